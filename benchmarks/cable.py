@@ -33,17 +33,17 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (
     CableBranchOptions,
     CableOptions,
-    cable_system,
+    clamped_cable_system,
     edge_length_parameter_values,
-    read_vertex_positions,
+    read_vertex_positions_by_name,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     constant_position_baseline,
-    interpolated_displacement_baseline,
-    mean_clamp_displacement_baseline,
-    measured_point_positions,
+    interpolated_displacement_position_baseline,
+    mean_clamp_displacement_baseline_prediction,
     position_rmse,
+    recorded_point_positions,
 )
 from yid_ocp.solvers import GaussNewton, solve
 
@@ -65,7 +65,7 @@ def branched_cable(folder: Path = FOLDER) -> CableTopology:
     return CableTopology(
         tuple(f"p{i}" for i in range(13)),
         {"a": ("p4", "a1", "a2", "a3", "a4"), "b": ("p8", "b1", "b2", "b3")},
-        read_vertex_positions(folder / "bdlo1_undeformed.csv"),
+        read_vertex_positions_by_name(folder / "bdlo1_undeformed.csv"),
     )
 
 
@@ -98,11 +98,11 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
         initial_state="fitted_to_points",
         path_cutoff=8.0,
         sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free_vertex_names)},
-        clamp_pose_definitions=cable.clamp_pose_definitions,
+        clamp_poses_from_points=cable.clamp_poses_from_points,
         prior_stds=dict.fromkeys(names, 0.2),
-        start_fit_window=TIME_STEP,
+        initial_state_fit_window=TIME_STEP,
         start_point_noise_std=NOISE,
-        start_fit_parameters=("clamp_start.roll",),
+        initial_state_fit_parameters=("clamp_start.roll",),
         parameters_by_recording=known,
     )
 
@@ -114,7 +114,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
     """
     errors, found = {}, problem.predict_held_out(x)
     for i, episode in enumerate(problem.episodes):
-        own = problem.theta_and_initial_state_offset(x, i)
+        own = problem.theta_and_initial_state_deviation(x, i)
         found.append((episode, problem.predictor.predict_episode(episode, *own, False)))
     for episode, result in found:
         if isinstance(result, str):
@@ -129,15 +129,15 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
 
 def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     """Prediction errors without a model [m]."""
-    free, measured = cable.free_vertex_names, measured_point_positions(recording, cable.free_vertex_names)
+    free, measured = cable.free_vertex_names, recorded_point_positions(recording, cable.free_vertex_names)
     predictions = {
         "stay": constant_position_baseline(recording, free),
-        "move_with_clamps": mean_clamp_displacement_baseline(recording, free, cable.clamped_vertex_names),
-        "linear_carry": interpolated_displacement_baseline(
+        "move_with_clamps": mean_clamp_displacement_baseline_prediction(recording, free, cable.clamped_vertex_names),
+        "linear_carry": interpolated_displacement_position_baseline(
             recording,
             free,
-            cable.points_along_parent_branch,
-            cable.points_along_child_branches,
+            cable.parent_branch_point_names,
+            cable.child_branch_point_names,
             cable.clamped_vertex_names,
         ),
     }
@@ -150,7 +150,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     recordings = {name: read_recording(folder / f"bdlo1_train_{name}.h5") for name in (*ESTIMATE, *HELD_OUT)}
     estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
     clock = time.perf_counter()
-    system = cable_system(typical_point_pair_distances(cable.edges, estimate), cable, OPTIONS)
+    system = clamped_cable_system(typical_point_pair_distances(cable.edges, estimate), cable, OPTIONS)
     step = yid.compile_step(system, TIME_STEP)
     seconds = {"build_and_compile": time.perf_counter() - clock}
     options = cable_options(cable, estimate + held_out, OPTIONS)
@@ -164,7 +164,8 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.free_vertex_names)
     point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)
     seconds["starts"] = time.perf_counter() - clock
-    episode, (theta, offset) = problem.episodes[0], problem.theta_and_initial_state_offset(problem.initial_unknowns, 0)
+    episode = problem.episodes[0]
+    (theta, offset) = problem.theta_and_initial_state_deviation(problem.initial_unknowns, 0)
     clock = time.perf_counter()
     problem.predictor.predict_episode(episode, theta, offset, False)
     seconds["rollout"] = time.perf_counter() - clock

@@ -37,10 +37,15 @@ from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_strict_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
-from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, aligned_table_lines, summary_terminal_lines
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, aligned_table_lines, summary_terminal_lines
 from yid_ocp.sensors.base import EffortSamplingKind
-from yid_ocp.version import source_hash
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.version import folder_source_hash
+from yid_ocp.virtual.experiment import (
+    ArmSensorNoise,
+    VirtualExperimentSettings,
+    baxter_foam_y_system,
+    run_virtual_experiment,
+)
 from yid_ocp.virtual.joint_motion import (
     MultisineMotion,
     MultisineOptions,
@@ -147,7 +152,7 @@ def make_twin(cell: str, recipe: Mapping[str, Any], number: int, folder: str, co
     )
     noise_seed = int(rng.integers(2**31))
     motion, motion_seed = gentle_enough(system, truth, posture, simulation, made.undeformed, rng)
-    experiment = VirtualExperiment(
+    experiment = VirtualExperimentSettings(
         motion=motion,
         initial_joint_angles=posture,
         simulation=simulation,
@@ -212,7 +217,7 @@ def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[s
             if entry["free"]
         },
         "diagnose": any(
-            "diagnose" in line for line in summary_terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result))
+            "diagnose" in line for line in summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))
         ),
     }
 
@@ -392,7 +397,7 @@ def record(
     """Record twins of some cells by their numbers; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    code = source_hash(PACKAGE / "virtual")
+    code = folder_source_hash(PACKAGE / "virtual")
     tasks = [
         Task(
             f"recording {k} of {name}",

@@ -37,13 +37,13 @@ from coverage import (
 )
 from make_recordings import OFFSETS, TRUTH
 
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.files import json_sha256, to_json_types, write_strict_json
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.version import source_hash
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system
+from yid_ocp.version import folder_source_hash
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, baxter_foam_y_system
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -99,7 +99,7 @@ def make_pair(name: str, recipe: Mapping[str, Any], number: int, folder: str, co
     for purpose in ("estimate", "held_out"):
         noise_seed = int(rng.integers(2**31))
         motion, motion_seed = gentle_enough(system, truth, posture, simulation, cell.undeformed, rng)
-        experiment = VirtualExperiment(
+        experiment = VirtualExperimentSettings(
             motion=motion,
             initial_joint_angles=posture,
             simulation=simulation,
@@ -127,7 +127,7 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         f"recordings.{key}=[{json.dumps(str(path))}]" for key, path in zip(USES, (estimate, held_out), strict=True)
     ]
     with tempfile.TemporaryDirectory() as folder:
-        made = load_config(config, [*given, "output.write_report=false", *settings], DEFAULT_DIAGNOSIS_CONFIG_FILE)
+        made = load_config(config, [*given, "output.write_report=false", *settings], DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
         finding = run_diagnose(made, Path(folder) / "run").output
     detectable = {
         f"{entry.effect.label}.{name}": value
@@ -226,7 +226,7 @@ def record(names: Sequence[str], number: int, workers: WorkerConfig, out: Path) 
     """Record so many twins of some kinds; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    code = source_hash(PACKAGE / "virtual")
+    code = folder_source_hash(PACKAGE / "virtual")
     tasks = [
         Task(
             f"recordings {k} of {name}",

@@ -30,7 +30,7 @@ from diagnosis_cases import CASES, record
 from make_recordings import ROUGH, TRUTH
 from planning import PlannedMovement
 
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording, SensorChannelGroup
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
@@ -40,7 +40,12 @@ from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, Solution, solve
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.virtual.experiment import (
+    PointCamera,
+    VirtualExperimentSettings,
+    baxter_foam_y_system,
+    run_virtual_experiment,
+)
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_step
@@ -67,7 +72,7 @@ def recorded(plan: InformativeMotionPlan, seed: int) -> Recording:
     movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
     posture = dict(zip(plan.joint_names, map(float, plan.simulator.moved_joint_start_positions), strict=True))
     simulation = replace(ROUGH.simulation, duration=float(plan.t[-1]))
-    experiment = VirtualExperiment(
+    experiment = VirtualExperimentSettings(
         motion=movement, initial_joint_angles=posture, simulation=simulation, arm_noise=ROUGH.noise(1),
         camera=PointCamera(), seed=seed,
         recording_name=f"planned_{seed}",
@@ -118,7 +123,7 @@ def _row(words: str, solution: Solution) -> tuple[str, ...]:
 def pair(name: str, starts: int, share: float) -> None:
     case = CASES[name]
     case = replace(case, withheld=tuple(_share(effect, share) for effect in case.withheld))
-    run = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE)
+    run = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
     nominal = build_problem(run)
     made = [record(case, 1, 401), record(case, 7, 402)]
     before = _diagnosed(nominal, made[:1], made[1:])
@@ -137,7 +142,7 @@ def pair(name: str, starts: int, share: float) -> None:
             print(f"seed {seed}: {first} beside {second}: {then:.3g} std in the recording, {now:.3g} in the plan")
         movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
         posture = dict(zip(plan.joint_names, map(float, plan.simulator.moved_joint_start_positions), strict=True))
-        experiment = VirtualExperiment(
+        experiment = VirtualExperimentSettings(
             motion=movement, initial_joint_angles=posture, simulation=SimulationOptions(float(plan.t[-1])),
             seed=NOISE_SEED + seed,
             recording_name=f"planned_{seed}",

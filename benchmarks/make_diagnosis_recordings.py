@@ -20,7 +20,7 @@ from yid_ocp.model import Grasp, System, flexible_object
 from yid_ocp.model.objects.foam_y import foam_y_segments
 from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.experiment import VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import (
     BAXTER_JOINT_NAMES_WITHOUT_SIDE,
     MultisineOptions,
@@ -69,7 +69,7 @@ def make(folder: Path) -> None:
         excitation = MultisineOptions(gripper_travel=TRAVEL[1])
         motion = random_multisine_motion(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation)
         name = f"diagnosis_{purpose}"
-        described = VirtualExperiment(
+        described = VirtualExperimentSettings(
             motion=motion,
             initial_joint_angles=posture,
             simulation=SimulationOptions(time_step=INNER_STEP),

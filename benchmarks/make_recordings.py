@@ -26,7 +26,7 @@ from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import (
     ArmSensorNoise,
     PointCamera,
-    VirtualExperiment,
+    VirtualExperimentSettings,
     baxter_foam_y_system,
     run_virtual_experiment,
 )
@@ -145,7 +145,7 @@ def make(folder: Path, torques: Torques) -> None:
             )
             for vision in (False, True):
                 name = f"{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
-                experiment = VirtualExperiment(
+                experiment = VirtualExperimentSettings(
                     motion=motion,
                     initial_joint_angles=posture,
                     simulation=torques.simulation,

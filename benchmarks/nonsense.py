@@ -30,7 +30,7 @@ from yid_ocp.errors import DataError, YidError
 from yid_ocp.integrator.step import Step
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_inputs import given_or_shipped_recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 Damage = Callable[[Recording], Recording]
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -121,7 +121,7 @@ def kept(which: Callable[[np.ndarray], np.ndarray]) -> Damage:
             first = replace(seen, t=seen.t[rows], position=seen.position[rows], std=std)
             return replace(recording, points=(first, *recording.points[1:]))
         rows = which(group.t)
-        made: dict[str, Any] = {name: values[rows] for name, values in group.channels.items()}
+        made: dict[str, Any] = {name: values[rows] for name, values in group.values_by_channel.items()}
         return replace(recording, joints=replace(group, t=group.t[rows], **made))
 
     return damage
@@ -163,7 +163,7 @@ def constant(recording: Recording) -> Recording:
     group = recording.joints
     assert group is not None
     made: dict[str, Any] = {
-        name: np.repeat(values[:1], len(group.t), axis=0) for name, values in group.channels.items()
+        name: np.repeat(values[:1], len(group.t), axis=0) for name, values in group.values_by_channel.items()
     }
     seen = [replace(g, position=np.repeat(g.position[:1], len(g.t), axis=0)) for g in recording.points]
     return replace(recording, joints=replace(group, **made), points=tuple(seen))
@@ -286,12 +286,12 @@ def renamed(old: str, new: str) -> Damage:
 
 def other_arm(recording: Recording) -> Recording:
     """The right arm's recording under the left arm's names."""
-    other = read_recording(given_or_shipped_recording_path("default:dual_arm_vision_held_out.h5"))
+    other = read_recording(resolve_recording_path("default:dual_arm_vision_held_out.h5"))
     group = other.joints
     assert group is not None
     columns = [i for i, name in enumerate(group.names) if name.startswith("right")]
     std = {key: value[columns] for key in ("effort_std", "effort_bias_std") if np.ndim(value := getattr(group, key))}
-    made: dict[str, Any] = {name: values[:, columns] for name, values in group.channels.items()}
+    made: dict[str, Any] = {name: values[:, columns] for name, values in group.values_by_channel.items()}
     names = tuple(group.names[i].replace("right", "left") for i in columns)
     own = recording.points[0]
     arm = other.points[0]
@@ -460,7 +460,7 @@ def clean_recording(case: Case) -> Path | None:
     """The recording that a case damages, None where it is not here."""
     if case.config in REAL:
         return _real(case.config) if _real(case.config).is_file() else None
-    return Path(given_or_shipped_recording_path(f"default:{case.config}_estimate.h5"))
+    return Path(resolve_recording_path(f"default:{case.config}_estimate.h5"))
 
 
 def prepared(case: Case, folder: Path) -> RunSettings:
@@ -499,7 +499,7 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
     causes = sorted({doubt.cause for doubt in doubts})
     found: list[str] = []
     wrong: list[str] = []
-    if solving and problem.options.has_no_serious_data_issues:
+    if solving and problem.options.all_data_issues_are_warnings:
         outcome = solve(problem, run.solver, limits=run.diagnosis.null_test_residual_limits)
         verdicts = {name: entry for name, entry in outcome.parameters.items() if entry.verdict == "identifiable"}
         found = list(verdicts)
@@ -509,7 +509,7 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
         "outcome": "doubted" if doubts else "believed",
         "named": bool(set(causes) & set(case.causes)),
         "causes": causes,
-        "harmless": problem.options.has_no_serious_data_issues and bool(doubts),
+        "harmless": problem.options.all_data_issues_are_warnings and bool(doubts),
         "found": found,
         "wrong": wrong,
         "doubts": [f"{doubt.where}: {doubt.what}" for doubt in doubts],

@@ -35,13 +35,13 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.planning.joint_paths import (
-    FramePositionFunction,
+    FramePositionEvaluator,
     SplinePath,
-    solve_equilibrium_at_target,
+    solve_equilibrium_at_point_target,
     solve_start_equilibrium,
 )
 from yid_ocp.planning.motion_plan import TargetMotionPlan, plan_motion_to_target
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, baxter_foam_y_system
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
@@ -74,7 +74,7 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
     turned by more than `TRAVEL`.
     """
     system, rng = step.system, np.random.default_rng(11)
-    theta, tip = system.parameters.vector(TRUTH), FramePositionFunction(system, [TIP])
+    theta, tip = system.parameters.vector(TRUTH), FramePositionEvaluator(system, [TIP])
     posture = grasping_joint_angles(system, TRUTH)
     start = solve_start_equilibrium(step, theta, np.array([posture[name] for name in system.prescribed]))
     begin = tip.positions_and_jacobian(start.state[None, : system.n_coordinates], theta)[0][0]
@@ -84,7 +84,7 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
         x, y, z = way / np.linalg.norm(way) * rng.uniform(0.04, 0.08)
         place = begin + np.array((x, y, z))
         with contextlib.suppress(ConfigError):
-            end = solve_equilibrium_at_target(step, theta, start, tip, place, 1e-3)
+            end = solve_equilibrium_at_point_target(step, theta, start, tip, place, 1e-3)
             rest = tip.positions_and_jacobian(end.state[None, : system.n_coordinates], theta)[0][0]
             travel = (end.state - start.state)[list(system.prescribed_coordinate_indices)]
             if np.linalg.norm(rest - place) < 1e-4 and np.abs(travel).max() < TRAVEL:
@@ -110,7 +110,7 @@ class PlannedMovement:
 def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> PlannedMovement:
     """The gripper along a straight line, its orientation as little changed as the arm allows."""
     system = step.system
-    gripper, n = FramePositionFunction(system, [GRIPPER]), system.n_coordinates
+    gripper, n = FramePositionEvaluator(system, [GRIPPER]), system.n_coordinates
     joints = list(system.prescribed_coordinate_indices)
     theta = system.parameters.vector()
 
@@ -209,7 +209,7 @@ def movement(planned: TargetMotionPlan) -> PlannedMovement:
 def settings(**recordings: Sequence[Path]) -> RunSettings:
     """The configuration with recordings by purpose."""
     files = [f"recordings.{purpose}=[{', '.join(map(str, paths))}]" for purpose, paths in recordings.items()]
-    return load_config(CONFIG, [*files, "output.write_report=false", "output.discretisation_check=none"])
+    return load_config(CONFIG, [*files, "output.write_report=false", "output.discretisation_check_mode=none"])
 
 
 def record(folder: Path, noise: int = NOISE, effects: Sequence[InjectedEffect] = ()) -> list[Path]:
@@ -224,7 +224,7 @@ def record(folder: Path, noise: int = NOISE, effects: Sequence[InjectedEffect] =
         motion = random_multisine_motion(
             system, TRUTH, seed=motion_seed, initial_joint_angles=posture, excitation=excitation
         )
-        experiment = VirtualExperiment(motion, posture, simulation, ROUGH.noise(1), CAMERA, seed=noise + i)
+        experiment = VirtualExperimentSettings(motion, posture, simulation, ROUGH.noise(1), CAMERA, seed=noise + i)
         files.append(folder / f"motion_{motion_seed}.h5")
         write_recording(run_experiment_with_effects(system, TRUTH, effects, experiment), files[-1])
     return files
@@ -255,10 +255,10 @@ def ten_goals(folder: Path, count: int, noise: int) -> None:
     print("|" + "---|" * (2 + len(names)))
     ratios = []
     for i, shift in enumerate(goals(step, count)):
-        options = replace(run.plan, target_offset=shift, start_joint_positions=posture)
+        options = replace(run.plan, target_offset_from_start=shift, start_joint_positions=posture)
         best = plan_motion_to_target(step, options, true)
         # the same place in the world, whatever a model believes of where the tip rests
-        there = replace(options, target_offset=None, target_position=tuple(best.target_position))
+        there = replace(options, target_offset_from_start=None, target_position=tuple(best.target_position))
         plans = [plan_motion_to_target(step, there, theta), best, plan_motion_to_target(step, there, guess)]
         cells = [carried_out(twin, TRUTH, movement(one), one, one) for one in plans]
         first = np.array([posture[name] for name in step.system.prescribed])
@@ -288,7 +288,7 @@ def withheld_effect(folder: Path) -> None:
         [make_effect(HANGING.kind, HANGING.location, baxter_foam_y_system(1), HANGING.values)]
     )
     posture = grasping_joint_angles(twin, TRUTH)
-    tip, theta = FramePositionFunction(twin, [TIP]), twin.parameters.vector(TRUTH)
+    tip, theta = FramePositionEvaluator(twin, [TIP]), twin.parameters.vector(TRUTH)
     true = compile_step(replace(twin, driven=(), prescribed=twin.driven), 0.01)
     rest = solve_start_equilibrium(true, theta, np.array(list(posture.values()))).state[None, : twin.n_coordinates]
     x, y, z = map(float, tip.positions_and_jacobian(rest, theta)[0][0] + HANGING_SHIFT)
@@ -297,7 +297,7 @@ def withheld_effect(folder: Path) -> None:
         values, step = found(chosen, folder / name)
         made = plan_motion_to_target(
             step,
-            replace(run.plan, target_offset=None, target_position=(x, y, z), start_joint_positions=posture),
+            replace(run.plan, target_offset_from_start=None, target_position=(x, y, z), start_joint_positions=posture),
             values,
         )
         error, swing = carried_out(twin, TRUTH, movement(made), made, made)
@@ -307,7 +307,7 @@ def withheld_effect(folder: Path) -> None:
 def two_hands() -> None:
     """Print what becomes of plans for two arms, beside a smooth motion of every joint to the same posture."""
     truth = ", ".join(f"{name}: {{initial: {value}}}" for name, value in TRUTH.items())
-    way = "plan={point: w_T1, target_offset: [0.03, 0.03, 0.0], duration: 0.8}"
+    way = "plan={point: w_T1, target_offset_from_start: [0.03, 0.03, 0.0], duration: 0.8}"
     print("| held by two arms | plan: error [mm], swing [mm/s] | same posture, smoothly |\n|---|---|---|")
     for name, config, more in (
         ("junction of the Y", "dual_arm_vision", ["parameters={}", f"parameters={{{truth}}}", way]),

@@ -28,7 +28,7 @@ from yid_ocp.config.settings import ParameterSettings, RunSettings
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -82,7 +82,7 @@ def recorded(system: System, seed: int, effects: Sequence[InjectedEffect] = ()) 
     """One motion of the arm in MuJoCo: commands, noisy angles, markers."""
     posture = UPRIGHT if any(effect.kind == "backlash" for effect in effects) else POSTURE
     excitation = MultisineOptions(max_joint_speed=2.5, duration=DURATION, frequency_band=(0.3, 2.0))
-    experiment = VirtualExperiment(
+    experiment = VirtualExperimentSettings(
         motion=random_multisine_motion(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation),
         initial_joint_angles=posture,
         simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),

@@ -27,7 +27,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
@@ -89,7 +89,7 @@ def recorded(system: System, seed: int) -> Recording:
     excitation = MultisineOptions(max_joint_speed=3.0, duration=DURATION, frequency_band=(0.2, 1.5))
     motion = random_multisine_motion(system, values, seed=seed, initial_joint_angles=POSTURE, excitation=excitation)
     moves = np.array([[name != "gripper"] for name in motion.joints])
-    experiment = VirtualExperiment(
+    experiment = VirtualExperimentSettings(
         motion=replace(motion, amplitude=motion.amplitude * moves),
         initial_joint_angles=POSTURE,
         simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),

@@ -91,7 +91,7 @@ def recorded(system: System, run: SimulationResult, every: int, noise: float, na
 def estimated(system: System, recording: Recording, time_step: float) -> Estimate:
     """Gauss-Newton from the truth; the unseen twists stay at theirs."""
     step = compile_step(system, time_step)
-    problem = EstimationProblem(step, [recording], FREE, ProblemOptions(tracking_filter="lqr"), TRUTH)
+    problem = EstimationProblem(step, [recording], FREE, ProblemOptions(arm_tracking_feedback="lqr"), TRUTH)
     found = solve(problem, GaussNewton(cost_tolerance=1e-12, max_iterations=15))
     std = np.array([found.std[name] for name in FREE])
     return Estimate(found.x[: len(FREE)], std, found.goodness_of_fit.chi2_per_dof, found.message)

@@ -28,8 +28,13 @@ from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_strict_json
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.version import source_hash
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.version import folder_source_hash
+from yid_ocp.virtual.experiment import (
+    PointCamera,
+    VirtualExperimentSettings,
+    baxter_foam_y_system,
+    run_virtual_experiment,
+)
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 
 ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
@@ -42,7 +47,7 @@ ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 METHOD = (
     "solver={name: steepest_descent, max_iterations: 200}",
     "problem.weighting=paper",
-    "compare.reference_paper_experiment=null",
+    "compare.reference_paper_experiment_name=null",
 )
 
 
@@ -56,7 +61,7 @@ def make_member(experiment: str, errors: Sequence[Sequence[float]], number: int,
         system, TRUTH, seed=ROUGH.motion_seeds[arms, "estimate"], initial_joint_angles=posture, excitation=excitation
     )
     torques = replace(ROUGH, white=tuple(errors[0]), offset=tuple(errors[1]))
-    described = VirtualExperiment(
+    described = VirtualExperimentSettings(
         motion=motion,
         initial_joint_angles=posture,
         simulation=torques.simulation,
@@ -77,7 +82,7 @@ def run(
     """What steepest descent finds: experiment, errors of the torques, parameter to the members' values."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    maker = source_hash(PACKAGE / "virtual")
+    maker = folder_source_hash(PACKAGE / "virtual")
     keys = [(experiment, errors, k) for experiment in experiments for errors in kinds for k in range(members)]
     tasks = [
         Task(

@@ -62,7 +62,7 @@ def one_film(number: int, frames: int, camera: str) -> dict[str, Any]:
         priors = dict(zip(names, map(float, common), strict=True))
         own = np.sqrt(np.maximum(found.std**2 - found.shared_std**2, 1e-6))
         group = replace(group, std=own)
-    options = ProblemOptions(prior_stds=priors, tracking_filter="lqr", initial_state="equilibrium")
+    options = ProblemOptions(prior_stds=priors, arm_tracking_feedback="lqr", initial_state="equilibrium")
     recording = Recording(joints_of(play, number), (play.arm_points(number), group), name=f"film {number}")
     try:
         problem = yid.EstimationProblem(yid.compile_step(system, 0.01), [recording], free, options, start)

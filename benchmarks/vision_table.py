@@ -43,19 +43,19 @@ from yid_ocp.virtual.joint_motion import (
     grasping_joint_angles,
     random_multisine_motion,
 )
-from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
+from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.vision import (
     CameraIntrinsics,
-    CameraScene,
     FrameSequence,
+    ObservedScene,
     TrackOptions,
     TrackResult,
     look_at_pose,
     track_object,
 )
 from yid_ocp.vision.frames import import_open3d
-from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes
+from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint
 
 Array = NDArray[np.float64]
 
@@ -213,12 +213,12 @@ class Stage:
     def __init__(self, play: Played, clutter: str, seed: int) -> None:
         self.play, self.course = play, play.course
         system = play.system
-        self.model = compile_mjcf(mujoco_xml(system, play.values))
+        self.model = mujoco_model_from_mjcf(mujoco_xml(system, play.values))
         self.data = mujoco.MjData(self.model)
         names = system.mechanism.joint_names
         self.order = [self.model.joint(name).id for name in names]
         tree = system.numeric_mechanism(play.values)
-        self.robot = load_robot_meshes("package:baxter", tree)
+        self.robot = load_robot_meshes_by_joint("package:baxter", tree)
         theta = dict(zip(system.parameters.names, system.parameters.vector(play.values), strict=True))
         self.rods = []
         for segment in system.segment_layouts:
@@ -365,7 +365,7 @@ def measured(depths: Sequence[Array], cosines: Sequence[Array], noise: Noise, rn
 class Film:
     """What `track_object` is given, and what was true."""
 
-    scene: CameraScene
+    scene: ObservedScene
     recording: Recording
     sequence: FrameSequence
     place: Callable[[float], Array]
@@ -408,7 +408,7 @@ def film(play: Played, row: Row, seed: int, frames: int) -> Film:
     names = tuple(f"frame {i}" for i in range(frames))
     sequence = FrameSequence(stamps, names, told, load, LENS, "independent camera")
     recording = Recording(play.joints(seed), (play.arm_points(seed),), source="MuJoCo", name="table")
-    return Film(CameraScene(system, "package:baxter", values), recording, sequence, stage.place, taken)
+    return Film(ObservedScene(system, "package:baxter", values), recording, sequence, stage.place, taken)
 
 
 @dataclass(frozen=True, eq=False)

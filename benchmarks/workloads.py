@@ -25,7 +25,7 @@ from yid_ocp.integrator import compiled
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections, TrackingFeedback
-from yid_ocp.integrator.tracking_feedback import lqr_feedback
+from yid_ocp.integrator.tracking_feedback import lqr_tracking_feedback
 from yid_ocp.model import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.problem import EstimationProblem
@@ -77,7 +77,7 @@ class Bench:
         step = compile_step(system, TIME_STEP)
         theta = system.parameters.vector(VALUES)
         rest = EquilibriumSolver(step).solve(angles[0], theta)
-        feedback = lqr_feedback(step, angles, torque, theta)
+        feedback = lqr_tracking_feedback(step, angles, torque, theta)
         path = np.zeros((len(torque) + 1, 0))
         trajectory = step.kernel.rollout(RolloutInputs(theta, rest.state, torque, path, feedback))
         assert trajectory.status.is_converged, trajectory.status.message

@@ -98,16 +98,16 @@ model:
   effects:
     - {kind: kelvin_voigt, location: T1, values: {tau: 0.02}}
 """,
-    "model.clamps.NAME": """\
+    "model.moving_clamps.NAME": """\
 model:
-  clamps:
-    hand: {origin_point: marker_a, z_axis_point: marker_b, roll_convention: transported}
+  moving_clamps:
+    hand: {origin_point_name: marker_a, z_axis_point_name: marker_b, roll_convention: transported}
 """,
     "model.extra_meshes": """\
 model:
   extra_meshes:
     - {mesh: gripper.stl, parent_frame: left_hand}
-    - {box: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
+    - {box_size: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
 """,
     "model.arms": """\
 model:
@@ -219,7 +219,7 @@ track:
 """,
     "track.options": """\
 track:
-  options: {max_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
+  options: {max_mean_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
 """,
     "track.options.filters": """\
 track:
@@ -250,7 +250,7 @@ track:
 plan:
   goal: place
   point: w_T3
-  target_offset: [0.05, 0.0, 0.1]                    # [m]
+  target_offset_from_start: [0.05, 0.0, 0.1]                    # [m]
   duration: 1.0                              # [s]
   parameter_run: runs/my_solve
 """,

@@ -63,7 +63,7 @@ class MadeUp:
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.unknown_scales = np.abs(self.initial_unknowns) if scales is None else np.array(scales, float)
         self.options = SimpleNamespace(
-            has_no_serious_data_issues=True,
+            all_data_issues_are_warnings=True,
             weighting=weighting,
             prior_stds=dict(priors or {}),
             path_cutoff=np.inf,
@@ -85,7 +85,7 @@ class MadeUp:
         node = np.linspace(0, steps, data).astype(int)
         group = samples(
             ("points.tip",), np.full((data, 1), self.rms_noise_of_data_residuals),
-            used_output_mask=np.ones((data, 1), bool), value=np.zeros((data, 1)), node=node,
+            positive_weight_mask=np.ones((data, 1), bool), value=np.zeros((data, 1)), node=node,
             fraction=np.zeros(data), n_residuals=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=steps, time_step=0.1)
@@ -99,7 +99,7 @@ class MadeUp:
     def residual_rows(self) -> ResidualVectorLayout:
         return ResidualVectorLayout.from_episodes(self.episodes, self._stated, self._weak)
 
-    def theta_and_initial_state_offset(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    def theta_and_initial_state_deviation(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         theta = self.theta.copy()
         theta[len(theta) - len(x) :] = x[::-1]
         return theta, np.zeros(0)

@@ -9,22 +9,22 @@ from types import SimpleNamespace
 import numpy as np
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.inference.null_test import ResidualChannelIndices
+from yid_ocp.inference.null_test import ResidualChannel
 
 WHITE = (1.0,)
 
 
-def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ResidualChannelIndices:
+def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ResidualChannel:
     """One output of one recording; times at even intervals unless given."""
     rows = np.asarray(rows)
     t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
-    return ResidualChannelIndices(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+    return ResidualChannel(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
 
 
 def without(recording: Recording, begin: float, end: float) -> Recording:
     """A recording whose joints lost the samples of some time [s]."""
     rows = (recording.joints.t < begin) | (recording.joints.t > end)
-    left = {name: values[rows] for name, values in recording.joints.channels.items()}
+    left = {name: values[rows] for name, values in recording.joints.values_by_channel.items()}
     return replace(recording, joints=replace(recording.joints, t=recording.joints.t[rows], **left))
 
 
@@ -32,7 +32,7 @@ def samples(channels: Sequence[str], std, unit="m", width=1, **more):
     """What one sensor measured, as far as rules look at it."""
     columns = tuple(channel for channel in channels for _ in range(width))
     return SimpleNamespace(
-        sensor=seeing(channels, unit, width), output_channel_names=columns, std=np.asarray(std, float), **more
+        sensor=seeing(channels, unit, width), channel_name_per_output=columns, std=np.asarray(std, float), **more
     )
 
 

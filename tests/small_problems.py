@@ -15,7 +15,7 @@ from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors.joints import EffortSensor
 from yid_ocp.sensors.points import PointSensor
 
@@ -30,14 +30,14 @@ def points(*names: str, pose=None, group="points") -> PointSensor:
     return PointSensor(group, names, names, pose)
 
 
-def measured(sensor, node, fraction, value, weight=None, std=None, span=(0, 100)) -> Measurements:
+def measured(sensor, node, fraction, value, weight=None, std=None, span=(0, 100)) -> SensorMeasurements:
     """Samples on nodes; whitened by unit noise unless weights are given."""
     value = np.asarray(value, float)
     seen = np.isfinite(value)
     weight = np.where(seen, 1.0, 0.0) if weight is None else np.asarray(weight, float)
     std = np.where(seen, 1.0, np.nan) if std is None else np.asarray(std, float)
     bias = np.zeros(value.shape[1])
-    return Measurements(sensor, np.asarray(node), np.asarray(fraction, float), value, weight, std, span, bias)
+    return SensorMeasurements(sensor, np.asarray(node), np.asarray(fraction, float), value, weight, std, span, bias)
 
 
 def correlated(episode):

@@ -103,7 +103,7 @@ def test_a_worker_of_another_version_is_refused(scheduler, monkeypatch, other, w
     here = software_fingerprint() | other
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: here)
     with pytest.raises(WorkerError, match=words):
-        scheduler.config.check_available()
+        scheduler.config.check_scheduler_available()
 
 
 def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
@@ -122,14 +122,14 @@ def test_workers_of_several_threads_are_refused():
         distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
         pytest.raises(WorkerError, match="2 tasks at once in one process"),
     ):
-        WorkerConfig(scheduler_address=cluster.scheduler_address).check_available()
+        WorkerConfig(scheduler_address=cluster.scheduler_address).check_scheduler_available()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere", "a:b:c"])
 def test_a_scheduler_that_is_not_there_is_said(address, monkeypatch):
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks._CONNECT_TIMEOUT", 0.5)
     with pytest.raises(WorkerError, match="no scheduler answers") as caught:
-        WorkerConfig(scheduler_address=address).check_available()
+        WorkerConfig(scheduler_address=address).check_scheduler_available()
     assert address in str(caught.value)
     assert "dask scheduler" in str(caught.value)
 
@@ -137,7 +137,7 @@ def test_a_scheduler_that_is_not_there_is_said(address, monkeypatch):
 def test_dask_is_optional(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(WorkerError, match=r"pip install 'yid-ocp\[cluster\]'"):
-        WorkerConfig(scheduler_address="localhost:8786").check_available()
+        WorkerConfig(scheduler_address="localhost:8786").check_scheduler_available()
 
 
 def test_a_scheduler_file_will_do(scheduler, tmp_path):

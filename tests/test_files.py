@@ -25,7 +25,12 @@ from yid_ocp.files import (
     write_strict_json,
 )
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences, source_hash
+from yid_ocp.version import (
+    folder_source_hash,
+    package_source_hash,
+    software_fingerprint,
+    software_fingerprint_differences,
+)
 
 
 def test_an_interruption_leaves_nothing(tmp_path):
@@ -95,14 +100,14 @@ def test_the_hash_of_sources_follows_their_names_and_content(tmp_path):
     kernel = tmp_path / "inner" / "kernel.c"
     (tmp_path / "a.py").write_text("a = 1\n")
     kernel.write_text("int a;\n")
-    first = source_hash(tmp_path)
+    first = folder_source_hash(tmp_path)
     (tmp_path / "a.pyc").write_text("compiled")
-    assert source_hash(tmp_path) == first
+    assert folder_source_hash(tmp_path) == first
     kernel.write_text("int b;\n")
-    assert source_hash(tmp_path) != first
+    assert folder_source_hash(tmp_path) != first
     kernel.write_text("int a;\n")
     (tmp_path / "a.py").rename(tmp_path / "b.py")
-    assert source_hash(tmp_path) != first
+    assert folder_source_hash(tmp_path) != first
 
 
 def test_where_two_processes_differ_is_said():
@@ -126,7 +131,7 @@ GUARDS = {"check_input_file", "check_readable_in_fork", "read_input_text"}
 OPENED_ELSEWHERE = {
     "files.limited_memory": "/proc",
     "files.atomic_write": "what was written",
-    "version.source_hash": "the package's own sources",
+    "version.folder_source_hash": "the package's own sources",
     "cli._discard_what_follows": "/dev/null",
     "cli._reliable_streams": "/dev/null",
     "config.reader._loaded": "a text that was read",
@@ -136,7 +141,7 @@ OPENED_ELSEWHERE = {
     "data.recording_hdf5._complaint": "in the process that is tried first",
     "data.readers.c3d._complaint": "in the process that is tried first",
     "data.readers.lerobot._files": "the format of a name",
-    "export.signals.export_csv": "writes",
+    "export.signals.export_recording_csv_files": "writes",
     "integrator.codegen.kernel_c_source": "sources in C that come with the package",
     "inference.kalman._library": "a source in C that comes with the package",
     "integrator.compiler._machine": "/proc",

@@ -7,14 +7,14 @@ import pytest
 from small_problems import joints, pendulum_step, recording, seen, taken
 
 import yid_ocp as yid
-from yid_ocp.display import _MAX_TABLE_ROWS, ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import _MAX_TABLE_ROWS, ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.model import Segment, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 
 class Thing(ReprMixin):
     def __init__(self, line, rows=()):
-        self.said = ReprSummary(line, rows)
+        self.said = ReprTexts(line, rows)
 
     def _summary(self):
         return self.said
@@ -57,7 +57,11 @@ def shown(urdf_folder):
     tube = flexible_object([Segment("tube", length=0.4, mass=0.1, radius=0.01, links=2)])
     system, [seen_channel, *_] = step.system, solution.channel_measurements_and_predictions()
     things = [made, step, system, system.mechanism, system.parameters, tube, problem, solution, solution.evaluation]
-    things += [seen_channel, yid.identifiability(problem, solution), yid.StepSymbols.from_equations(step.equations)]
+    things += [
+        seen_channel,
+        yid.identifiability(problem, solution),
+        yid.NamedStepEquations.from_equations(step.equations),
+    ]
     return {type(thing).__name__: thing for thing in things}
 
 
@@ -66,7 +70,7 @@ LINES |= {"System": "double_pendulum, 2 coordinates (1 prescribed, 1 passive), 0
 LINES |= {"Step": "0.01 s, symmetric, interpreted, of double_pendulum", "Mechanism": "double_pendulum, 2 joints and"}
 LINES |= {"FlexibleObject": "tube, 6 joints", "Solution": "by gauss_newton", "Evaluation": "by 2 unknowns"}
 LINES |= {"ChannelPrediction": "of 'run_1'", "IdentifiabilityResult": "of 2 parameters found"}
-LINES |= {"StepSymbols": "4 equations of a step of double_pendulum"}
+LINES |= {"NamedStepEquations": "4 equations of a step of double_pendulum"}
 
 
 @pytest.mark.parametrize(("name", "words"), LINES.items(), ids=LINES)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from yid_ocp.analysis.identifiability import identifiability as identifiability
-    from yid_ocp.analysis.step_symbols import StepSymbols as StepSymbols
+    from yid_ocp.analysis.step_symbols import NamedStepEquations as NamedStepEquations
     from yid_ocp.analysis.what_if import what_if as what_if
     from yid_ocp.config.reader import load_config as load_config
     from yid_ocp.data import Recording as Recording
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 # what is entered here is imported above as well
 _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.identifiability": ("identifiability",),
-    "analysis.step_symbols": ("StepSymbols",),
+    "analysis.step_symbols": ("NamedStepEquations",),
     "analysis.what_if": ("what_if",),
     "config.reader": ("load_config",),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
 
 from yid_ocp import interruption
-from yid_ocp.errors import ConfigError, InsufficientMemoryError, OutputError, YidError, unknown_name_details
+from yid_ocp.errors import ConfigError, InsufficientMemoryError, OutputError, YidError, unknown_name_error_arguments
 
 _EXIT_WRONG_INPUT, _EXIT_BUG, _EXIT_INTERRUPTED = 2, 3, 130
 _ERROR_FORMAT = "yid-error/1"
@@ -189,7 +189,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: between its cells")
     group.add_argument("--episode", type=int, metavar="NUMBER", help="of a LeRobot dataset; 0 when absent")
     group.add_argument("--clock", choices=("recorded", "nominal"), help="of a table: whether its times were measured")
-    group.add_argument("--sensor-description", metavar="TEXT", help="what saw the points")
+    group.add_argument("--point-sensor-name", metavar="TEXT", help="what saw the points")
     group.add_argument("--frame", metavar="TEXT", help="frame of reference of the points, of a table or C3D file")
 
 
@@ -345,7 +345,9 @@ class _Parser(argparse.ArgumentParser):
             flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
             if not flag.startswith("-"):
                 raise ConfigError(f"'{rest[0]}' is one argument too many", where=self.prog, hint=self._help())
-            raise ConfigError(f"there is no option '{flag}'", where=self.prog, **unknown_name_details(flag, flags))
+            raise ConfigError(
+                f"there is no option '{flag}'", where=self.prog, **unknown_name_error_arguments(flag, flags)
+            )
         return found, rest
 
     def error(self, message: str) -> NoReturn:
@@ -353,7 +355,7 @@ class _Parser(argparse.ArgumentParser):
         if chosen:
             known = [name.strip(" '") for name in chosen[3].split(",")]
             noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
-            details = unknown_name_details(chosen[2], known)
+            details = unknown_name_error_arguments(chosen[2], known)
             raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
         raise ConfigError(message, where=self.prog, hint=self._help())
 

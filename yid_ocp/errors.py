@@ -98,13 +98,13 @@ _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none i
 def nearest_name_hint(name: str, known: Iterable[str]) -> str:
     """Hint for an error about an unknown name: the most similar known name, or a list of known names.
 
-    It is for errors that do not say what is allowed; beside a list, see `unknown_name_details`.
+    It is for errors that do not say what is allowed; beside a list, see `unknown_name_error_arguments`.
     """
     names = [str(entry) for entry in known]
     return _meant(name, names) or f"known: {_listed(name, sorted(names)) or 'none'}"
 
 
-def unknown_name_details(name: str, known: Iterable[str]) -> dict[str, str]:
+def unknown_name_error_arguments(name: str, known: Iterable[str]) -> dict[str, str]:
     """Arguments `allowed` and `hint` for an error about an unknown name; a long list of names is shortened."""
     names = [str(entry) for entry in known]
     return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}

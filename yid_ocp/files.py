@@ -78,7 +78,7 @@ def limited_memory() -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def check_number_count(count: int, where: str) -> None:
+def check_max_input_numbers(count: int, where: str) -> None:
     """Raise `DataError` if an input file holds or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
         allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
@@ -208,7 +208,7 @@ def named_attributes(value: Any, names: str) -> dict[str, Any]:
     return {key: getattr(value, name or key) for key, _, name in pairs}
 
 
-def attributes_to_json(value: Any, names: str) -> dict[str, Any]:
+def object_attributes_to_json_dict(value: Any, names: str) -> dict[str, Any]:
     """Dict of an object's attributes as JSON data; `names` as for `named_attributes`."""
     return dict(to_json_types(named_attributes(value, names)))
 

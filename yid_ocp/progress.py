@@ -47,7 +47,7 @@ class LoggingProgress(Progress):
         self.log.info("%d of %d, %s", done, total, text)
 
 
-class ParallelProgress:
+class PartsDoneCounter:
     """Thread-safe counter of a stage's `total` parallel parts; reports every count, the first with the text `first`."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Generic, TypeVar
 
-from yid_ocp.errors import ConfigError, unknown_name_details
+from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 
 _Entry = TypeVar("_Entry")
 
@@ -29,14 +29,14 @@ class Registry(Generic[_Entry]):
 
         return enter
 
-    def unregister(self, names: Iterable[str]) -> None:
+    def unregister_names(self, names: Iterable[str]) -> None:
         """Remove entries, such as those of a module whose import failed."""
         for name in names:
             self._entries.pop(name, None)
 
     def __getitem__(self, name: str) -> _Entry:
         if name not in self._entries:
-            raise ConfigError(f"there is no {self.entry_noun} '{name}'", **unknown_name_details(name, self))
+            raise ConfigError(f"there is no {self.entry_noun} '{name}'", **unknown_name_error_arguments(name, self))
         return self._entries[name]
 
     def __contains__(self, name: object) -> bool:

@@ -43,7 +43,7 @@ def golden_problem(golden, paper_systems, single_step, dual_step):
             groups.append(PointGroup("points_camera", names, t[at], seen, 5e-3, sensor="camera", pose=np.eye(4)))
         start = np.concatenate([trep.q[0], trep.p[0]])
         options = ProblemOptions(
-            tracking_filter="proportional", known_initial_states={"golden": start}, path_cutoff=math.inf
+            arm_tracking_feedback="proportional", known_initial_states={"golden": start}, path_cutoff=math.inf
         )
         values = dict(zip(STIFFNESSES, map(float, trep.rho), strict=True))
         recording = Recording(joints, tuple(groups), name="golden")

@@ -56,10 +56,10 @@ class Formula:
         self.whitening_filters, self.has_process_noise = (None,), False
         weighting, empty = "paper" if noise != 1 else "whitened", {name: {} for name in _BY_NAME}
         common = {"multivariate_prior": MultivariateGaussianPrior(), "path_cutoff": np.inf, "data_issues": ()}
-        common |= {"has_no_serious_data_issues": True, "initial_state": "equilibrium"}
+        common |= {"all_data_issues_are_warnings": True, "initial_state": "equilibrium"}
         self.options = SimpleNamespace(weighting=weighting, **common, **empty)
         everything = samples(
-            ("points.tip",), np.full((data, 1), noise), used_output_mask=np.ones((data, 1), bool),
+            ("points.tip",), np.full((data, 1), noise), positive_weight_mask=np.ones((data, 1), bool),
             value=np.zeros((data, 1)), node=np.arange(data), fraction=np.zeros(data), count=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=data, time_step=0.1)
@@ -73,13 +73,13 @@ class Formula:
         self.system = SimpleNamespace(parameters=entries)
         self.asked: list[tuple[float, ...]] = []
 
-    def theta_and_initial_state_offset(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    def theta_and_initial_state_deviation(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         values = dict(zip((name.split("[")[0] for name in self.unknown_names), np.asarray(x, float), strict=True))
         return np.array([values[name] for name in self.system.parameters.names]), np.zeros(0)
 
     @property
     def theta(self) -> np.ndarray:
-        return self.theta_and_initial_state_offset(self.initial_unknowns, 0)[0]
+        return self.theta_and_initial_state_deviation(self.initial_unknowns, 0)[0]
 
     @property
     def positive_unknowns_mask(self) -> np.ndarray:

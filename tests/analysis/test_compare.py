@@ -16,8 +16,8 @@ from yid_ocp.analysis.compare import (
     _TRUTH_EXPERIMENT,
     PAPER_ESTIMATES,
     _load_torque_ensemble,
+    choose_cable_memory_fit,
     compare_methods,
-    decide_cable_memory,
     explain_paper_estimates,
     is_within_ensemble_range,
 )
@@ -396,7 +396,7 @@ class Means:
         start = None if speed is None else SimpleNamespace(fitted_parameters={START_SPEED_PARAMETER_NAME: speed})
         return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
 
-    def theta_and_initial_state_offset(self, x, i):
+    def theta_and_initial_state_deviation(self, x, i):
         return float(x[0]) + (0.0 if "a.memory" in self.unknown_names else self.off), None
 
     def evaluate(self, x, equilibrium_guesses=None):
@@ -404,7 +404,7 @@ class Means:
         jacobian[:, 0] = 1.0
         return SimpleNamespace(residual=x[0] - self.values, jacobian=jacobian, equilibrium_guesses=None)
 
-    def with_compiled_parameters_free(self, names):
+    def with_free_parameters_without_recompiling(self, names):
         made = Means(self.values, [0.0] * len(self.values), tuple(names), self.off)
         made.episodes, made.bounds = self.episodes, tuple(bound[:1] for bound in self.bounds)
         return made
@@ -442,12 +442,12 @@ def solved(monkeypatch):
 )
 def test_nothing_is_asked_where_nothing_is_in_question(solved, names, speeds):
     problem, found = Means((1.0, 2.0, 3.0), speeds, names), fitted((2.0, 0.5), names)
-    safe = decide_cable_memory(problem, None, found)
+    safe = choose_cable_memory_fit(problem, None, found)
     assert (safe.problem, safe.solution, safe.message, solved.problems) == (problem, found, "", [])
 
 
 def test_a_single_recording_in_motion_bears_nothing_out(solved):
-    safe = decide_cable_memory(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
+    safe = choose_cable_memory_fit(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
     assert safe.problem is solved.problems[0]
     assert (safe.problem.unknown_names, safe.solution.x.tolist()) == (("k",), [2.0])
     assert "too few recordings start in motion" in safe.message
@@ -470,7 +470,7 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     """Each from the others alone: the first from a mean of 4, the last from 1.5, wherever the fit of all stands."""
     problem, found = Means((1.0, 2.0, 6.0), (0.5, 0.0, 0.5), off=off), fitted((at, 0.5))
     problem.bounds = tuple(np.array([bound, side]) for bound, side in zip(bounds, (0.0, 1.0), strict=True))
-    safe = decide_cable_memory(problem, None, found)
+    safe = choose_cable_memory_fit(problem, None, found)
     missed = np.array(predicted) - [1.0, 6.0]
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (safe.problem is problem) is kept
@@ -481,6 +481,6 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
 def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
     problem.predictor.predict_episode = lambda *_: "it snaps"
-    assert "inf with it and" in decide_cable_memory(problem, None, found).message
+    assert "inf with it and" in choose_cable_memory_fit(problem, None, found).message
     solved.ok = False
-    assert decide_cable_memory(problem, None, found).solution is found
+    assert choose_cable_memory_fit(problem, None, found).solution is found

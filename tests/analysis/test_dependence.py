@@ -10,12 +10,12 @@ from small_problems import pendulum_step
 from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
     ParameterDetectability,
-    linearise_and_check,
+    checked_step_linearisation,
     linearise_step_equations,
-    parameter_rows_and_sensor_responses,
-    step_size_summary,
+    parameter_detectabilities,
+    step_complexity_summary,
 )
-from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
@@ -45,8 +45,8 @@ def judged(problem):
     assert rest.is_converged
     path = episode.initial_known_coordinates[len(system.driven) :]
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
-    symbols = StepSymbols.from_equations(step.equations)
-    found = parameter_rows_and_sensor_responses(step, symbols, episode, rest.state, problem.theta, rows)
+    symbols = NamedStepEquations.from_equations(step.equations)
+    found = parameter_detectabilities(step, symbols, episode, rest.state, problem.theta, rows)
     return {entry.parameter: entry for entry in found}, rest, rows
 
 
@@ -178,11 +178,11 @@ def test_efforts_of_joints_moved_as_measured_feel_their_own_rows(swinging):
 
 def test_without_sensors_only_rows_are_said(hanging):
     step = hanging().step
-    symbols = StepSymbols.from_equations(step.equations)
+    symbols = NamedStepEquations.from_equations(step.equations)
     theta = step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, theta, np.zeros(0))
-    found = {e.parameter: e for e in parameter_rows_and_sensor_responses(step, symbols, None, rest.state, theta, rows)}
+    found = {e.parameter: e for e in parameter_detectabilities(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].observable_rows is None
     assert found["T1.twist"].max_change_from_rest is None
     assert found["T1.bend"].description == "T1.bend enters 12 rows (6 of del, 6 of p1)."
@@ -236,7 +236,7 @@ def held_pendulum(urdf_folder):
 
 def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder, held_pendulum):
     swing = pendulum_step(urdf_folder, driven=("shoulder",))
-    found = step_size_summary(swing)
+    found = step_complexity_summary(swing)
     assert found["sizes"] == swing.sizes
     assert found["sizes"] | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found["sizes"]
     assert (found["unknowns"], found["jacobian_nonzeros"]) == (2, 4)
@@ -245,7 +245,7 @@ def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder, 
         assert entry == {"name": f.name(), "operations": f.n_instructions(), "nonzeros": nonzeros}
     assert max(entry["operations"] for entry in found["functions"]) > 100
     sizes = held_pendulum.sizes
-    assert step_size_summary(held_pendulum)["unknowns"] == sizes["n"] - 2 + sizes["nz"] + sizes["m"]
+    assert step_complexity_summary(held_pendulum)["unknowns"] == sizes["n"] - 2 + sizes["nz"] + sizes["m"]
 
 
 def linearised(step, wrong=None):
@@ -263,7 +263,7 @@ def linearised(step, wrong=None):
             return matrices
 
         step = Changed(step, jacobians)
-    return linearise_and_check(step, state, np.zeros(step.sizes["nu"]), step.system.parameters.vector(), posture)
+    return checked_step_linearisation(step, state, np.zeros(step.sizes["nu"]), step.system.parameters.vector(), posture)
 
 
 class Changed:

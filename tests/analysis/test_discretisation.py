@@ -204,9 +204,9 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
         points = replace(points, name="points_camera", sensor="camera", pose=np.eye(4))
     drawn = replace(drawn, joints=replace(drawn.joints, **levels), points=(points,))
     free, gains = ("elbow.damping", "elbow.stiffness"), (9.0,)
-    options = ProblemOptions(tracking_filter=feedback, tracking_filter_gains=gains)
+    options = ProblemOptions(arm_tracking_feedback=feedback, arm_tracking_feedback_gains=gains)
     truth = EstimationProblem(step_with_time_step(step, 0.0025), [drawn], free, options)
-    recording = truth.simulate_recording(seed=1)
+    recording = truth.simulate_noisy_recording(seed=1)
     coarse, anew = (EstimationProblem(step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02))
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)

@@ -16,12 +16,12 @@ from yid_ocp.analysis import torque_error_propagation as propagation
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    CandidateExperimentBuilder,
     CandidateExperimentSensitivities,
+    CandidateExperimentSensitivityBuilder,
     FrameObservationSchedule,
     RecordedExperiment,
-    add_observable_frames_to_step,
     observable_frames,
+    step_and_observable_frames,
 )
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
@@ -55,8 +55,8 @@ MARKER_DISTANCE = 0.03
 def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
-        (made.camera_sample_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_point_sample_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.camera_group_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
+        (made.arm_point_group_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -67,12 +67,12 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     std = np.full((3, 2, 3), 2e-3)
     std[0] = [9e-3, np.nan, 9e-3]
     made, episode = setting(group(std=std))
-    assert made.camera_sample_times_and_std(episode)[2] == 2e-3
+    assert made.camera_group_times_and_std(episode)[2] == 2e-3
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
-    assert made.camera_sample_times_and_std(episode)[2] == 3e-3
+    assert made.camera_group_times_and_std(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
     with pytest.raises(DataError, match="the noise level of group 'points_camera' is not known"):
-        unknown.existing_sensor_observations(episode)
+        unknown.existing_point_observation_schedules(episode)
 
 
 def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen():
@@ -86,7 +86,7 @@ def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen
     }
     groups = replace(made, position=position), group("points_arm"), group("points_off")
     chosen, episode = setting(*groups, sensors=sensors)
-    found = chosen.existing_sensor_observations(episode)
+    found = chosen.existing_point_observation_schedules(episode)
     seen = [("points_camera", "a"), ("points_camera", "tip"), ("points_arm", "b")]
     assert [(view.point_group, view.frame) for view in found] == seen
     np.testing.assert_allclose(found[0].times, [0.0, 0.5, 1.0])
@@ -115,7 +115,7 @@ def test_a_view_is_interpolated_between_nodes(sloped, time, weights):
     std = np.array([[0.1, 0.2, 0.5]])
     slopes = sloped.position_sensitivities[0, "camera", "a"]
     rows = sum((w * slopes[k] for k, w in weights.items()), np.zeros((3, 2))) / std.T
-    found = sloped.fisher_information([[view([time], std)], [], []])
+    found = sloped.fisher_information_with_prior([[view([time], std)], [], []])
     np.testing.assert_allclose(found, np.diag([7.0, 0.0]) + rows.T @ rows, atol=1e-9)
 
 
@@ -132,7 +132,7 @@ def test_views_add_up_over_frames_times_and_recordings(sloped):
 
     for std in (0.1, 0.1, 0.05):
         views = [[view([0.0, 1.0], std)], [view([0.5], 0.2), view([0.5], 0.2, "b")]]
-        np.testing.assert_allclose(sloped.fisher_information(views), information(std))
+        np.testing.assert_allclose(sloped.fisher_information_with_prior(views), information(std))
 
 
 @pytest.mark.parametrize(("links", "middle"), [(1, []), (2, ["T1_0_tip"]), (3, ["T1_1_tip"]), (4, ["T1_1_tip"])])
@@ -188,7 +188,7 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     base = RecordedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
-    assert CandidateExperimentBuilder(base).applicable_mechanical_changes() == possible.split()
+    assert CandidateExperimentSensitivityBuilder(base).applicable_mechanical_changes() == possible.split()
 
 
 @pytest.fixture(scope="module")
@@ -213,21 +213,21 @@ def swung(urdf_folder):
 
 def built(problem, *mechanics, heard=None, **settings):
     """The builder of a problem's variants, and the variant with these changes."""
-    made = CandidateExperimentBuilder(
+    made = CandidateExperimentSensitivityBuilder(
         RecordedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
     )
-    found = made.build_experiment(frozenset(mechanics))
+    found = made.build_sensitivities(frozenset(mechanics))
     assert not isinstance(found, str), found
     return made, found
 
 
 def informed(problem, *mechanics):
     made, found = built(problem, *mechanics)
-    views = [made.setting.existing_sensor_observations(episode) for episode in problem.episodes]
-    return found, found.fisher_information(views)
+    views = [made.setting.existing_point_observation_schedules(episode) for episode in problem.episodes]
+    return found, found.fisher_information_with_prior(views)
 
 
-COSTS = [{}, {"huber_threshold": 0.1}, {"weighting": "paper"}, {"weak_prior_std_as_factor": 0.01}, {"duration": 0.8}]
+COSTS = [{}, {"huber_threshold": 0.1}, {"weighting": "paper"}, {"weak_prior_geometric_std": 0.01}, {"duration": 0.8}]
 
 
 @pytest.mark.parametrize("options", [*COSTS, {"prior_stds": {"elbow.stiffness": 1e-3}}])
@@ -248,19 +248,19 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     problem = swung()
     x = np.array([np.nan, 0.1])
-    found = CandidateExperimentBuilder(RecordedExperiment(problem, x)).build_experiment(frozenset())
+    found = CandidateExperimentSensitivityBuilder(RecordedExperiment(problem, x)).build_sensitivities(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
 def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung):
     heard = Heard()
     builder, made = built(swung(), "torque", heard=heard)
-    blind = made.fisher_information([[]])
+    blind = made.fisher_information_with_prior([[]])
     assert np.all(np.linalg.eigvalsh(blind) > 0)
-    stated = built(swung(effort_std=0.05), "torque")[1].fisher_information([[]])
+    stated = built(swung(effort_std=0.05), "torque")[1].fisher_information_with_prior([[]])
     np.testing.assert_allclose(stated, 4 * blind, rtol=1e-9)
     assert made.problem.system.prescribed == ("shoulder",)
-    assert builder.build_experiment(frozenset({"torque"})) is made
+    assert builder.build_sensitivities(frozenset({"torque"})) is made
     assert heard.stages == ["working out joint torques as a measurement, the arms' motion as known"]
 
 
@@ -272,7 +272,7 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
     np.testing.assert_allclose(camera.t, episode.grid.node_times)
     assert np.all(camera.std == 1.0)
     step = swung().step
-    more, seen = add_observable_frames_to_step(step)
+    more, seen = step_and_observable_frames(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel
@@ -280,10 +280,10 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
 
 def test_welds_keep_the_orientation_at_the_start(held_tube):
     builder, made = built(held_tube, "weld")
-    (grasp,), free = made.problem.system.grasps, builder.build_experiment(frozenset())
+    (grasp,), free = made.problem.system.grasps, builder.build_sensitivities(frozenset())
     assert grasp.kind == "weld"
-    start = free.problem.initial_state(
-        free.problem.episodes[0], *free.problem.theta_and_initial_state_offset(free.x, 0)
+    start = free.problem.initial_state_of_episode(
+        free.problem.episodes[0], *free.problem.theta_and_initial_state_deviation(free.x, 0)
     )
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
     tree = system.numeric_mechanism()
@@ -372,13 +372,13 @@ def drawn_motion(monkeypatch):
             row[:, feedback.state_indices] -= s.state_by_torque @ gain
         return [(np.stack(rows), None)]
 
-    monkeypatch.setattr(propagation, "step_maps", maps)
+    monkeypatch.setattr(propagation, "rollout_step_derivatives", maps)
     monkeypatch.setattr(
         propagation, "applied_torque_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    functions = SimpleNamespace(step=None, reference_momentum_shift=shift)
+    functions = SimpleNamespace(step=None, effect_momentum_shift=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
@@ -494,8 +494,8 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
 
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
-    builder = CandidateExperimentBuilder(RecordedExperiment(noisy, noisy.initial_unknowns))
-    made = builder.build_experiment(frozenset({"motion"}))
+    builder = CandidateExperimentSensitivityBuilder(RecordedExperiment(noisy, noisy.initial_unknowns))
+    made = builder.build_sensitivities(frozenset({"motion"}))
     assert not isinstance(made, str), made
     own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors
     for name in ("torque_std", "torque_bias_std", "angle_std"):

@@ -18,7 +18,7 @@ from yid_ocp.analysis.identifiability import (
 )
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError
-from yid_ocp.inference.uncertainty import percent_text
+from yid_ocp.inference.uncertainty import percent_number_text
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp
 from yid_ocp.problem import EstimationProblem
@@ -194,7 +194,7 @@ def test_a_start_fitted_to_points_becomes_the_centre_of_a_prior(pendulum, twin):
     empty = pendulum()
     made = pendulum(twin(empty, empty.initial_unknowns, 3))
     recordings = [episode.recording for episode in made.episodes]
-    options = replace(made.options, initial_state="fitted_to_points", start_fit_window=0.05)
+    options = replace(made.options, initial_state="fitted_to_points", initial_state_fit_window=0.05)
     given = EstimationProblem(made.step, recordings, made.free, options)
     known, unknown = identifiability(given), identifiability(given, start="unknown")
     assert known.nuisance_names == ()
@@ -235,7 +235,7 @@ def test_what_is_said_of_one_parameter_is_what_stands_beside_it():
     info = identifiability(Formula(rows, START), [2.0, 50.0])
     for direction in info.directions:
         [name] = [name for name, part in direction.components.items() if abs(part) > 0.5]
-        assert f"(± {percent_text(info.parameters[name].std_relative)} %)" in direction.words
+        assert f"(± {percent_number_text(info.parameters[name].std_relative)} %)" in direction.words
 
 
 def test_a_joint_change_names_the_largest_part_first_and_leaves_small_ones_out():

@@ -16,7 +16,7 @@ from yid_ocp.analysis.step_diagnostics import (
     nlp_stage_sparsity,
     step_sparsity_patterns,
 )
-from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -40,7 +40,7 @@ def test_patterns_of_a_step_hold_its_matrices(step):
     """At a state like any other, where nothing vanishes by chance."""
     sizes, n = step.sizes, step.sizes["n"]
     rng = np.random.default_rng(5)
-    symbols = StepSymbols.from_equations(step.equations)
+    symbols = NamedStepEquations.from_equations(step.equations)
     theta = step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.array([0.3, -0.6]), theta, None)
     assert rest.is_converged
@@ -71,7 +71,7 @@ def test_patterns_of_a_step_hold_its_matrices(step):
 
 
 def test_blocks_cover_rows_and_columns(step):
-    symbols = StepSymbols.from_equations(step.equations)
+    symbols = NamedStepEquations.from_equations(step.equations)
     names = {"dR_dy": ("del", "q1"), "A": ("q1", "q0"), "B_u": ("q1", "u"), "B_theta": ("q1", "theta")}
     for name, pattern in step_sparsity_patterns(symbols).items():
         for spans, labels, count in (
@@ -88,10 +88,10 @@ def test_blocks_cover_rows_and_columns(step):
 
 
 def test_a_stiffness_enters_the_rows_of_its_joints_alone(step):
-    found = step_sparsity_patterns(StepSymbols.from_equations(step.equations))["dR_dtheta"]
+    found = step_sparsity_patterns(NamedStepEquations.from_equations(step.equations))["dR_dtheta"]
     column = found.column_labels.index("T1.twist")
     rows = {found.row_labels[i] for i in np.flatnonzero(found.nonzero_mask[:, column])}
-    relaxing = {name for name in step.system.internal_coordinate_symbols if name.endswith("_z")}
+    relaxing = {name for name in step.system.effect_internal_coordinate_symbols if name.endswith("_z")}
     assert rows - relaxing == {"T1_0_z", "T1_1_z", "T1_2_z"}
 
 
@@ -105,7 +105,7 @@ def made_problem(urdf_folder, feedback, start):
     how = {"sensor": "camera", "pose": np.eye(4)}
     camera = PointGroup("points_camera", ["T1_0_tip"], t[:4] + 0.004, np.zeros((4, 1, 3)), 2e-3, **how)
     step = compile_step(system, 0.01, use_compiler=False)
-    options = ProblemOptions(path_cutoff=math.inf, tracking_filter=feedback, initial_state=start)
+    options = ProblemOptions(path_cutoff=math.inf, arm_tracking_feedback=feedback, initial_state=start)
     return EstimationProblem(step, [Recording(joints, (camera,), name="short")], ("T1.bend", "T1.length"), options)
 
 
@@ -114,7 +114,7 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     problem = made_problem(urdf_folder, feedback, start)
     program = transcribe(problem)
     episode = problem.episodes[0]
-    symbols = StepSymbols.from_equations(problem.step.equations)
+    symbols = NamedStepEquations.from_equations(problem.step.equations)
     followed = () if episode.tracking_feedback is None else tuple(episode.tracking_feedback.state_indices)
     sensors = [samples.sensor for samples in episode.measurements]
     loose = problem.predictor.estimated_initial_state_indices
@@ -124,7 +124,7 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     width = size["variables"]
     jacobian, curved, measured = kkt.nonzero_mask[width:, :width], kkt.nonzero_mask[:width, :width], kkt.marked_mask
     # the program has the equilibrium at the start and the torques' errors besides
-    shown = np.setdiff1d(np.arange(program.w.numel()), program.block_layout("rest").index)[:width]
+    shown = np.setdiff1d(np.arange(program.w.numel()), program.named_block("rest").index)[:width]
     rng = np.random.default_rng(0)
     w = program.initial_guess + 1e-3 * rng.normal(size=len(program.initial_guess))
     weights = rng.normal(size=program.g.numel())
@@ -156,7 +156,7 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
 def test_the_size_of_many_steps_is_that_of_the_matrices(urdf_folder):
     """Of two recordings that share their parameters, where nothing is measured and no prior counts."""
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
-    symbols = StepSymbols.from_equations(problem.step.equations)
+    symbols = NamedStepEquations.from_equations(problem.step.equations)
     stage = nlp_stage_sparsity(symbols, ("T1.bend",), [], (0, 1), ())
     size, width, height, nonzeros = full_nlp_size(stage, [5, 7]), 0, 0, 0
     for steps in (5, 7):
@@ -170,7 +170,7 @@ def test_the_size_of_many_steps_is_that_of_the_matrices(urdf_folder):
 
 def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
-    symbols = StepSymbols.from_equations(problem.step.equations)
+    symbols = NamedStepEquations.from_equations(problem.step.equations)
     sensors = [samples.sensor for samples in problem.episodes[0].measurements]
     stage = nlp_stage_sparsity(symbols, problem.shared_parameters, sensors, (), ())
     kkt = kkt_sparsity_pattern(stage, 2)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
-from yid_ocp.analysis.clock_checks import check_fit_for_drift_and_noise
+from yid_ocp.analysis.clock_checks import drift_and_overstated_noise_issues
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
     check_efforts_by_inverse_dynamics,
@@ -21,7 +21,7 @@ from yid_ocp.analysis.joint_checks import (
 )
 from yid_ocp.analysis.point_checks import (
     check_cable_point_geometry,
-    check_object_points_by_rollout,
+    check_object_points_against_rollout,
     check_point_distances,
     check_robot_held_points,
 )
@@ -432,14 +432,14 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
     samples = measured(sensor, at, 0.0 * at, change(place).reshape(20, 9))
     episode = SimpleNamespace(name="run", measurements=(samples,))
     result = SimpleNamespace(predicted_outputs=(place.reshape(20, 9),))
-    found = list(check_object_points_by_rollout(episode, result, 2.0))
+    found = list(check_object_points_against_rollout(episode, result, 2.0))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         apart = np.sqrt(np.mean(np.sum((change(place) - place) ** 2, axis=2)))
         assert (doubt.recording, doubt.group, doubt.weight) == ("run", "points_camera", "not_trusted")
         assert doubt.evidence_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
         assert words in doubt.what
-    assert list(check_object_points_by_rollout(episode, result, 0.0)) == []
+    assert list(check_object_points_against_rollout(episode, result, 0.0)) == []
 
 
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}
@@ -566,7 +566,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0):
         options = replace(options, sensors={**options.sensors, group.name: own})
     made = EstimationProblem(problem.step, [replace(recording, points=(moved,))], problem.free, options)
     solution = solve(made, run.solver)
-    return check_fit_for_drift_and_noise(solution.problem or made, solution.x, solution.evaluation)
+    return drift_and_overstated_noise_issues(solution.problem or made, solution.x, solution.evaluation)
 
 
 def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a_diagnosis(springs):
@@ -587,12 +587,12 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
     arm = joints(("shoulder",), t, 0.4 * np.sin(5 * t)[:, None], effort=2 * np.cos(5 * t)[:, None], **more)
     camera = seen(["tip"], t[4:-4:4], np.zeros((74, 1, 3)), "points_camera", std=np.full((74, 1, 3), 2e-3))
     source = EstimationProblem(step, [recording(arm, camera)], ["elbow.stiffness"])
-    made = source.simulate_recording(seed=1)
+    made = source.simulate_noisy_recording(seed=1)
     moved = replace(made.points[0], t=1.5 + 1.02 * (made.points[0].t - 1.5))
     problem = EstimationProblem(step, [replace(made, points=(moved,))], ["elbow.stiffness"])
     solution = solve(problem, GaussNewton(), restarts=False)
     assert solution.problem.has_process_noise
-    (doubt,) = check_fit_for_drift_and_noise(solution.problem, solution.x, solution.evaluation)
+    (doubt,) = drift_and_overstated_noise_issues(solution.problem, solution.x, solution.evaluation)
     assert (doubt.cause, doubt.group) == ("clock_drift", "points_camera")
     assert "its clock runs 20 ± 0.4 parts per thousand too fast" in doubt.what
 

@@ -8,7 +8,13 @@ import pytest
 from formula_reader import FUNCTIONS, read, read_latex
 from held_rod import held_rod
 
-from yid_ocp.analysis.step_symbols import StepSymbols, _SymbolName, count_operations, escape_latex, format_expressions
+from yid_ocp.analysis.step_symbols import (
+    NamedStepEquations,
+    _SymbolName,
+    count_operations,
+    escape_latex,
+    format_expressions,
+)
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import Grasp
@@ -19,7 +25,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 def symbols(urdf_folder):
     """A driven shoulder, a springy elbow whose tip is tied to a rod; a relaxing branch on the rod."""
     system = held_rod(urdf_folder, kind="axis", driven=["shoulder"], springs={"elbow": RobotJointSpring(3.0)})
-    return StepSymbols.from_equations(discrete_equations(system))
+    return NamedStepEquations.from_equations(discrete_equations(system))
 
 
 def point(symbols):
@@ -41,7 +47,7 @@ def test_blocks_have_the_names_of_the_project(symbols):
     assert [block.name for block in symbols.row_blocks] == ["del", "internal", "constraint", "p1"]
     parts = "x", "y", "z", "tilt_x", "tilt_y"
     assert symbols.row_blocks[2].full_names == tuple(f"constraint[hand.{part}]" for part in parts)
-    assert list(symbols.row_blocks[1].labels) == list(symbols.equations.system.internal_coordinate_symbols)
+    assert list(symbols.row_blocks[1].labels) == list(symbols.equations.system.effect_internal_coordinate_symbols)
     assert symbols.column_blocks[3].full_names == ("u[shoulder]",)
     # parameters are called as everywhere, without a block
     assert symbols.column_blocks[4].full_names == symbols.equations.system.parameters.names

@@ -12,17 +12,17 @@ from heard import Heard
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis.experiment_design import (
     MECHANICAL_CHANGE_DESCRIPTIONS,
-    CandidateExperimentBuilder,
+    CandidateExperimentSensitivityBuilder,
     RecordedExperiment,
 )
 from yid_ocp.analysis.identifiability import identifiability
-from yid_ocp.analysis.what_if import ChangedExperimentResult, evaluate_change_sets, what_if
+from yid_ocp.analysis.what_if import ChangedExperimentResult, evaluate_experiment_change_sets, what_if
 from yid_ocp.data.recording import PointGroup
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.virtual.experiment import VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.virtual.experiment import VirtualExperimentSettings, baxter_foam_y_system, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build_problem import load_problem
@@ -157,7 +157,7 @@ def test_a_fit_that_is_worse_than_its_noise_informs_less(held_tube, tube_ranking
     found = what_if(held_tube, x, considered_changes=()).unchanged_experiment.std_relative["T1.bend"]
     known = tube_ranking[0].unchanged_experiment.std_relative["T1.bend"]
     assert found == pytest.approx(math.sqrt(chi2) * known, rel=1e-5)
-    [other] = evaluate_change_sets(RecordedExperiment(held_tube, x), [()], chi2)
+    [other] = evaluate_experiment_change_sets(RecordedExperiment(held_tube, x), [()], chi2)
     assert other.std_relative["T1.bend"] == pytest.approx(found, rel=1e-9)
 
 
@@ -207,8 +207,8 @@ def missing(*arguments, **settings):
 
 def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
-    builder = CandidateExperimentBuilder(RecordedExperiment(short_run, short_run.initial_unknowns))
-    other = builder.build_experiment(frozenset({"motion"}))
+    builder = CandidateExperimentSensitivityBuilder(RecordedExperiment(short_run, short_run.initial_unknowns))
+    other = builder.build_sensitivities(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_driven_angles[:20]
     np.testing.assert_allclose(other.problem.episodes[0].measured_driven_angles[:20], held_out, atol=1e-12)
@@ -256,14 +256,16 @@ def test_one_arm_needs_another_arm_and_welds(exact):
 def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     """Two arms with welds and no camera, MuJoCo's motion and noise, from a start of 3 N m/rad each."""
     made = exact("dual_arm_no_vision")
-    layout = CandidateExperimentBuilder(RecordedExperiment(made, at_truth(made))).build_experiment(frozenset({"weld"}))
+    layout = CandidateExperimentSensitivityBuilder(RecordedExperiment(made, at_truth(made))).build_sensitivities(
+        frozenset({"weld"})
+    )
     assert not isinstance(layout, str), layout
     system = layout.problem.system
     posture = dict(zip(system.driven, map(float, made.episodes[0].measured_driven_angles[0]), strict=True))
     how = {"initial_joint_angles": posture, "excitation": MultisineOptions(gripper_travel=0.13)}
     motion = random_multisine_motion(system, TRUTH, seed=7, **how)
     simulation = SimulationOptions(time_step=5e-5)
-    experiment = VirtualExperiment(motion, posture, simulation, camera=None, seed=5, recording_name="welded")
+    experiment = VirtualExperimentSettings(motion, posture, simulation, camera=None, seed=5, recording_name="welded")
     recording = run_virtual_experiment(system, TRUTH, experiment)
     assert [group.name for group in recording.points] == ["points_arm"]
     start = dict.fromkeys(TRUTH, 3.0)

@@ -4,7 +4,7 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
-from yid_ocp.workflow.run_inputs import given_or_shipped_recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links and a short horizon
@@ -19,7 +19,7 @@ COARSE = (
     "parameters={T*.bend: {initial: 2.8}, T1.bend: {free: true, initial: 5.5}, T*.twist: {initial: 2.5}}",
 )
 # one of the paper's experiments is run with half the time step as well
-UNREFINED = ("output.discretisation_check=none",)
+UNREFINED = ("output.discretisation_check_mode=none",)
 FEW = ("solver.max_iterations=2", "problem.use_compiler=false")
 DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
@@ -38,7 +38,7 @@ QUICK = {
         *UNREFINED,
     ),
     "deft_bdlo1": (
-        *("problem.duration=0.1", *FEW, "problem.start_fit_parameters=[]", *UNREFINED),
+        *("problem.duration=0.1", *FEW, "problem.initial_state_fit_parameters=[]", *UNREFINED),
         f"recordings.estimate=[{DEFT.format('007')}]",
         f"recordings.held_out=[{DEFT.format('014')}]",
     ),
@@ -56,7 +56,7 @@ def recorded(repository, name):
     file = configurations(repository)[name]
     recordings = load_config(file).recordings
     for path in (*recordings.estimate, *recordings.held_out):
-        if not given_or_shipped_recording_path(path).is_file():
+        if not resolve_recording_path(path).is_file():
             pytest.skip(f"its recordings are not here: {path}")
     return file
 

@@ -99,13 +99,13 @@ def arm_and_camera() -> Messages:
 def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, heard = write_bag(tmp_path, kind, arm_and_camera()), Heard()
     monkeypatch.setattr("yid_ocp.data.readers.bags._PROGRESS_INTERVAL", 3)
-    recording = read_any(path, sensor_description="camera", progress=heard)
+    recording = read_any(path, point_sensor_name="camera", progress=heard)
     assert heard.parts == [(done, 8, "messages") for done in (0, 3, 6)]
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert np.allclose(joints.t, 0.01 * np.arange(5), rtol=0, atol=1e-12)
     assert np.allclose(joints.position, np.outer(np.arange(5), [0.1, 0.2]))
-    assert list(joints.channels) == ["position", "velocity"]
+    assert list(joints.values_by_channel) == ["position", "velocity"]
     (points,) = recording.points
     assert (points.name, points.names) == ("points", ("w_T1", "w_T2"))
     assert (points.frame, points.sensor, points.clock) == ("camera_link", "camera", "recorded")
@@ -158,7 +158,7 @@ def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
     assert joints.t[-1] == pytest.approx(0.19)
     assert np.allclose(joints.position[:, 0], joints.t)  # 0.01 rad every 10 ms, interpolated
     assert np.allclose(joints.position[:, 1], joints.t - 0.005)
-    assert np.array_equal(joints.channels["effort"][:, 1], 2.0 * np.arange(len(joints.t)))
+    assert np.array_equal(joints.values_by_channel["effort"][:, 1], 2.0 * np.arange(len(joints.t)))
     assert any("/left were interpolated to the times of /right" in note for note in recording.notes)
     alone = read_any(path, joint_topics=["/right"])
     assert alone.joint_names == ("b",)
@@ -187,7 +187,7 @@ def test_a_gap_of_one_topic_stays_a_gap_and_commands_are_held_until_the_next(tmp
     path = write_bag(tmp_path / "held", "mcap", messages)
     joints = joints_of(read_any(path, joint_topics=["/left"], command_topic="/command"))
     wanted = [10.0] * 7 + [11.0] * 5 + [12.0] * 5 + [13.0] * 3
-    assert np.array_equal(joints.channels["position_command"][:, 0], wanted)
+    assert np.array_equal(joints.values_by_channel["position_command"][:, 0], wanted)
 
 
 def twelve_topics() -> Messages:
@@ -309,9 +309,9 @@ def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
     joints = joints_of(read_any(path, joints=["b=elbow", "a"]))
     assert set(joints.names) == {"elbow", "a"}
     assert np.allclose(joints.position[:, joints.names.index("elbow")], joints.t - 0.005)
-    efforts = joints_of(read_bag(path)).channels["effort"]
+    efforts = joints_of(read_bag(path)).values_by_channel["effort"]
     options: dict[str, Any] = {"torque_constants": {"*": 0.1, "b": 0.2}, "gears": {"b": 50.0}}
-    torques = joints_of(read_any(path, units={"effort": "mA"}, **options)).channels["effort"]
+    torques = joints_of(read_any(path, units={"effort": "mA"}, **options)).values_by_channel["effort"]
     assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
     current = "effort of 'a' is a current, and its torque constant is not given"
     refused(path, current, units={"effort": "A"}, torque_constants={"b": 1.0})

@@ -12,7 +12,7 @@ from recording_examples import joints_of, table
 from yid_ocp.data import readers
 from yid_ocp.data.readers import READERS, preview_file, read_any
 from yid_ocp.data.readers.csv import CsvOptions, read_csv
-from yid_ocp.data.recording import JointGroup, Recording, validate_recording
+from yid_ocp.data.recording import JointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
@@ -25,13 +25,13 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
         "\n"
         "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
     )
-    recording = read_any(path, clock="nominal", sensor_description="camera", frame="base", description="two joints")
+    recording = read_any(path, clock="nominal", point_sensor_name="camera", frame="base", description="two joints")
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert joints.clock == "nominal"
     assert np.array_equal(joints.position, [[0.1, 0.2], [0.3, 0.4]])
-    assert np.array_equal(joints.channels["effort"], [[1, 2], [3, 4]])
-    assert np.array_equal(joints.channels["position_command"], [[0, 0], [0, 1]])
+    assert np.array_equal(joints.values_by_channel["effort"], [[1, 2], [3, 4]])
+    assert np.array_equal(joints.values_by_channel["position_command"], [[0, 0], [0, 1]])
     (points,) = recording.points
     assert (points.names, points.sensor, points.frame, points.clock) == (("tip",), "camera", "base", "nominal")
     assert np.array_equal(points.position, [[[0.5, 0.6, 0.7]]])
@@ -65,8 +65,8 @@ def test_csv_units_are_converted(tmp_path: Path) -> None:
     joints = joints_of(recording)
     assert np.allclose(joints.t, [0.0, 0.5])
     assert np.allclose(joints.position[:, 0], [math.pi, math.pi / 2])
-    assert joints.channels["velocity"][0, 0] == pytest.approx(2 * math.pi)
-    assert joints.channels["effort"][0, 0] == pytest.approx(1.0)
+    assert joints.values_by_channel["velocity"][0, 0] == pytest.approx(2 * math.pi)
+    assert joints.values_by_channel["effort"][0, 0] == pytest.approx(1.0)
     assert np.allclose(recording.points[0].position[0, 0], [0.001, 0.002, 0.003])
     with pytest.raises(DataError, match="reaches 180 rad"):
         read_any(path, units={"t": "ms"})
@@ -193,7 +193,7 @@ def test_a_table_without_a_header(tmp_path: Path) -> None:
     columns = {"1": "t", "2": "position:a", "3": "effort:a"}
     joints = joints_of(read_any(path, header=False, columns=columns))
     assert np.array_equal(joints.position[:, 0], [0.1, 0.2])
-    assert np.array_equal(joints.channels["effort"][:, 0], [5, 6])
+    assert np.array_equal(joints.values_by_channel["effort"][:, 0], [5, 6])
     with pytest.raises(DataError, match="no header row") as caught:
         read_any(path, columns=columns)
     assert "--no-header --columns t," in caught.value.hint
@@ -206,7 +206,7 @@ def test_patterns_of_columns(tmp_path: Path) -> None:
         read_any(path, columns=columns)
     joints = joints_of(read_any(path, columns={**columns, "b_tau": "effort:elbow"}))
     assert joints.names == ("a", "elbow")
-    assert np.array_equal(joints.channels["effort"], [[3, 4], [8, 9]])
+    assert np.array_equal(joints.values_by_channel["effort"], [[3, 4], [8, 9]])
 
 
 def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
@@ -262,7 +262,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     assert joints.names == ("shoulder", "elbow")
     np.testing.assert_array_equal(joints.t, [0.0, 0.02])
     values = {"position": [[0.1, 0.2], [0.5, 0.6]], "velocity": [[1, 2], [3, 4]]}
-    np.testing.assert_equal(joints.channels, {**values, "position_command": [[0.3, 0.4], [0.7, 0.8]]})
+    np.testing.assert_equal(joints.values_by_channel, {**values, "position_command": [[0.3, 0.4], [0.7, 0.8]]})
     contents = preview_file(path)
     assert "columns" not in contents.reader_options
     assert [source.imported_as for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
@@ -303,7 +303,7 @@ def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.Mo
 
     @READERS.register(".one")
     def read_one(path: Path, *, value: float = 1.0) -> Recording:
-        return validate_recording(Recording(JointGroup(("a",), np.zeros(1), np.full((1, 1), value)), name=path.stem))
+        return validated_recording(Recording(JointGroup(("a",), np.zeros(1), np.full((1, 1), value)), name=path.stem))
 
     assert joints_of(read_any(tmp_path / "run.one", value=2.0)).position[0, 0] == 2.0
 

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 from recording_examples import assert_same, changed, example, finite, joints_of, turned, with_joints
 
 from yid_ocp.data import recording_hdf5
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import (
     create_hdf5_atomically,
     open_hdf5_after_read_check,
@@ -104,7 +104,7 @@ def recordings(draw: st.DrawFn) -> Recording:
 
 @given(recordings())
 def test_any_valid_recording_survives_the_file(recording: Recording) -> None:
-    validate_recording(recording)
+    validated_recording(recording)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.h5"
         write_recording(recording, path)
@@ -224,7 +224,7 @@ def test_files_of_other_tools(file: Path) -> None:
     recording = read_recording(file)
     joints = joints_of(recording)
     assert (joints.names, joints.clock, recording.description) == (("a", "b"), "recorded", "")
-    assert joints.channels["effort"].dtype == np.float64
+    assert joints.values_by_channel["effort"].dtype == np.float64
     arm, camera = recording.points
     assert (arm.names, arm.clock) == (("w_T2",), "nominal")
     assert (np.asarray(arm.std)[0, 0, 0], np.shape(camera.std)) == (0.03, (4, 3, 3))

@@ -63,7 +63,7 @@ def test_state_and_action_of_an_episode(version: str, tmp_path: Path) -> None:
     assert (joints.names, joints.clock) == (("elbow", "shoulder_pan"), "nominal")
     assert np.allclose(joints.t, np.arange(4) / 30)
     assert np.allclose(joints.position, np.radians([[101, 100], [111, 110], [121, 120], [131, 130]]))
-    assert np.allclose(joints.channels["position_command"] - joints.position, math.radians(1))
+    assert np.allclose(joints.values_by_channel["position_command"] - joints.position, math.radians(1))
     assert recording.notes == ("observation.images.top was left out (a video feature that is not understood)",)
     assert (recording.name, recording.source) == ("arm_000001", "arm, episode 1")
 
@@ -80,8 +80,8 @@ def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
     units = {"position": "deg", "position_command": "deg", "effort": "mA"}
     joints = joints_of(read_lerobot_episode(path, units=units, torque_constants={"a": 2.0}, gears={"a": 100.0}))
     assert joints.names == ("a",)
-    assert np.array_equal(joints.channels["velocity"][:, 0], [1, 11, 21, 31])
-    assert np.allclose(joints.channels["effort"][:, 0], 0.2 * np.array([2, 12, 22, 32]))
+    assert np.array_equal(joints.values_by_channel["velocity"][:, 0], [1, 11, 21, 31])
+    assert np.allclose(joints.values_by_channel["effort"][:, 0], 0.2 * np.array([2, 12, 22, 32]))
 
 
 def test_the_preview_proposes_degrees(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_examples import assert_same, changed, example, finite, joints_of, with_camera, with_joints
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
@@ -25,7 +25,7 @@ def test_arrays_are_copied_and_read_only_and_not_ragged() -> None:
     assert group.t[0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
         group.t[0] = 5.0
-    assert list(group.channels) == ["position", "effort"]
+    assert list(group.values_by_channel) == ["position", "effort"]
     with pytest.raises(DataError, match="not an array of real numbers"):
         JointGroup(("a",), [0.0, 1.0], [[0.0], [1.0, 2.0]])  # type: ignore[arg-type]
 
@@ -47,10 +47,10 @@ def test_slice_keeps_each_clock_and_both_ends_and_drops_groups_without_samples()
     part = example().time_slice(0.1, 0.4)
     joints = joints_of(part)
     assert joints.t[[0, -1]] == pytest.approx([0.1, 0.4])
-    assert joints.channels["effort"].shape == (31, 2)
+    assert joints.values_by_channel["effort"].shape == (31, 2)
     assert list(part.points[1].t) == [0.1, 0.35]
     assert np.shape(part.points[1].std) == (2, 3, 3)
-    assert_same(part, validate_recording(part))
+    assert_same(part, validated_recording(part))
     part = example().time_slice(0.6, 1.0)
     assert part.joints is None
     assert [group.name for group in part.points] == ["points_camera"]
@@ -65,13 +65,13 @@ def test_an_empty_slice_is_refused(bounds: tuple[float, float]) -> None:
 
 def test_positions_of_the_straight_object_follow_their_points() -> None:
     straight = np.arange(9.0).reshape(3, 3)
-    recording = validate_recording(
+    recording = validated_recording(
         dataclasses.replace(example(), points=example().points[1:], marker_reference_pose=straight)
     )
     assert recording.marker_reference_pose is not None
     with pytest.raises(ValueError, match="read-only"):
         recording.marker_reference_pose[0, 0] = 5.0
-    assert np.array_equal(validate_recording(recording.time_slice(0.0, 0.2)).marker_reference_pose, straight)
+    assert np.array_equal(validated_recording(recording.time_slice(0.0, 0.2)).marker_reference_pose, straight)
     assert recording.time_slice(0.4, 0.45).marker_reference_pose is None, "no frame of the points lies in between"
 
 
@@ -169,7 +169,7 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
 def test_invalid_recordings_are_refused(case: str, tmp_path: Path) -> None:
     make, message = INVALID[case]
     with pytest.raises(DataError, match=message) as caught:
-        validate_recording(make())
+        validated_recording(make())
     assert "recording '" in caught.value.where
     assert case not in ("degrees", "millimetres") or case in caught.value.hint
     if case != "NaN effort":
@@ -180,12 +180,12 @@ def test_invalid_recordings_are_refused(case: str, tmp_path: Path) -> None:
 
 def test_nan_effort_on_request() -> None:
     recording = with_joints(effort=changed(Q, (2, 0), np.nan))
-    assert validate_recording(recording, allow_nan_effort=True) is recording
+    assert validated_recording(recording, allow_nan_effort=True) is recording
     with pytest.raises(DataError, match="velocity"):
-        validate_recording(with_joints(velocity=changed(Q, (2, 0), np.nan)), allow_nan_effort=True)
+        validated_recording(with_joints(velocity=changed(Q, (2, 0), np.nan)), allow_nan_effort=True)
 
 
 def test_a_point_may_never_be_seen_and_its_std_be_nan_then() -> None:
     std = np.where(np.isnan(CAMERA.position), np.nan, 0.01)
     for recording in (with_camera(std=std), with_camera(position=np.full((4, 3, 3), np.nan))):
-        assert validate_recording(recording) is recording
+        assert validated_recording(recording) is recording

@@ -26,14 +26,14 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import ParameterTransferCheck
+from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult
-from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
+from yid_ocp.inference.smoother import SmoothedUnknowns, SmoothedUnknownsResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import SensorMeasurements
 
 
 def cases(names: str, rows: Mapping[str, object]):
@@ -141,9 +141,9 @@ def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=N
     return SelectedEffect(of, fitted or fit([of]), part or closed(), (of, *rivals))
 
 
-def carried(name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> ParameterTransferCheck:
+def carried(name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> EffectAmplitudeTransferCheck:
     """An amplitude on the recordings to estimate on and on the held-out ones."""
-    return ParameterTransferCheck("friction@elbow", name, "N m", values[0], stds[0], values[1], stds[1], agrees)
+    return EffectAmplitudeTransferCheck("friction@elbow", name, "N m", values[0], stds[0], values[1], stds[1], agrees)
 
 
 # -- smoother ---------------------------------------------------------------------------------------------------------
@@ -170,9 +170,9 @@ def smoothed(
     traces=(),
     chi2=(200.0, 100.0),
     degrees=(100.0, 90.0),
-) -> SmootherResult:
+) -> SmoothedUnknownsResult:
     """What the smoother says."""
-    return SmootherResult(
+    return SmoothedUnknownsResult(
         smoothed_unknowns=tuple(traces),
         group_variance={s: float(w > 0) for s, w in weight.items()} if variance is None else dict(variance),
         log_evidence_drop=dict(weight),
@@ -225,9 +225,9 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
     return DiagnosisResult(**(usual | changed))
 
 
-def measurements(channels, node, fraction, value, weight, span=(0, 100), **sensor) -> Measurements:
+def measurements(channels, node, fraction, value, weight, span=(0, 100), **sensor) -> SensorMeasurements:
     """Samples of unit noise on nodes."""
     value, weight = np.asarray(value, float), np.asarray(weight, float)
     made = seeing(channels, **sensor)
     rest = (weight, np.ones(value.shape), span, np.zeros(value.shape[1]))
-    return Measurements(made, np.asarray(node), np.asarray(fraction, float), value, *rest)
+    return SensorMeasurements(made, np.asarray(node), np.asarray(fraction, float), value, *rest)

@@ -9,7 +9,7 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
+from yid_ocp.diagnosis.baseline import BaselineRunData, with_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -25,16 +25,16 @@ model:
     kind: segments
     mount: {rpy: [0.0, 1.5707963267948966, 0.0]}
     segments:
-      beam: {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_per_curvature: true,
+      beam: {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, has_stiffness_per_curvature: true,
              clamped_at_base: true, joint_axes: y}
 recordings: {estimate: [bare.h5]}
 parameters:
   beam.bend: {free: true, initial: 0.015}
   beam.damping: {free: true, initial: 8.0e-5}
-problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, start_configuration_std: 0.2,
-          start_velocity_std: 3.0}
+problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, initial_configuration_std: 0.2,
+          initial_velocity_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
-output: {write_report: false, discretisation_check: none}
+output: {write_report: false, discretisation_check_mode: none}
 """
 NOISE, LOAD = 1e-4, 0.05
 TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}
@@ -50,7 +50,7 @@ def swing(folder, name, seed, effects="[]"):
     problem = build_problem(run)
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
     values = problem.named_values(problem.vector({**TRUTH, **start}))
-    theta, offset = problem.theta_and_initial_state_offset(problem.vector(values), 0)
+    theta, offset = problem.theta_and_initial_state_deviation(problem.vector(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
     made = recording_from_prediction(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)
@@ -112,7 +112,7 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
     both = refit_with_effects(AllCandidatesProblem(with_baseline_prior(problem, known), (), False), (), {})
-    [shift] = BaselineData.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
+    [shift] = BaselineRunData.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:
         assert shift.z_score is None  # the recording says nothing beside such a baseline

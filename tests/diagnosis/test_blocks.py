@@ -18,7 +18,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 def swinging(urdf_folder):
     """A pendulum let go, with dry friction in the elbow that the model does not know."""
     step, record = swinging_pendulum(urdf_folder, ("joint_coulomb", "elbow", {"tau_c": 0.02}))
-    options = ProblemOptions(initial_state="estimated", start_configuration_std=0.5, start_velocity_std=2.0)
+    options = ProblemOptions(initial_state="estimated", initial_configuration_std=0.5, initial_velocity_std=2.0)
     return EstimationProblem(step, [record(1, 400, 0.4, 1e-3)], ("elbow.damping", "shoulder.damping"), options)
 
 
@@ -72,7 +72,7 @@ def followed(monkeypatch):
     monkeypatch.setattr(hypotheses, "_in_blocks", lambda problem: replace(problem, held_out=("blocks",)))
     return lambda *held, margin=0.9: AllCandidatesProblem(
         Problem(held_out=held), (), False
-    ).truncate_held_out_recordings({}, margin)
+    ).truncate_failing_held_out_recordings({}, margin)
 
 
 WHOLE, NOTHING_OF_IT = Held("a", 500), TruncatedHeldOutRecording("b", 0.0, 5.0)

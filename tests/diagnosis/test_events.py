@@ -27,7 +27,7 @@ from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineMotion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
@@ -89,7 +89,7 @@ class Twin:
         motion = MultisineMotion(JOINTS, 0.25 / frequency, frequency, phase)
         simulation = SimulationOptions(5.0, 200.0, 1e-3, effort_kind="mean")
         noise, start = ArmSensorNoise(position_std=5e-5, effort_std=0.02), dict.fromkeys(JOINTS, 0.3)
-        how = VirtualExperiment(motion, start, simulation, noise, None, interruptions, seed, f"run_{seed}")
+        how = VirtualExperimentSettings(motion, start, simulation, noise, None, interruptions, seed, f"run_{seed}")
         return run_virtual_experiment(self.driven, None, how)
 
     def problem(self, *recordings: Recording) -> EstimationProblem:
@@ -195,10 +195,10 @@ def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     cleaned = problem_corrected_for_events(problem, EventSet((event,)))
     (before,), (after,) = problem.episodes[0].measurements, cleaned.episodes[0].measurements
     t = times_since_recording_start(problem.episodes[0], before)
-    hidden = before.used_output_mask & ~after.used_output_mask
+    hidden = before.positive_weight_mask & ~after.positive_weight_mask
     smear = 1 / problem.options.path_cutoff
     assert not hidden[:, 0].any()
-    assert np.array_equal(hidden[:, 1], before.used_output_mask[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
+    assert np.array_equal(hidden[:, 1], before.positive_weight_mask[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
     elsewhere = problem_corrected_for_events(problem, EventSet((replace(event, recording="another"),)))
     assert elsewhere.episodes[0].measurements[0] is before
     # beside torques that drive a joint its force acts, with its whole impulse
@@ -224,7 +224,7 @@ def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_fo
     arm = joints(JOINTS, t, state, effort=np.vstack([torque, torque[-1:]]), effort_std=0.0, effort_kind="command")
     made = recording(arm, seen(frames, t, place, std=np.full(place.shape, 1e-3)))
     sensors = {"joints.position": SensorOptions(use=False)}
-    options = ProblemOptions(initial_state="equilibrium", tracking_filter="none", sensors=sensors)
+    options = ProblemOptions(initial_state="equilibrium", arm_tracking_feedback="none", sensors=sensors)
     problem = EstimationProblem(step, [made], ["shoulder.damping"], options)
     x = solve(problem, GaussNewton()).x
     evaluation = problem.evaluate(x)
@@ -246,5 +246,5 @@ def test_after_a_fall_nothing_counts(twin, pushed):
     cleaned = problem_corrected_for_events(problem, EventSet((), (_Overspeed("run_0", "elbow", 3.0),)))
     (samples,) = cleaned.episodes[0].measurements
     t = times_since_recording_start(cleaned.episodes[0], samples)
-    assert not samples.used_output_mask[t > 3.0].any()
-    assert samples.used_output_mask[(t > 1.0) & (t < 2.0)].all()
+    assert not samples.positive_weight_mask[t > 3.0].any()
+    assert samples.positive_weight_mask[(t > 1.0) & (t < 2.0)].all()

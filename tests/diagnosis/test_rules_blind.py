@@ -17,13 +17,13 @@ from yid_ocp.diagnosis.blind import (
     BlindCaseGenerator,
     CaseGroundTruth,
     PlannedBlindCase,
-    SyntheticRecordingConditions,
+    SyntheticMeasurementConditions,
     plan_blind_cases,
     scale_parameters_to_more_links,
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect
+from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect
 from yid_ocp.virtual.joint_motion import MultisineOptions
 
 KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
@@ -124,7 +124,7 @@ def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
 
 def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     ensemble = drawn()
-    found = ensemble.simulate_recording({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
+    found = ensemble.simulate_noisy_recording({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
     assert (found.name, found.description, found.source, found.true_parameters) == ("case_001", "", "", {})
     [made] = drawn.made
     assert (made["truth"], made["injected"]) == ({"T1.bend": 7.0}, (KV,))
@@ -189,7 +189,7 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     assert len({json.dumps(entry.truth) for entry in first}) == 4
     assert drawn(seed=9).draw_planned_case(wanted[3])[1].truth != first[3].truth
     # an ensemble to calibrate by shares no case with the one that is reported
-    calibrating = drawn(conditions=SyntheticRecordingConditions(purpose="calibration"))
+    calibrating = drawn(conditions=SyntheticMeasurementConditions(purpose="calibration"))
     assert calibrating.draw_planned_case(wanted[3])[1].truth != first[3].truth
 
 
@@ -293,7 +293,9 @@ def test_only_kinds_that_the_other_engine_can_do_are_injected(drawn):
 def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
     ensemble = drawn()
     found = [ensemble._outside(np.random.default_rng(seed)) for seed in range(600)]
-    by_kind = {kind: [f for f in found if f.kind == kind] for kind in {*OUT_OF_LIBRARY_EFFECTS} - {"slipping_grasp"}}
+    by_kind = {
+        kind: [f for f in found if f.kind == kind] for kind in {*OUT_OF_LIBRARY_FORCE_BUILDERS} - {"slipping_grasp"}
+    }
     assert all(len(group) > 10 for group in by_kind.values())
     ripples = by_kind["torque_ripple"]
     assert {f.location for f in ripples} == {"s0"}, "the first half of the joints, rounded down"

@@ -8,11 +8,11 @@ import pytest
 from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, cases, place, smoothed, trace
 
 from yid_ocp.diagnosis.localise import (
-    gap_locations_by_effect_closure,
     gap_locations_by_smoother_evidence,
+    gap_locations_from_effect_closures,
     merge_time_intervals,
     smoothed_unknown_units,
-    smoothed_unknown_z_scores,
+    z_scores_of_smoothed_unknowns,
 )
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 
@@ -92,7 +92,7 @@ T1, T2, T3 = place("T1"), place("T2"), place("T3")
     },
 )
 def test_places_of_effects_share_by_what_they_close(before, closed, rest, expected):
-    found = described(gap_locations_by_effect_closure([before], closed, rest, ()))
+    found = described(gap_locations_from_effect_closures([before], closed, rest, ()))
     assert sorted(found, key=lambda p: p[0]) == sorted(expected, key=lambda p: p[0])
     shares = [share.expected for _, share, _ in found]
     assert shares == sorted(shares, reverse=True)
@@ -103,10 +103,10 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
     before = [place("T1", windows=seen), place("T2")]
     found = {
         p.location: p.time_windows
-        for p in gap_locations_by_effect_closure(before, {"T1": 0.5, "world": 0.2}, [place("T3")], residual)
+        for p in gap_locations_from_effect_closures(before, {"T1": 0.5, "world": 0.2}, [place("T3")], residual)
     }
     assert found == {"T1": seen, "world": residual, "T2": (), "T3": ()}
-    [whole] = gap_locations_by_effect_closure([place("T2")], {"T2": 1.0}, [], residual)
+    [whole] = gap_locations_from_effect_closures([place("T2")], {"T2": 1.0}, [], residual)
     assert whole.time_windows == residual
 
 
@@ -125,7 +125,7 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
 )
 def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expected):
     found = smoothed({FORCE: 1.0}, variance={FORCE: variance}, traces=[trace([FORCE], [[mean]], [[std]])])
-    edges, names, values = smoothed_unknown_z_scores(found, informed_fraction=mapped)
+    edges, names, values = z_scores_of_smoothed_unknowns(found, informed_fraction=mapped)
     np.testing.assert_allclose(values, [[expected]])
     assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
 

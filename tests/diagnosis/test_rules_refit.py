@@ -43,15 +43,15 @@ class Problem:
     def problem(self):
         return self
 
-    def with_free_effects(self, effects):
+    def with_nominal_and_effects_free(self, effects):
         self.freed = tuple(effects)
         return self
 
-    def relinearized_with_effects(self, effects, at):
+    def with_effects_and_relinearized_filters(self, effects, at):
         self.at.append(self.named_values(self.vector(at)))
-        return self.with_free_effects(effects)
+        return self.with_nominal_and_effects_free(effects)
 
-    def with_held_out_relinearized(self, own, effects, at):
+    def with_relinearized_held_out_filters(self, own, effects, at):
         assert own is self
         self.foreseen.append(dict(at))
         return self
@@ -123,7 +123,7 @@ def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_ru
 
 @pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
-    monkeypatch.setattr(module, "max_torque_bias_change_between_filters", lambda before, after: apart)
+    monkeypatch.setattr(module, "torque_bias_change_in_stds", lambda before, after: apart)
     monkeypatch.setattr(module, "_relinearizing", lambda problem: problem.evaluate)
     refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
@@ -367,7 +367,7 @@ def predicting(monkeypatch):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)
         return SimpleNamespace(residual=np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs]))
 
-    usual = {"whitened_held_out_residual": rows, "has_process_noise": False, "options": ProblemOptions()}
+    usual = {"whitened_held_out_prediction_residual": rows, "has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": (), "unknown_names": (), "initial_unknowns": np.zeros(0)}
 
     def made(*pairs):

@@ -159,7 +159,7 @@ def test_where_a_model_errs_everywhere_fewer_parameters_outweigh_a_larger_loss(l
 def test_an_amplitude_far_out_of_its_range_comes_last():
     fits = [there(SMALL, 1.0, 1.0, a=2.5), there(LARGE, 1.0, 1.0)]
     assert labels(_near_best_models(fits)) == ["large@x", "small@x"]
-    assert labels(_near_best_models(fits, Thresholds(prior_range_margin=2.0))) == ["small@x", "large@x"]
+    assert labels(_near_best_models(fits, Thresholds(prior_range_margin_in_widths=2.0))) == ["small@x", "large@x"]
 
 
 ODD, UNSURE, SURE = {"s": 9.0}, {"a": 0.019, "b": 0.0}, {"a": 0.021, "b": 0.0}
@@ -450,12 +450,12 @@ LITTLE = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "
     "left, limits, chosen",
     {
         "below the smallest gap": (1e-3, {}, ["a"]),
-        "above it": (1e-3, {"min_excess_chi2": 0.05}, ["a", "b"]),
-        "at it": (1e-3, {"min_excess_chi2": 0.09}, ["a", "b"]),
+        "above it": (1e-3, {"min_excess_chi2_per_dof": 0.05}, ["a", "b"]),
+        "at it": (1e-3, {"min_excess_chi2_per_dof": 0.09}, ["a", "b"]),
         # surer than a rest that the residual as a whole shows, counted as the best of two
         "along a candidate": (4e-5, {}, ["a", "b"]),
         "hardly along one": (6e-5, {}, ["a"]),
-        "along one by another level": (6e-5, {"candidate_gap_significance_level": 2e-4}, ["a", "b"]),
+        "along one by another level": (6e-5, {"candidate_score_significance_level": 2e-4}, ["a", "b"]),
     },
 )
 def test_a_rest_is_left_unless_it_is_large_or_shows_along_a_candidate(monkeypatch, left, limits, chosen):

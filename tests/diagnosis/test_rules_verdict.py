@@ -27,12 +27,12 @@ from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     _compare,
-    check_parameter_transfer,
+    check_effect_amplitude_transfer,
     decide_verdict,
-    explained_fraction_of_smoother_chi2,
     find_unknown_verdict_reason,
-    fit_with_disagreement_in_std,
+    fraction_of_smoother_chi2_decrease,
     has_significant_gap,
+    inflate_std_by_disagreement,
     is_barely_significant_and_unexplained,
 )
 from yid_ocp.progress import NULL_PROGRESS
@@ -85,12 +85,12 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    limits = Thresholds(min_channel_excess_chi2=0.03, candidate_gap_significance_level=0.01)
+    limits = Thresholds(min_channel_excess_chi2_per_dof=0.03, candidate_score_significance_level=0.01)
     assert has_significant_gap(*tests, limits, scored(*p_values)) is gap
 
 
 def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
-    sure = Thresholds(candidate_gap_significance_level=1e-4, significance_level=0.05)
+    sure = Thresholds(candidate_score_significance_level=1e-4, significance_level=0.05)
     assert [has_significant_gap(outcome(), outcome(chi2=1.2), sure, scored(p)) for p in (9e-5, 0.03)] == [True, False]
 
 
@@ -214,8 +214,8 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
     nominal, last = fit(cost=costs[0]), added(ONE, fitted=fit([ONE], cost=costs[1]))
     first = added(OTHER, fitted=fit([OTHER], cost=1e3))
     found = smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees)
-    assert explained_fraction_of_smoother_chi2(nominal, (first, last), found) == pytest.approx(part)
-    assert explained_fraction_of_smoother_chi2(nominal, (first, last), None) == 1.0
+    assert fraction_of_smoother_chi2_decrease(nominal, (first, last), found) == pytest.approx(part)
+    assert fraction_of_smoother_chi2_decrease(nominal, (first, last), None) == 1.0
 
 
 # -- on which side ----------------------------------------------------------------------------------------------------
@@ -236,7 +236,7 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
     },
 )
 def test_the_side_of_a_gap_by_evidence(weight, plant, sensor, both, side):
-    assert smoothed(weight, evidence={"plant": plant, "sensor": sensor, "both": both}).gap_origin == side
+    assert smoothed(weight, evidence={"plant": plant, "sensor": sensor, "both": both}).plant_or_sensor_origin == side
 
 
 @cases(
@@ -314,10 +314,10 @@ def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
 )
 def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(first, second, std):
     one, other = (of("spring@elbow", {"k": value, "s": 3.0}, {"k": size}) for value, size in (first, second))
-    counted = fit_with_disagreement_in_std(one, _compare(SPRING, one, other, Thresholds()))
+    counted = inflate_std_by_disagreement(one, _compare(SPRING, one, other, Thresholds()))
     assert counted.std == one.std | {"spring@elbow.k": pytest.approx(std)}
     assert counted.values == one.values
-    again = fit_with_disagreement_in_std(other, _compare(SPRING, other, one, Thresholds()))
+    again = inflate_std_by_disagreement(other, _compare(SPRING, other, one, Thresholds()))
     reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
     assert not abs(first[0] - second[0]) > reach  # their intervals overlap
 
@@ -344,7 +344,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 
     monkeypatch.setattr(module, "refit_with_effects", refitted)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
-    [entry] = check_parameter_transfer(search, first)
+    [entry] = check_effect_amplitude_transfer(search, first)
     assert (entry.estimation_value, entry.held_out_value, entry.is_consistent) == (2.0, 7.0, False)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
     assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
@@ -357,5 +357,5 @@ def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, bloc
     asked = []
     monkeypatch.setattr(module, "refit_with_effects", lambda *_: asked.append(True))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
-    assert check_parameter_transfer(search, fit(effects)) == ()
+    assert check_effect_amplitude_transfer(search, fit(effects)) == ()
     assert bool(asked) is (not blocks and bool(effects))

@@ -23,7 +23,7 @@ from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_whitened_at,
     problem_whitened_by_sensor_noise,
-    problem_with_relinearized_held_out,
+    problem_with_relinearized_held_out_whitening,
     problem_without_input_errors,
 )
 from yid_ocp.integrator.step import Step, compile_step, simulate
@@ -66,7 +66,9 @@ def recorded(step: Step, seed: int, offset: float | None = None, friction: float
 
 
 def problem_of(step: Step, recordings: list[Recording], held_out: list[Recording] | None = None) -> EstimationProblem:
-    options = ProblemOptions(initial_state="equilibrium", tracking_filter="proportional", tracking_filter_gains=(9.0,))
+    options = ProblemOptions(
+        initial_state="equilibrium", arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,)
+    )
     return EstimationProblem(step, recordings, FREE, options, None, held_out or [])
 
 
@@ -84,7 +86,7 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     assert weighted.candidate_effects == made.candidate_effects
     assert weighted.is_split_in_blocks == made.is_split_in_blocks
     own = weighted.problem
-    extended = weighted.with_free_effects(weighted.candidate_effects)
+    extended = weighted.with_nominal_and_effects_free(weighted.candidate_effects)
     assert all(x is y is not None for x, y in zip(own.whitening_filters, extended.whitening_filters, strict=True))
     held = zip(own.held_out_whitening_filters, extended.held_out_whitening_filters, strict=True)
     assert all(x is y is not None for x, y in held)
@@ -97,10 +99,12 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
 def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out):
     """Weights are frozen once, about torques that an offset among the effects must not move."""
     made = composed(step, held_out, "effort_offset", "joint_viscous").whitened_at({"elbow.stiffness": 2.5})
-    wide = made.with_free_effects(made.candidate_effects)
+    wide = made.with_nominal_and_effects_free(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
-    moved = problem_with_relinearized_held_out(problem_relinearized_at_torque_bias(wide, x, frozen), x, frozen)
+    moved = problem_with_relinearized_held_out_whitening(
+        problem_relinearized_at_torque_bias(wide, x, frozen), x, frozen
+    )
     for group in ("whitening_filters", "held_out_whitening_filters"):
         [before], [after] = getattr(wide, group), getattr(moved, group)
         assert after.filter_steps is before.filter_steps
@@ -109,7 +113,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     there, then = (problem_whitened_by_sensor_noise(own).evaluate(at) for own, at in ((moved, x), (wide, frozen)))
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
     pairs = ((moved, x), (wide, frozen))
-    own, nominal = (p.whitened_held_out_residual(0, *p.predict_held_out(at)[0]).residual for p, at in pairs)
+    own, nominal = (p.whitened_held_out_prediction_residual(0, *p.predict_held_out(at)[0]).residual for p, at in pairs)
     assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
     # and to first order the rows are those of a filter that is worked out there
     again = problem_whitened_at(moved, x)
@@ -179,7 +183,7 @@ def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
     assert found.std[k] < 0.1 * STRONG
     assert found.held_out_loss.chi2_per_sample < 1.1 < other.held_out_loss.chi2_per_sample
     for whitening in (*found.problem.whitening_filters, *found.problem.held_out_whitening_filters):
-        assert abs(whitening.input_errors.torque_bias[0]) < OFFSET
+        assert abs(whitening.input_error_model.torque_bias[0]) < OFFSET
     # and what is looked for beside it stands on the same ground
     beside = linearize_candidates(made, [spring], found.values)
     assert 0.95 < float(beside.projected_residual @ beside.projected_residual) / (2 * found.cost) < 1.001
@@ -202,7 +206,9 @@ def geared(step) -> Step:
 
 def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> EstimationProblem:
     free = (*FREE, *(name for effect in geared.system.effects for name in effect.parameters.names))
-    options = ProblemOptions(initial_state="equilibrium", tracking_filter=feedback, tracking_filter_gains=(9.0,))
+    options = ProblemOptions(
+        initial_state="equilibrium", arm_tracking_feedback=feedback, arm_tracking_feedback_gains=(9.0,)
+    )
     problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
     return problem_whitened_at(problem, problem.initial_unknowns, rounds=3)
 
@@ -228,7 +234,8 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     problem = EstimationProblem(gained, [recorded(step, 7)], ("effort_gain@shoulder.inverse",))
     at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
     episode = problem_whitened_at(problem, at, rounds=3).episodes[0]
-    errors, [theta, later] = episode.input_errors, [problem.theta_and_initial_state_offset(x, 0)[0] for x in (at, near)]
+    errors = episode.input_errors
+    [theta, later] = [problem.theta_and_initial_state_deviation(x, 0)[0] for x in (at, near)]
     assert np.max(np.abs(errors.torque_noise)) > WHITE
     acting, more = (problem.predictor.corrected_inputs(episode, own, ()).torque for own in (theta, later))
     np.testing.assert_allclose(acting, inverse * episode.torque - errors.estimated_torque_error, atol=1e-12)

@@ -15,7 +15,7 @@ import pytest
 from ruamel.yaml import YAML
 
 import yid_ocp
-from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.cli import build_argument_parser
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings
@@ -113,9 +113,9 @@ def test_the_program_runs(page, run_script, repository):
 
 
 @pytest.fixture(scope="module")
-def symbols(repository) -> StepSymbols:
+def symbols(repository) -> NamedStepEquations:
     system = build_system(load_config(repository / "configs/dual_arm_vision.yaml"))
-    return StepSymbols.from_equations(discrete_equations(system))
+    return NamedStepEquations.from_equations(discrete_equations(system))
 
 
 def test_entries_and_names_are_those_of_the_equations(page, symbols):

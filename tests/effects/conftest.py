@@ -19,7 +19,7 @@ from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.objects.base import CableTopology
-from yid_ocp.model.objects.cable import CableOptions, cable_system
+from yid_ocp.model.objects.cable import CableOptions, clamped_cable_system
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_reading_function
 
@@ -104,7 +104,7 @@ class Bench:
         state, n = np.zeros(sizes["nx"]), sizes["n"]
         state[at] = self.rest.state[: len(at)]
         state[[n + i for i in at]] = self.rest.state[len(at) : 2 * len(at)] + self.kick
-        for row, name in enumerate(step.system.internal_coordinate_symbols):
+        for row, name in enumerate(step.system.effect_internal_coordinate_symbols):
             joint = name.rpartition(".")[2]
             if joint in names and not name.startswith("hysteresis"):
                 state[2 * n + row] = state[names.index(joint)]
@@ -145,10 +145,10 @@ def made_cable() -> tuple[CableTopology, Recording]:
     where |= {"c1": [0.3, 0.1, 1.0], "c2": [0.3, 0.2, 1.0]}
     layout = CableTopology(PARENT, {"a": ("p3", "c1", "c2")}, where)
     t = H * np.arange(9)
-    points = np.tile(np.array([where[name] for name in layout.vertices]), (len(t), 1, 1))
+    points = np.tile(np.array([where[name] for name in layout.vertex_names]), (len(t), 1, 1))
     points[:, :, 2] -= 0.02 * np.sin(np.pi * points[0, :, 0] / 0.6)
     points[:, -4:, 1] += 0.01 * np.sin(9 * t)[:, None]
-    group = PointGroup("points", layout.vertices, t, points, np.array(0.01), "motion capture", clock="nominal")
+    group = PointGroup("points", layout.vertex_names, t, points, np.array(0.01), "motion capture", clock="nominal")
     return layout, Recording(points=(group,), name="sway")
 
 
@@ -174,7 +174,7 @@ def prescribed(benches) -> Bench:
 def cable() -> tuple[CableTopology, Recording, System]:
     layout, recording = made_cable()
     lengths = typical_point_pair_distances(layout.edges, [recording])
-    return layout, recording, cable_system(lengths, layout, CableOptions())
+    return layout, recording, clamped_cable_system(lengths, layout, CableOptions())
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.recorded_inputs import recorded_sensor_kinds
+from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 from yid_ocp.sensors import recorded_camera_pose, sensor_reading_function
 from yid_ocp.solvers import MultipleShooting
 
@@ -37,7 +37,7 @@ KINDS = {
 # what changes the momentum that the arm's motion has
 HEAVIER = {"rotor_inertia": {"left_b": {"armature": 0.05}}, "link_mass": {"left_c": {"scale": 1.1}}}
 KINDS |= HEAVIER
-OPEN = {"path_cutoff": float("inf"), "weak_prior_std_as_factor": 0.0}
+OPEN = {"path_cutoff": float("inf"), "weak_prior_geometric_std": 0.0}
 
 
 def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
@@ -70,7 +70,7 @@ def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options)
     effects, step = effects_and_step(bench, tuple(kinds), neutral)
     names = tuple(name for effect in effects for name in effect.parameters.names)
     gains = (20.0, 20.0, 10.0)
-    settings = ProblemOptions(**OPEN, tracking_filter=feedback, tracking_filter_gains=gains, **options)
+    settings = ProblemOptions(**OPEN, arm_tracking_feedback=feedback, arm_tracking_feedback_gains=gains, **options)
     return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
 
 
@@ -85,16 +85,16 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     one, other = (p.evaluate(p.initial_unknowns, derivatives=False) for p in (plain, full))
     assert one.ok, one.message
     assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
-    assert plain.uses_inputs_as_recorded
-    assert full.with_compiled_parameters_free(["T1.bend", "kelvin_voigt@T3.tau"]).uses_inputs_as_recorded
+    assert plain.has_no_input_corrections
+    assert full.with_free_parameters_without_recompiling(["T1.bend", "kelvin_voigt@T3.tau"]).has_no_input_corrections
     # an arm's own damping leaves the recording as it is
-    assert problem(bench, (), feedback=feedback, free=("left_a.damping",)).uses_inputs_as_recorded
+    assert problem(bench, (), feedback=feedback, free=("left_a.damping",)).has_no_input_corrections
     # the momentum that an LQR filter follows depends on how fast the clock runs
-    assert full.with_compiled_parameters_free(["T1.bend", "clock_scale@clock.scale"]).uses_inputs_as_recorded is (
-        feedback != "lqr"
-    )
+    assert full.with_free_parameters_without_recompiling(
+        ["T1.bend", "clock_scale@clock.scale"]
+    ).has_no_input_corrections is (feedback != "lqr")
     for name in ("effort_delay@left.delay", "effort_lag@left_c.time_constant", "camera_latency@camera.delay"):
-        assert not full.with_compiled_parameters_free([name]).uses_inputs_as_recorded
+        assert not full.with_free_parameters_without_recompiling([name]).has_no_input_corrections
     with pytest.raises(SolverError, match="gauss_newton"):
         MultipleShooting(condensing=True).minimize_cost(full, full.initial_unknowns, None)
 
@@ -189,20 +189,20 @@ def test_a_gear_needs_recorded_effort(prescribed) -> None:
 
 def test_what_a_recording_holds(driven) -> None:
     full = recording(driven)
-    assert recorded_sensor_kinds([full]) == {"joints.position", "joints.effort", "camera"}
-    assert recorded_sensor_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
+    assert recorded_signal_kinds([full]) == {"joints.position", "joints.effort", "camera"}
+    assert recorded_signal_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
     arm, camera = full.points
     assert recorded_camera_pose(arm) is None
     assert recorded_camera_pose(camera) is not None
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
     assert recorded_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
-    assert "nominal_clock" in recorded_sensor_kinds([Recording(points=(unposed,))])
+    assert "nominal_clock" in recorded_signal_kinds([Recording(points=(unposed,))])
 
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     layout, made, system = cable
     options = ProblemOptions(
-        **OPEN, initial_state="fitted_to_points", clamp_pose_definitions=layout.clamp_pose_definitions
+        **OPEN, initial_state="fitted_to_points", clamp_poses_from_points=layout.clamp_poses_from_points
     )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
@@ -218,7 +218,7 @@ def test_the_filter_follows_the_momentum_of_the_effects(driven) -> None:
     """The cost is one number, whether derivatives are asked for or not, and however the effects' values are given."""
     task = problem(driven, HEAVIER, feedback="lqr")
     with_slopes, without = (task.evaluate(task.initial_unknowns, derivatives=flag).cost for flag in (True, False))
-    fixed = task.with_compiled_parameters_free(["T1.bend"])
+    fixed = task.with_free_parameters_without_recompiling(["T1.bend"])
     told = problem(driven, HEAVIER, neutral=True, feedback="lqr")
     values = dict(zip(task.unknown_names, task.initial_unknowns, strict=True))
     other = told.evaluate([values[name] for name in told.unknown_names], derivatives=False).cost

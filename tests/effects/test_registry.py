@@ -27,7 +27,7 @@ def beam() -> System:
     """Panda with a beam on its hand, its joints prescribed."""
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names)
-    segment = Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_per_curvature=True)
+    segment = Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, has_stiffness_per_curvature=True)
     item = flexible_object([segment], name="beam")
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
 
@@ -154,12 +154,12 @@ def test_a_compliance_is_given_and_reported_as_stiffness(one_arm) -> None:
     effect = make_effect("grasp_compliance", "left", one_arm, {"stiffness": 500.0})
     name = "grasp_compliance@left.compliance"
     assert effect.parameters[name].value == pytest.approx(2e-3)
-    found = effect.reported_parameters({name: 4e-3}, {name: 4e-4})
+    found = effect.parameters_as_reported({name: 4e-3}, {name: 4e-4})
     assert found["stiffness"].value == pytest.approx(250.0)
     assert found["stiffness"].std == pytest.approx(25.0)
     assert found["stiffness"].unit == "N/m"
     assert found["damping"].unit == "N s/m"
-    rigid = effect.reported_parameters({name: 0.0}, {name: 1e-4})["stiffness"]
+    rigid = effect.parameters_as_reported({name: 0.0}, {name: 1e-4})["stiffness"]
     assert math.isinf(rigid.value)
     assert math.isnan(rigid.std)
     with pytest.raises(ConfigError, match="positive"):
@@ -185,6 +185,6 @@ def test_names_and_places_survive_added_joints(one_arm) -> None:
 def test_how_much_stiffening_to_expect_depends_on_how_far_joints_turn() -> None:
     effect = make_effect("cubic_stiffness", "T1", baxter_foam_y_system(1))
     low, high = effect.prior_ranges["cubic_stiffness@T1.k3"]
-    told = effect.with_prior_ranges_for_angles({"T1": 0.25, "T2": 1.0})
+    told = effect.with_prior_ranges_scaled_to_angles({"T1": 0.25, "T2": 1.0})
     assert told.prior_ranges["cubic_stiffness@T1.k3"] == pytest.approx((4 * low, 4 * high))
-    assert effect.with_prior_ranges_for_angles({"T2": 0.1}) is effect
+    assert effect.with_prior_ranges_scaled_to_angles({"T2": 0.1}) is effect

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from held_rod import held_rod
 
-from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.effects import make_effect
 from yid_ocp.export import equations as exported
 from yid_ocp.export.equations import _exported_step_functions, export_step_functions, write_equation_sheet
@@ -34,7 +34,7 @@ def step(urdf_folder):
 
 @pytest.fixture(scope="module")
 def symbols(step):
-    return StepSymbols.from_equations(step.equations)
+    return NamedStepEquations.from_equations(step.equations)
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_a_large_jacobian_is_left_to_the_reader(symbols, monkeypatch):
 def held(urdf_folder):
     """A driven shoulder, an elbow with a spring and an effect with inner coordinates on a rod that is held."""
     system = held_rod(urdf_folder, links=1, ratio=0.4, driven=["shoulder"], springs={"elbow": RobotJointSpring(3.25)})
-    return StepSymbols.from_equations(discrete_equations(system))
+    return NamedStepEquations.from_equations(discrete_equations(system))
 
 
 def sheet(symbols, tmp_path, free=("T1.bend",), time_step=0.01):
@@ -219,13 +219,13 @@ def test_numbers_stand_for_all_but_what_is_free(held, tmp_path):
 def test_rules_say_what_the_step_does(held, tmp_path):
     assert r"\tfrac{h}{2} F - \tfrac12" in sheet(held, tmp_path)
     system = held.equations.system
-    left = StepSymbols.from_equations(discrete_equations(system, "left", "node"))
+    left = NamedStepEquations.from_equations(discrete_equations(system, "left", "node"))
     text = sheet(left, tmp_path)
     assert r"- L_v(q_m, v_m) + h F - D\varphi(q_k)^{T} \lambda_k" in text
     assert "p_{k+1} &= \\tfrac{h}{2} L_q(q_m, v_m) + L_v(q_m, v_m) \\\\\n" in text
     assert "multiplied by it" not in text
     added = [make_effect("grasp_compliance", "hand", system, {}), make_effect("mount_compliance", "base", system, {})]
-    soft = StepSymbols.from_equations(discrete_equations(system.with_effects(added)))
+    soft = NamedStepEquations.from_equations(discrete_equations(system.with_effects(added)))
     assert soft.equations.constraint_relaxation_gain is not None
     assert soft.equations.system.joint_compliances
     text = sheet(soft, tmp_path, free=())
@@ -235,7 +235,7 @@ def test_rules_say_what_the_step_does(held, tmp_path):
 
 def test_without_grasps_there_is_no_word_of_them(urdf_folder, tmp_path):
     system = System.build(read_urdf(urdf_folder / "mixed_joints.urdf"))
-    text = sheet(StepSymbols.from_equations(discrete_equations(system)), tmp_path, free=())
+    text = sheet(NamedStepEquations.from_equations(discrete_equations(system)), tmp_path, free=())
     assert not any(word in text for word in ("varphi", "lambda", "pull of the grasps"))
 
 
@@ -246,7 +246,7 @@ def test_short_rows_are_written_out(tmp_path, urdf_folder):
       <mass value="2"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link></robot>"""
     (tmp_path / "one.urdf").write_text(urdf)
     system = System.build(read_urdf(tmp_path / "one.urdf"), damping=0.125)
-    text = sheet(StepSymbols.from_equations(discrete_equations(system)), tmp_path, free=())
+    text = sheet(NamedStepEquations.from_equations(discrete_equations(system)), tmp_path, free=())
     row = next(line for line in text.splitlines() if line.startswith(r"$\displaystyle R_{k"))
     assert "B_{" not in row
     assert all(part in row for part in ("0.125", "9.81", r"\sin("))

@@ -18,7 +18,12 @@ from mcap_ros2.decoder import DecoderFactory
 
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_any, read_csv
 from yid_ocp.errors import OutputError
-from yid_ocp.export.signals import RosTopicTimeSeries, export_csv, export_mcap, ros_signals_from_recording
+from yid_ocp.export.signals import (
+    RosTopicTimeSeries,
+    export_mcap,
+    export_recording_csv_files,
+    ros_signals_from_recording,
+)
 
 
 def read(path) -> dict[str, list]:
@@ -96,11 +101,11 @@ def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
         export_mcap([signal], tmp_path / "file" / "a.mcap")
     tables = Recording(JointGroup(("a",), np.zeros(1), np.zeros((1, 1))))
     with pytest.raises(OutputError, match="folder cannot be made"):
-        export_csv(tables, tmp_path / "file")
+        export_recording_csv_files(tables, tmp_path / "file")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     (tmp_path / "joints.csv").mkdir()
     with pytest.raises(OutputError, match="that of a folder"):
-        export_csv(tables, tmp_path)
+        export_recording_csv_files(tables, tmp_path)
 
 
 def test_a_solve_says_what_it_measured_and_predicted(pendulum, cli, tmp_path):
@@ -177,12 +182,12 @@ def test_csv_round_trip(position: np.ndarray, points: np.ndarray, hidden: np.nda
     joints = JointGroup(("a", "b_x"), np.array([0.0, 0.1, 0.3, 1e9 / 3]), position, effort=-position)
     camera = PointGroup("points_camera", ("p", "q r"), np.array([-1.0, 0.0, math.pi]), points)
     with tempfile.TemporaryDirectory() as folder:
-        files = export_csv(Recording(joints, (camera,)), Path(folder) / "new" / "tables")
+        files = export_recording_csv_files(Recording(joints, (camera,)), Path(folder) / "new" / "tables")
         assert [file.name for file in files] == ["joints.csv", "points_camera.csv"]
         back, (points_back,) = read_csv(files[0]).joints, read_csv(files[1]).points
     assert (back.names, points_back.names) == (joints.names, camera.names)
-    assert list(back.channels) == ["position", "effort"]
+    assert list(back.values_by_channel) == ["position", "effort"]
     for own, read_back in ((joints, back), (camera, points_back)):
         np.testing.assert_array_equal(read_back.t, own.t)
         np.testing.assert_array_equal(read_back.position, own.position)
-    np.testing.assert_array_equal(back.channels["effort"], -position)
+    np.testing.assert_array_equal(back.values_by_channel["effort"], -position)

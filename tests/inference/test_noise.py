@@ -19,7 +19,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
-TRACKED = {"tracking_filter": "proportional", "tracking_filter_gains": (9.0,)}
+TRACKED = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
 
 
 def problem_of(
@@ -53,7 +53,7 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
         feedback = replace(feedback, reference=feedback.reference + reference)
     torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
     changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
-    result = problem.predictor.predict_episode(changed, *problem.theta_and_initial_state_offset(x, 0), False)
+    result = problem.predictor.predict_episode(changed, *problem.theta_and_initial_state_deviation(x, 0), False)
     return _sensor_whitened_residual(changed.measurements, result).residual
 
 
@@ -87,7 +87,7 @@ def dense_covariance(problem, x, angle):
     ("how", "effects", "together"),
     [
         ({}, (), True),
-        ({"feedback": {"tracking_filter": "none"}}, (), False),
+        ({"feedback": {"arm_tracking_feedback": "none"}}, (), False),
         ({}, (("camera_latency", "camera", {"delay": 0.0137}),), False),
         # the noise of interpolated angles is only as large as white noise makes it
         ({"period": 2, "angle": 1e-9}, (), True),
@@ -117,7 +117,7 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
         {"encoders": True, "period": 2},
         {"encoders": False, "period": 3, "effects": (("camera_latency", "camera", {"delay": 0.0137}),)},
         {"encoders": False, "prescribed": ("elbow",)},
-        {"encoders": True, "feedback": {"tracking_filter": "none"}, "prescribed": ("elbow",), "period": 2},
+        {"encoders": True, "feedback": {"arm_tracking_feedback": "none"}, "prescribed": ("elbow",), "period": 2},
         {"encoders": False, "size": 1e4, "angle": 1e-9},
     ],
     ids=["tracked", "encoders", "late", "prescribed", "open_loop", "ill_conditioned"],
@@ -140,7 +140,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     """Encoders are measurements and the filter only says where to linearise: gains move chi2 by what is not linear."""
     costs = []
     for g in (9.0, gain):
-        feedback = {"tracking_filter": "proportional", "tracking_filter_gains": (g,)}
+        feedback = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
         weighted = problem_whitened_at(problem, problem.initial_unknowns)
         rows = problem.residual_rows.data
@@ -160,7 +160,7 @@ def small_gap(problem, size=1.0):
     truth = replace(episode, torque=episode.torque + 0.3 * size * TORQUE * rng.standard_normal(episode.torque.shape))
     truth = replace(truth, tracking_feedback=None)
     result = problem.predictor.predict_episode(
-        truth, *problem.theta_and_initial_state_offset(problem.initial_unknowns, 0), False
+        truth, *problem.theta_and_initial_state_deviation(problem.initial_unknowns, 0), False
     )
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     samples = tuple(replace(s, value=y + s.std * rng.standard_normal(y.shape)) for s, y in pairs)
@@ -198,7 +198,7 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert torque_biases_and_stds_by_recording(problem, problem.initial_unknowns) == [None]
 
 
-@pytest.mark.parametrize("feedback", [TRACKED, {"tracking_filter": "lqr"}], ids=["angles", "angles_and_momenta"])
+@pytest.mark.parametrize("feedback", [TRACKED, {"arm_tracking_feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
 def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, feedback):
     """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
@@ -211,7 +211,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     other = replace(again, input_errors=episode.input_errors)
     found = []
     for each in (episode, other):
-        result = weighted.predictor.predict_episode(each, *problem.theta_and_initial_state_offset(x, 0), False)
+        result = weighted.predictor.predict_episode(each, *problem.theta_and_initial_state_deviation(x, 0), False)
         found.append(estimate_episode_torque_bias(each, result, whitening)[0])
     seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05

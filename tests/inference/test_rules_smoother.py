@@ -14,7 +14,7 @@ import threadpoolctl
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.localise import gap_locations_by_smoother_evidence, smoothed_unknown_z_scores
+from yid_ocp.diagnosis.localise import gap_locations_by_smoother_evidence, z_scores_of_smoothed_unknowns
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
 from yid_ocp.inference.smoother import select_and_smooth_unknowns
@@ -208,7 +208,7 @@ def test_the_group_that_explains_the_residual_is_taken_in(monkeypatch, column):
     assert found.log_evidence[own] > found.log_evidence[other] + 5
     assert found.log_evidence["none"] == 0.0
     assert found.log_evidence_drop == NOTHING | {source: gained}
-    assert found.gap_origin == own
+    assert found.plant_or_sensor_origin == own
     assert found.min_log_bayes_factor == 5.0
 
 
@@ -220,7 +220,7 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
     for source in SOURCES:
         less = Dense(models, found.group_variance | {source: 0.0}).log_evidence
         assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
-    assert found.gap_origin == "both"
+    assert found.plant_or_sensor_origin == "both"
     assert sum(v > 0 for v in smoothed(monkeypatch, models, max_unknown_groups=2).group_variance.values()) == 2
     assert not any(smoothed(monkeypatch, models, min_log_bayes_factor=1e6).group_variance.values())
 
@@ -228,7 +228,7 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
 def test_noise_alone_takes_nothing_in(monkeypatch):
     models = [made(9, size=np.zeros(3), loose=0.0)]
     found = smoothed(monkeypatch, models)
-    assert found.gap_origin == "none"
+    assert found.plant_or_sensor_origin == "none"
     assert not any(found.group_variance.values())
     assert found.log_evidence_drop == NOTHING
     assert found.chi2_before == pytest.approx(found.chi2_after)
@@ -360,7 +360,7 @@ def recorded(system: System, pushed: dict[int, tuple[float, float, float]], seed
 
 def problem_of(system: System, recording: Recording, feedback: Literal["none", "lqr"] = "none") -> EstimationProblem:
     sensors = {"joints.position": SensorOptions(use=False)}
-    options = ProblemOptions(initial_state="equilibrium", tracking_filter=feedback, sensors=sensors)
+    options = ProblemOptions(initial_state="equilibrium", arm_tracking_feedback=feedback, sensors=sensors)
     return EstimationProblem(compile_step(system, TIME_STEP), [recording], ("shoulder.damping",), options)
 
 
@@ -410,7 +410,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
 def test_clean_data_have_no_place(driven):
     found = said_of(problem_of(driven, recorded(driven, {}, 2)))
     assert found.log_evidence["both"] == 0
-    assert found.gap_origin == "none"
+    assert found.plant_or_sensor_origin == "none"
     assert all(place.gap_share == 0 for place in gap_locations_by_smoother_evidence(found))
     assert any(place.is_observable for place in gap_locations_by_smoother_evidence(found))
 
@@ -428,7 +428,7 @@ def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     middle = (trace.interval_edges[:-1] >= 0.9) & (trace.interval_edges[1:] <= 1.25)
     size = trace.reference_std[column] * trace.posterior_mean[middle, column]
     assert np.abs(size).mean() == pytest.approx(push, rel=0.35)
-    edges, names, values = smoothed_unknown_z_scores(found)
+    edges, names, values = z_scores_of_smoothed_unknowns(found)
     assert values.shape == (len(edges) - 1, len(names))
     assert np.isfinite(values[:, names.index(name)]).any()
 
@@ -440,7 +440,7 @@ def test_a_sensor_that_reads_wrong_is_told_from_a_push(driven):
     moved[80:130, 1] += [0.0, 0.02, 0.0]
     wrong = replace(recording, points=(replace(group, position=moved),))
     found = said_of(problem_of(driven, wrong))
-    assert found.gap_origin == "sensor"
+    assert found.plant_or_sensor_origin == "sensor"
     assert gap_locations_by_smoother_evidence(found)[0].location == "points"
 
 
@@ -451,7 +451,7 @@ def test_efforts_of_prescribed_joints_say_which(bench):
     assert places[0].location == "elbow"
     assert places[0].gap_share > 0.8
     assert found.explainable_gap_fraction > 0.5
-    assert found.gap_origin == "either", "a force at a measured joint and its sensor's bias are the same"
+    assert found.plant_or_sensor_origin == "either", "a force at a measured joint and its sensor's bias are the same"
 
 
 SYSTEM = baxter_foam_y_system(1)

@@ -39,7 +39,7 @@ from yid_ocp.inference.uncertainty import (
     with_profile_interval,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.signal_filters import effort_filter_from_path_cutoff
+from yid_ocp.problem.signal_filters import effort_filter_with_path_cutoff
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 
@@ -178,7 +178,7 @@ def test_a_fit_is_judged_in_units_of_noise_by_the_limits_of_a_diagnosis():
     problem = of_size(1.2)
     found = problem.evaluate([1.0])
     assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(significance_level=1e-6)).explains
-    assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(min_excess_chi2=0.5)).explains
+    assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(min_excess_chi2_per_dof=0.5)).explains
     half = assess_goodness_of_fit(problem, found, ExcessResidualCriteria(noise_fraction_of_std=0.5))
     assert half.chi2_per_dof == pytest.approx(4 * assess_goodness_of_fit(problem, found).chi2_per_dof)
 
@@ -213,7 +213,7 @@ def test_a_misfit_of_one_block_or_of_none_widens_nothing():
 def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(urdf_folder):
     """Zeros that move from recording to recording cancel in no block of time, and show in no other channel."""
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
-    options = ProblemOptions(path_cutoff=np.inf, weak_prior_std_as_factor=0.0)
+    options = ProblemOptions(path_cutoff=np.inf, weak_prior_geometric_std=0.0)
     recordings = [taken(step, seed, camera=False, steps=200) for seed in range(3)]
     problem = EstimationProblem(step, recordings, ("elbow.mass",), options)
     found, series = problem.evaluate(problem.initial_unknowns), residual_channel_indices(problem)
@@ -338,10 +338,10 @@ def test_numbers_of_a_result():
     found = uncertainty.covariance_to_dict(("a", "b", "c", "d"), matrix, (1.0, 3.0, 5.0, math.inf))
     assert (found["names"], np.ravel(found["matrix"])) == (["a", "b"], pytest.approx([1.0, 1.5, 1.5, 9.0]))
     lost, fixed = replace(known, verdict="not_identifiable"), replace(known, free=False, verdict="fixed")
-    marked = uncertainty.estimates_marked_not_trusted({"a": known, "b": lost, "c": fixed})
+    marked = uncertainty.all_estimates_marked_not_trusted({"a": known, "b": lost, "c": fixed})
     assert marked == {"a": replace(known, verdict="not_trusted"), "b": lost, "c": fixed}
     parts = {0.1234: "12", 0.994: "99", 0.996: "100", 12.34: "1234", 123.4: "1.2e+04"}
-    assert [uncertainty.percent_text(part) for part in parts] == list(parts.values())
+    assert [uncertainty.percent_number_text(part) for part in parts] == list(parts.values())
     assert [uncertainty.finite_or_none(x) for x in (2.0, math.inf, math.nan)] == [2.0, None, None]
     problem = MadeUp(linear(COLUMN, [1.0, 2.0, 5.0, 7.0]), stated=1, weak=1, noise=0.1, weighting="paper")
     cost = uncertainty.cost_without_weak_priors(problem, problem.evaluate([0.0]))
@@ -371,7 +371,7 @@ def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
 )
 def test_a_fit_is_told_with_its_misfit(chi2, explains, words):
     assert words in uncertainty.goodness_of_fit_message(chi2, explains)
-    assert set(uncertainty.VERDICT_TABLE_TEXTS) == set(uncertainty.VERDICT_PREDICATES)
+    assert set(uncertainty.VERDICT_TABLE_TEXTS) == set(uncertainty.VERDICT_SENTENCE_TEXTS)
 
 
 CHI2 = scipy.stats.chi2
@@ -400,7 +400,7 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
 def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_folder):
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
     problem = EstimationProblem(step, [taken(step, 1, steps=90)], ("elbow.mass",), ProblemOptions(path_cutoff=15.0))
-    low_pass, own = effort_filter_from_path_cutoff(15.0), residual_channel_indices(problem)
+    low_pass, own = effort_filter_with_path_cutoff(15.0), residual_channel_indices(problem)
     found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
     noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
     lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)

@@ -13,7 +13,7 @@ import pytest
 
 from yid_ocp.errors import InsufficientMemoryError
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.integrator.step_model import NewtonStatus, RolloutInputs, TrackingFeedback
+from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutInputs, TrackingFeedback
 from yid_ocp.model import (
     Grasp,
     Kinematics,
@@ -28,7 +28,7 @@ from yid_ocp.model import (
 )
 from yid_ocp.model.kinematics import motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import ForceWithDerivatives, floating_clamp
+from yid_ocp.model.system import ForceWithDerivativeFactors, floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -176,7 +176,7 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
             force[j] = ca.dot(screws[j], wrench)
             by_rate[:, j] = slope @ screws[j]
             by_turn[:, j] = slope @ added + motion_cross_force_product(screws[j], wrench)
-        closed = ForceWithDerivatives(force, by_rate, by_turn)
+        closed = ForceWithDerivativeFactors(force, by_rate, by_turn)
         return StepTerms(dissipative_force=-b * v, force_with_derivatives=closed)
 
     return Added("air", joint, parameters, change=change, add=add)
@@ -203,7 +203,7 @@ def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
     """The cable, bent, its end held by a clamp whose six coordinates are prescribed; with its configuration."""
     bent = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
     pose = tip(cable().mechanism, "w_C", bent)
-    clamp = floating_clamp("clamp")
+    clamp = floating_joint_mechanism("clamp")
     grasp = Grasp("clamp", "clamp", "w_C", kind, held_orientation=ca.SX(ca.DM(pose[:3, :3])))
     objects = [(cable_object(), None, None)]
     system = System.build(
@@ -311,7 +311,7 @@ def close(actual, expected, tolerance):
 def assert_kernels_agree(steps, inputs, conditioning=1.0, tolerance=1e-10):
     """Two steps: rollouts with derivatives, and the gradients of a cost of all that they give."""
     one, two = (step.kernel.rollout(inputs) for step in steps)
-    assert one.status.code == two.status.code == NewtonStatus.OK
+    assert one.status.code == two.status.code == NewtonStatusCode.OK
     close(one.state, two.state, tolerance)
     for key in ("multipliers", "effort", "torque"):
         close(getattr(one, key), getattr(two, key), tolerance * conditioning)

@@ -116,12 +116,12 @@ def test_a_member_that_fails_fails_as_alone_and_companions_do_not_notice(parts, 
 def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeypatch):
     case = parts.builders["closed_loop"](urdf_folder)
     members = members_of(case)
-    original = compiler.compiled_shared_library
+    original = compiler.compile_and_load_library
 
     def without_batches(text, *make):
         return None if "define BATCHED" in text else original(text, *make)
 
-    monkeypatch.setattr(compiler, "compiled_shared_library", without_batches)
+    monkeypatch.setattr(compiler, "compile_and_load_library", without_batches)
     for one, member in zip(case.step.kernel.rollout_batch(members), members, strict=True):
         assert_same(one, alone(case, member))
 
@@ -195,7 +195,7 @@ def test_arithmetic_of_a_batch_is_that_of_one(monkeypatch, machine, program):
     monkeypatch.setattr(compiler, "_compiler_path", lambda: path)
     monkeypatch.setattr(compiler, "_NATIVE_FLAGS", MACHINES[machine])
     function = everything()
-    library = compiler.compiled_shared_library(arithmetic_source(function))
+    library = compiler.compile_and_load_library(arithmetic_source(function))
     assert library.yid_simd_width() == (8 if machine == "this" and "avx512f" in compiler._machine() else 4)
     assert_those_of_casadi(library, function)
 
@@ -208,7 +208,7 @@ def test_a_long_function_in_parts_is_the_same(monkeypatch, batched, size):
     monkeypatch.setattr(codegen, "_PART_INSTRUCTION_COUNT", size)
     source = arithmetic_source(function, batched)
     assert source.count("noinline") == math.ceil(function.n_instructions() / size)
-    library = compiler.compiled_shared_library(source)
+    library = compiler.compile_and_load_library(source)
     if batched and not library.yid_simd_width():
         pytest.skip("this machine has no vectors")
     assert_those_of_casadi(library, function)
@@ -224,7 +224,7 @@ def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, n
     text = codegen.kernel_c_source(model.functions, model.index_tables)
     assert "linear_3(" in text
     assert "casadi_f0" in text, "short ones are as CasADi writes them"
-    kernel = compiled.CompiledKernel(model, compiler.compiled_shared_library(text))
+    kernel = compiled.CompiledKernel(model, compiler.compile_and_load_library(text))
     for member, found in zip(members, kernel.rollout_batch(members), strict=True):
         assert_same(found, alone(case, member), TOLERANCE)
 

@@ -35,7 +35,7 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     case = parts.make_case(*parts.closed_loop(urdf_folder))
     model = case.step.model
     source = codegen.kernel_c_source(model.functions, model.index_tables)
-    library = compiler.compiled_shared_library(poor.source + source)
+    library = compiler.compile_and_load_library(poor.source + source)
     poor.watch(library)
     kernel = CompiledKernel(model, library)
     names = ("spin.mass", "hinge.damping")
@@ -51,10 +51,10 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     back = (case.theta, plain, case.feedback, names, (np.ones_like(plain.state), None, None))
     assert poor.grants_needed(lambda: kernel.adjoint_gradient(*back)) == 1
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
-    assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 1
+    assert poor.grants_needed(lambda: kernel.linearize_step_equations(*trajectory)) == 1
     loads = np.zeros((sum(step.sizes[key] for key in ("n", "nz", "m")), 0)), np.zeros((step.sizes["n"], 0))
     mapped = case.theta, plain, case.feedback, np.zeros((*plain.torque.shape, 1)), loads
-    assert poor.grants_needed(lambda: kernel.step_maps(*mapped)) == 1
+    assert poor.grants_needed(lambda: kernel.rollout_step_derivatives(*mapped)) == 1
     poor.grants.value = 100
     again = kernel.rollout(differentiated)
     np.testing.assert_array_equal(again.state, plain.state)
@@ -71,7 +71,7 @@ def test_structs_are_laid_out_as_in_the_kernel(step):
     places = [f"offsetof({kind.__name__}, {field})" for kind, field in fields]
     text = f"#include <stddef.h>\nconst long long yid_layout[] = {{{', '.join(sizes + places)}}};\n"
     source = codegen.kernel_c_source(step.model.functions, step.model.index_tables)
-    library = compiler.compiled_shared_library(source + text)
+    library = compiler.compile_and_load_library(source + text)
     layout = list((ctypes.c_longlong * (len(sizes) + len(places))).in_dll(library, "yid_layout"))
     expected = [ctypes.sizeof(kind) for kind in structs] + [getattr(kind, field).offset for kind, field in fields]
     assert layout == expected
@@ -196,7 +196,9 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
             assert rollout.status.is_converged, rollout.status.message
             cost = (np.ones_like(rollout.state), None, None)
             back = step.kernel.adjoint_gradient(theta, rollout, case.feedback, names, cost)
-            along = step.kernel.linearize(theta, rollout.state, rollout.multipliers, rollout.torque, names, True)
+            along = step.kernel.linearize_step_equations(
+                theta, rollout.state, rollout.multipliers, rollout.torque, names, True
+            )
             found = [getattr(rollout, name) for name in GIVEN]
             return *found, *vars(back).values(), *vars(along).values()
 

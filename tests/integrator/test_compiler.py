@@ -70,16 +70,16 @@ def runs(monkeypatch):
 
 @needs_compiler
 def test_the_second_compilation_reads_the_cache(cache, runs):
-    first = compiler.compiled_shared_library(SOURCE % 42)
+    first = compiler.compile_and_load_library(SOURCE % 42)
     assert first.yid_answer() == 42
     compilations = [command for command in runs if "-shared" in command]
     assert len(compilations) == 1
     assert [path.suffix for path in cache.iterdir()] == [".so"]
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     del runs[:]
-    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
     assert runs == []
-    assert compiler.compiled_shared_library(SOURCE % 43).yid_answer() == 43
+    assert compiler.compile_and_load_library(SOURCE % 43).yid_answer() == 43
     assert len(list(cache.iterdir())) == 2
 
 
@@ -87,7 +87,7 @@ def test_the_second_compilation_reads_the_cache(cache, runs):
 @pytest.mark.parametrize("change", ["compiler", "processor", "flags", "level", "casadi"])
 def test_what_a_library_was_made_with_is_part_of_its_key(cache, choose, monkeypatch, change):
     """A cache that moves to another machine, or meets another compiler, is not trusted."""
-    compiler.compiled_shared_library(SOURCE % 42)
+    compiler.compile_and_load_library(SOURCE % 42)
     if change == "compiler":
         choose(script=f'exec {compiler._compiler_path()} "$@"', version="other")
     elif change == "processor":
@@ -100,7 +100,7 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, choose, monkeypa
     elif change == "casadi":
         monkeypatch.setattr(compiler.ca.CasadiMeta, "version", lambda: "another")
     compiler._machine.cache_clear()
-    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
     assert len(list(cache.iterdir())) == 2
 
 
@@ -136,7 +136,7 @@ def test_without_a_compiler_everything_works_after_one_notice(cache, choose, cap
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "unreadable"])
 def test_a_damaged_library_is_made_again(cache, caplog, damage):
     """Loading one would end the process with a signal."""
-    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
     (path,) = cache.iterdir()
     whole = path.read_bytes()
     path.unlink()  # a new file: the old one stays loaded
@@ -144,7 +144,7 @@ def test_a_damaged_library_is_made_again(cache, caplog, damage):
         path.symlink_to(cache.parent / "nowhere")
     else:
         path.write_bytes(whole[:900] if damage == "truncated" else whole[:700] + bytes([whole[700] ^ 8]) + whole[701:])
-    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
     assert "damaged" in caplog.text
 
 
@@ -160,7 +160,7 @@ int yid_answer(void) {{ return 666; }}
 @pytest.mark.parametrize("how", ["writable by all", "link", "pipe", "without its symbols"])
 def test_a_planted_library_is_not_run_but_made_again(cache, tmp_path, how):
     """Its name holds the hash of its content, as anybody can work out."""
-    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
     (own,) = cache.iterdir()
     key, made = own.stem.partition("-")[0], tmp_path / "made.so"
     own.unlink()
@@ -174,7 +174,7 @@ def test_a_planted_library_is_not_run_but_made_again(cache, tmp_path, how):
     else:
         made.rename(planted)
         planted.chmod(0o777 if how == "writable by all" else 0o755)
-    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
     assert not (tmp_path / "trace").exists()
     assert [path.is_symlink() or path.stat().st_mode & 0o022 for path in cache.iterdir()] == [0]
 
@@ -185,7 +185,7 @@ def test_what_a_killed_compilation_left_is_removed(cache):
     for name, age in (("build-old", 1e5), ("build-new", 0.0)):
         (cache / name).mkdir()
         os.utime(cache / name, (time.time() - age,) * 2)
-    assert compiler.compiled_shared_library(SOURCE % 1).yid_answer() == 1
+    assert compiler.compile_and_load_library(SOURCE % 1).yid_answer() == 1
     assert [path.name for path in cache.iterdir() if path.is_dir()] == ["build-new"]
 
 
@@ -195,7 +195,7 @@ def test_a_home_that_cannot_be_written_to_has_a_cache_for_the_command(cache, tmp
     monkeypatch.delenv("YID_OCP_CACHE")
     monkeypatch.setattr(compiler.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "home" / name))
     compiler._temporary_cache_folder.cache_clear()
-    assert compiler.compiled_shared_library(SOURCE % 7).yid_answer() == 7
+    assert compiler.compile_and_load_library(SOURCE % 7).yid_answer() == 7
     assert "set YID_OCP_CACHE" in caplog.text
     folder = compiler._temporary_cache_folder(tmp_path / "home" / "yid_ocp")
     assert (folder.stat().st_mode & 0o777, len(list(folder.glob("*.so")))) == (0o700, 1)
@@ -206,7 +206,7 @@ def test_a_compiler_that_hangs_is_spoken_of_and_waited_for_once(cache, choose, t
     monkeypatch.setattr(compiler, "_COMPILE_TIMEOUT", 0.5)
     monkeypatch.setattr(compiler, "_NOTICE_DELAY", 0.1)
     monkeypatch.setattr(compiler, "_HUNG_COMPILERS", set())
-    assert [compiler.compiled_shared_library(SOURCE % i) for i in range(3)] == [None] * 3
+    assert [compiler.compile_and_load_library(SOURCE % i) for i in range(3)] == [None] * 3
     assert (tmp_path / "calls").read_text().split() == ["x"]
     assert "has been at work for" in caplog.text
 
@@ -227,7 +227,7 @@ def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, choose, 
 def test_a_level_of_optimization_or_a_compiler_that_is_none_is_said(cache, choose, monkeypatch):
     monkeypatch.setenv("YID_OCP_OPTIMIZE", "fast")
     with pytest.raises(ConfigError, match="YID_OCP_OPTIMIZE"):
-        compiler.compiled_shared_library(SOURCE % 42)
+        compiler.compile_and_load_library(SOURCE % 42)
     choose("no_such_cc")
     with pytest.raises(ConfigError, match="no_such_cc"):
         compiler._compiler_path()
@@ -298,13 +298,13 @@ def test_values_at_every_point(use_compiler):
 
 @needs_compiler
 def test_no_memory_for_a_mapped_function(poor, monkeypatch):
-    libraries, original = [], compiler.compiled_shared_library
+    libraries, original = [], compiler.compile_and_load_library
 
     def poor_library(source):
         libraries.append(original(poor.source + source))
         return libraries[-1]
 
-    monkeypatch.setattr(compiler, "compiled_shared_library", poor_library)
+    monkeypatch.setattr(compiler, "compile_and_load_library", poor_library)
     x = ca.SX.sym("x", 2)
     double = MappedFunction(ca.Function("double_it", [x], [2 * x]))
     poor.watch(libraries[0])

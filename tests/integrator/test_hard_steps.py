@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import NewtonStatus, RolloutInputs, SensitivityDirections, StepStatus
+from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutInputs, RolloutStatus, SensitivityDirections
 from yid_ocp.model import Grasp, System
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
@@ -35,7 +35,7 @@ class Hard:
     torque: float = 0.0
     moved: np.ndarray | float = 0.0
     steps: int = 1
-    code: NewtonStatus = NewtonStatus.OK
+    code: NewtonStatusCode = NewtonStatusCode.OK
     damped: bool = False
     conditioning: float = 1.0
     tolerance: float | None = None
@@ -44,7 +44,7 @@ class Hard:
         return compile_step(self.system, self.time_step, use_compiler=use_compiler, tolerance=self.tolerance)
 
     def inputs(self):
-        n, nz = self.system.n_coordinates, len(self.system.internal_coordinate_symbols)
+        n, nz = self.system.n_coordinates, len(self.system.effect_internal_coordinate_symbols)
         start = np.concatenate([self.q, np.broadcast_to(self.p, n), np.zeros(nz)])
         torque = np.full((self.steps, len(self.system.driven)), self.torque)
         path = np.tile(self.q[list(self.system.prescribed_coordinate_indices)], (self.steps + 1, 1))
@@ -54,7 +54,7 @@ class Hard:
 
 def gripped_cable(parts, shape):
     """The cable in a shape, its end held by a prescribed clamp."""
-    clamp, end = floating_clamp("clamp"), parts.tip(parts.cable().mechanism, "w_C", shape)[:3, 3]
+    clamp, end = floating_joint_mechanism("clamp"), parts.tip(parts.cable().mechanism, "w_C", shape)[:3, 3]
     objects, grasps = [(parts.cable_object(), None, None)], [Grasp("end", "clamp", "w_C")]
     system = System.build(clamp, objects=objects, grasps=grasps, prescribed=clamp.joint_names)
     return system, np.concatenate([end, np.zeros(3), shape])
@@ -102,16 +102,18 @@ CASES: dict[str, Callable[..., Hard]] = {
     "almost_at_full_stretch": lambda p, f: Hard(*gripped_cable(p, 1e-4 * NEARLY_STRAIGHT), 1e-3, conditioning=1e5),
     "short_steps_to_the_last_digit": lambda p, f: Hard(p.cable(), BENT, 5e-6, p=0.1 * BENT, steps=300, tolerance=1e-17),
     "at_full_stretch": lambda p, f: Hard(
-        *gripped_cable(p, 0 * BENT), 1e-3, moved=PULLED_BACK, code=NewtonStatus.SINGULAR
+        *gripped_cable(p, 0 * BENT), 1e-3, moved=PULLED_BACK, code=NewtonStatusCode.SINGULAR
     ),
-    "redundant_grasps": lambda p, f: Hard(redundant(f), np.array([0.1, 0.2, 0.3]), 0.01, code=NewtonStatus.SINGULAR),
+    "redundant_grasps": lambda p, f: Hard(
+        redundant(f), np.array([0.1, 0.2, 0.3]), 0.01, code=NewtonStatusCode.SINGULAR
+    ),
     "out_of_reach": lambda p, f: Hard(
-        out_of_reach(f), np.array([0.1, 0.3, 0.4]), 0.01, code=NewtonStatus.NOT_CONVERGED
+        out_of_reach(f), np.array([0.1, 0.3, 0.4]), 0.01, code=NewtonStatusCode.NOT_CONVERGED
     ),
     "much_too_fast": lambda p, f: Hard(
-        pendulum(f), HANGING, 1.0, p=np.array([10.0, -4.0]), torque=5.0, code=NewtonStatus.NOT_CONVERGED
+        pendulum(f), HANGING, 1.0, p=np.array([10.0, -4.0]), torque=5.0, code=NewtonStatusCode.NOT_CONVERGED
     ),
-    "not_a_number": lambda p, f: Hard(pendulum(f), HANGING, 0.01, torque=np.nan, code=NewtonStatus.NOT_FINITE),
+    "not_a_number": lambda p, f: Hard(pendulum(f), HANGING, 0.01, torque=np.nan, code=NewtonStatusCode.NOT_FINITE),
 }
 
 
@@ -127,7 +129,7 @@ def first_correction(hard: Hard) -> float:
     after[list(hard.system.prescribed_coordinate_indices)] = path[1]
     sizes, unknown = step.sizes, step.model.index_tables.unknown_rows
     pair = np.stack([start, after])
-    found = step.kernel.linearize(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
+    found = step.kernel.linearize_step_equations(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
     change = np.linalg.solve(found.residual_by_new[0][np.ix_(unknown, unknown)], found.residual[0][unknown])
     return float(np.max(np.abs(change[: len(unknown) - sizes["m"]])))
 
@@ -143,10 +145,10 @@ def test_both_kernels_agree(parts, hard):
     inputs = RolloutInputs(theta, start, torque, path, None, directions)
     one, two = (step.kernel.rollout(inputs) for step in steps)
     assert (one.status.code, two.status.code) == (hard.code, hard.code)
-    done = hard.steps if hard.code == NewtonStatus.OK else 0
+    done = hard.steps if hard.code == NewtonStatusCode.OK else 0
     assert one.status.completed_steps == two.status.completed_steps == done
     assert one.status.message.partition("(")[0] == two.status.message.partition("(")[0]
-    if hard.code != NewtonStatus.OK:
+    if hard.code != NewtonStatusCode.OK:
         assert all(np.all(np.isnan(r.state_sensitivity[1:])) and np.all(np.isnan(r.multipliers)) for r in (one, two))
         return
     if hard.damped:
@@ -154,8 +156,8 @@ def test_both_kernels_agree(parts, hard):
     parts.assert_kernels_agree(steps, inputs, hard.conditioning)
 
 
-@pytest.mark.parametrize("code", list(NewtonStatus))
+@pytest.mark.parametrize("code", list(NewtonStatusCode))
 @pytest.mark.parametrize("step", [3, 700])
 def test_a_failure_after_hundreds_of_steps_names_the_methods_limit(code, step):
-    late = step == 700 and code in (NewtonStatus.NOT_CONVERGED, NewtonStatus.NOT_FINITE)
-    assert ("the midpoint rule damps nothing" in StepStatus(code, step, 0.1, 5, 5).message) is late
+    late = step == 700 and code in (NewtonStatusCode.NOT_CONVERGED, NewtonStatusCode.NOT_FINITE)
+    assert ("the midpoint rule damps nothing" in RolloutStatus(code, step, 0.1, 5, 5).message) is late

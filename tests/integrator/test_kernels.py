@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import compile_step_like, step_maps
+from yid_ocp.integrator.step import compile_step_like, rollout_step_derivatives
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 
@@ -91,7 +91,9 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     s, step, names = case.step.sizes, case.step, case.step.system.parameters.names[::3]
     n, h = s["n"], step.time_step
     rollout = case.rollout()
-    exact = step.kernel.linearize(case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False)
+    exact = step.kernel.linearize_step_equations(
+        case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False
+    )
     solved = exact.residual[:, step.model.index_tables.unknown_rows]
     assert np.max(np.abs(solved)) < 1e-9 * scale_of(rollout.multipliers)
     np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
@@ -103,7 +105,10 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
     lam = rollout.multipliers + 0.01 * rng.normal(size=rollout.multipliers.shape)
     plain = compile_step_like(step, step.system, use_compiler=False)
-    one, two = (k.linearize(case.theta, state, lam, case.torque, names, True) for k in (step.kernel, plain.kernel))
+    one, two = (
+        k.linearize_step_equations(case.theta, state, lam, case.torque, names, True)
+        for k in (step.kernel, plain.kernel)
+    )
     for key in vars(one):
         actual, expected = getattr(one, key), getattr(two, key)
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale_of(expected))
@@ -115,7 +120,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
 
     def at(epsilon):
         arguments = [value + epsilon * move for value, move in zip(values, moves, strict=True)]
-        return step.kernel.linearize(*arguments, (), False)
+        return step.kernel.linearize_step_equations(*arguments, (), False)
 
     epsilon = 1e-6
     plus, minus = at(epsilon), at(-epsilon)
@@ -141,7 +146,10 @@ def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
     rows, momentum = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2)), rng.normal(size=(sizes["n"], 2))
     inputs = rng.normal(size=(len(rollout.torque), sizes["nu"], 3))
     for feedback in (None, case.feedback):
-        maps = (step_maps(s, case.theta, rollout, inputs, feedback, (rows, momentum)) for s in (case.step, slow))
+        maps = (
+            rollout_step_derivatives(s, case.theta, rollout, inputs, feedback, (rows, momentum))
+            for s in (case.step, slow)
+        )
         both = ([np.concatenate(parts) for parts in zip(*some, strict=True)] for some in maps)
         made, expected = ((state, *np.split(effort, [sizes["nc"]], axis=1)) for state, effort in both)
         for one, other in zip(made, expected, strict=True):
@@ -150,7 +158,7 @@ def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
             scale = np.maximum(np.max(np.abs(other), axis=(0, 1), initial=0.0), least)
             assert np.max(np.abs(one - other) / scale, initial=0.0) < 1e-9
     each = np.tile(np.eye(sizes["nu"]), (len(rollout.torque), 1, 1))
-    by_all, effort = next(step_maps(case.step, case.theta, rollout, each))
+    by_all, effort = next(rollout_step_derivatives(case.step, case.theta, rollout, each))
     n, q0 = sizes["n"], rollout.state[0]
     prescribed = (case.path[0], case.path[1]) if sizes["nc"] else None
     A, B_u, _ = case.step.jacobians(q0[:n], q0[n : 2 * n], case.torque[0], case.theta, prescribed, q0[2 * n :], ())

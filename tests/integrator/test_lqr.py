@@ -11,8 +11,8 @@ from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import (
     EffectMomentumShift,
     JointMotionWithSensitivities,
-    lqr_feedback,
-    proportional_feedback,
+    lqr_tracking_feedback,
+    proportional_tracking_feedback,
 )
 from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import mass_matrix, rigid_body_lagrangian_derivatives
@@ -56,7 +56,7 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
     inertia, by_q = (np.array(ca.densify(x)) for x in function(posture, [0, 0]))
     torque = np.tile(-by_q.ravel(), (STEPS, 1))
     theta = step.system.parameters.vector()
-    loop = lqr_feedback(step, np.tile(posture, (STEPS + 1, 1)), torque, theta)
+    loop = lqr_tracking_feedback(step, np.tile(posture, (STEPS + 1, 1)), torque, theta)
     n = step.system.n_coordinates
     np.testing.assert_array_equal(loop.state_indices, [0, 1, n, n + 1])
 
@@ -76,27 +76,27 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
 def test_the_reference_is_a_motion_of_the_arm_alone(step, motion):
     """It holds the angles and, by the arm's own equations, the momenta; the first one from a standing start."""
     _, torque, swung = motion
-    loop = lqr_feedback(step, swung.state[:, :2], torque, step.system.parameters.vector())
+    loop = lqr_tracking_feedback(step, swung.state[:, :2], torque, step.system.parameters.vector())
     np.testing.assert_allclose(loop.reference[1:], swung.state[1:-1], rtol=0, atol=1e-9)
 
 
 def test_a_proportional_filter(step):
     measured = np.arange(8.0).reshape(4, 2)
-    loop = proportional_feedback(step, measured, [5.0, 7.0])
+    loop = proportional_tracking_feedback(step, measured, [5.0, 7.0])
     np.testing.assert_array_equal(loop.gain, [np.diag([5.0, 7.0])] * 3)
     np.testing.assert_array_equal(loop.reference, measured[:-1])
     np.testing.assert_array_equal(loop.state_indices, [0, 1])
-    np.testing.assert_array_equal(proportional_feedback(step, measured, 5.0).gain, [np.diag([5.0, 5.0])] * 3)
+    np.testing.assert_array_equal(proportional_tracking_feedback(step, measured, 5.0).gain, [np.diag([5.0, 5.0])] * 3)
     with pytest.raises(ModelError, match=r"negative: -1 N m/rad"):
-        proportional_feedback(step, measured, [5.0, -1.0])
+        proportional_tracking_feedback(step, measured, [5.0, -1.0])
     with pytest.raises(ModelError, match="3 gains for 2 driven joints"):
-        proportional_feedback(step, measured, [1.0, 2.0, 3.0])
+        proportional_tracking_feedback(step, measured, [1.0, 2.0, 3.0])
 
 
 def test_driven_joints_must_come_first(parts):
     step = compile_step(parts.cable(driven=["C_2_x"]), 0.01, use_compiler=False)
     with pytest.raises(ModelError, match="come first"):
-        lqr_feedback(step, np.zeros((4, 1)), np.zeros((3, 1)), step.system.parameters.vector())
+        lqr_tracking_feedback(step, np.zeros((4, 1)), np.zeros((3, 1)), step.system.parameters.vector())
 
 
 ANGLES = slice(0, 2)
@@ -148,7 +148,7 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     state, torque, internal = moved(step, theta)
     shift = EffectMomentumShift(step)
     read = torque + misread
-    loop = lqr_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
+    loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
     recorded, true = (JointMotionWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
     value, _ = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)

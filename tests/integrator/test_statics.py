@@ -11,13 +11,13 @@ from yid_ocp.integrator.statics import (
     _HOLD_STIFFNESS,
     _HOLD_STIFFNESS_WITH_TORQUE,
     EquilibriumSolver,
-    relaxed_internal_coordinates,
+    internal_coordinates_at_held_configuration,
 )
 from yid_ocp.integrator.step import compile_step, compile_step_like, simulate
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -25,7 +25,7 @@ def hung_cable(span: float):
     """A cable of 0.6 m that starts level along x, its end held at a fraction of its length; statics and clamp pose."""
     turn = rotation_from_rpy(0.0, np.pi / 2, 0.0)
     segment = Segment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rest_rotation=turn)
-    clamp = floating_clamp("clamp")
+    clamp = floating_joint_mechanism("clamp")
     objects, grasps = [(flexible_object([segment], name="cable"), None, None)], [Grasp("end", "clamp", "w_C")]
     system = System.build(clamp, objects=objects, grasps=grasps, prescribed=clamp.joint_names)
     return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False)), np.array([0.6 * span, 0, 0, 0, 0, 0])
@@ -126,6 +126,8 @@ def test_internal_coordinates_of_an_object_that_has_long_been_there(parts):
     system = parts.cable(effects=[parts.maxwell_branch("C_0_x", 3.0, 0.02)])
     step = compile_step(system, 1e-3, use_compiler=False)
     q = np.linspace(0.1, 0.5, 9)
-    np.testing.assert_allclose(relaxed_internal_coordinates(step, q, system.parameters.vector()), [q[0]], rtol=1e-12)
+    np.testing.assert_allclose(
+        internal_coordinates_at_held_configuration(step, q, system.parameters.vector()), [q[0]], rtol=1e-12
+    )
     plain = compile_step(parts.cable(), 1e-3, use_compiler=False)
-    assert relaxed_internal_coordinates(plain, q, plain.system.parameters.vector()).shape == (0,)
+    assert internal_coordinates_at_held_configuration(plain, q, plain.system.parameters.vector()).shape == (0,)

@@ -11,10 +11,10 @@ import pytest
 
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
-from yid_ocp.integrator.step_model import NewtonStatus
+from yid_ocp.integrator.step_model import NewtonStatusCode
 from yid_ocp.model import Grasp, Parameters, Segment, StepTerms, System, flexible_object
 from yid_ocp.model.mechanism import Inertia
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
 ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
@@ -211,11 +211,11 @@ class TestFailures:
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         theta = system.parameters.vector()
         _, _, _, status = step([0.1, 0.2], [0.0, 0.0], [math.nan], theta)
-        assert (status.is_converged, status.code, status.completed_steps) == (False, NewtonStatus.NOT_FINITE, 0)
+        assert (status.is_converged, status.code, status.completed_steps) == (False, NewtonStatusCode.NOT_FINITE, 0)
         torque = np.zeros((12, 1))
         torque[7] = math.nan
         rollout = roll(step, theta, [0.1, 0.2], [0.0, 0.0], 12, torque=torque)
-        assert (rollout.status.code, rollout.status.completed_steps) == (NewtonStatus.NOT_FINITE, 7)
+        assert (rollout.status.code, rollout.status.completed_steps) == (NewtonStatusCode.NOT_FINITE, 7)
         assert rollout.status.message.startswith("step 7: the state is no longer finite")
         assert np.all(np.isfinite(rollout.state[:8]))
         assert np.all(np.isnan(rollout.state[9:]))
@@ -312,7 +312,7 @@ PULL, WEIGHT = 100.0, 9.81  # [N]
 def test_tension_makes_no_motion_grow_where_constraints_pull_at_the_midpoint(parts):
     """A light cable, almost straight, drawn up by a clamp of 1 kg."""
     light = {"mass": 0.06, "radius": 0.01, "bend": 0.5, "twist": 0.5, "damping": 1e-3}
-    clamp, bent = floating_clamp("clamp"), np.array([0.02, 0, 0, -0.03, 0, 0, 0.01, 0, 0])
+    clamp, bent = floating_joint_mechanism("clamp"), np.array([0.02, 0, 0, -0.03, 0, 0, 0.01, 0, 0])
     body = Inertia.from_values(1.0, np.zeros(3), 1e-3 * np.eye(3))
     clamp = replace(clamp, joints=tuple(replace(j, bodies=(body,) * (j.name == "clamp_z")) for j in clamp.joints))
     held = [name for name in clamp.joint_names if name != "clamp_z"]

@@ -17,7 +17,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism, Segment, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Inertia, merge_bodies
 from yid_ocp.model.objects.base import CableTopology
-from yid_ocp.model.objects.cable import cable_system
+from yid_ocp.model.objects.cable import clamped_cable_system
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.rotations import (
     homogeneous_transform,
@@ -89,7 +89,7 @@ def test_a_cable_is_counted_from_clamp_to_clamp():
     parent = ("a", "b", "c", "d", "e")
     shape = {name: [0.1 * i, 0.0, 0.0] for i, name in enumerate(parent)} | {"f": [0.2, 0.0, 0.1]}
     cable = CableTopology(parent, {"child": ("c", "f")}, shape)
-    tree = cable_system(dict.fromkeys(cable.edges, 0.1), cable).mechanism
+    tree = clamped_cable_system(dict.fromkeys(cable.edges, 0.1), cable).mechanism
     along = places(tree, ["parent:0%", "parent:12.5%", "parent:25%", "parent:50%", "parent:100%", "child:50%"])
     a, b, c, e, f = places(tree, ["a", "b", "c", "e", "f"])
     for found, place in zip(along, (a, (a + b) / 2, b, c, e, (c + f) / 2), strict=True):

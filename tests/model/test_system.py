@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from placed_frames import numbers
 
-from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_hint, unknown_name_details
+from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.model import (
     Effect,
     Grasp,
@@ -22,7 +22,7 @@ from yid_ocp.model import (
 from yid_ocp.model.mechanism import merge_bodies
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.rotations import rotation_from_rpy
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -70,7 +70,7 @@ def test_forces_and_energy(robot):
 @pytest.mark.parametrize(("kind", "count"), [("point", 3), ("axis", 5), ("weld", 6)])
 def test_grasp_equations(kind, count):
     """Zero where holder, turned and offset, meets the held frame; linear in small displacements."""
-    tree = floating_clamp("one").with_attached_mechanism(floating_clamp("two"))
+    tree = floating_joint_mechanism("one").with_attached_mechanism(floating_joint_mechanism("two"))
     turn = rotation_from_rpy(0.3, -0.5, 0.9)
     grasp = Grasp("g", "one", "two", kind, ca.SX(ca.DM(turn)), ca.SX(ca.DM([0.1, 0.2, 0.3])), axial_slip=ca.SX(0.05))
     system = System.build(tree, grasps=[grasp])
@@ -149,13 +149,13 @@ def test_errors_of_build(robot, name):
 
 
 def test_a_clamp_has_six_massless_coordinates():
-    clamp = floating_clamp("hand", frame="palm")
+    clamp = floating_joint_mechanism("hand", frame="palm")
     assert clamp.joint_names == tuple(f"hand_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))
     assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
-    assert clamp.parent_indices == (-1, 0, 1, 2, 3, 4)
+    assert clamp.parent_joint_indices == (-1, 0, 1, 2, 3, 4)
     assert all(merge_bodies(j.bodies) is None for j in clamp.joints)
     assert clamp.frame("palm").joint_index == 5
-    assert floating_clamp("hand").frame("hand").joint_index == 5
+    assert floating_joint_mechanism("hand").frame("hand").joint_index == 5
 
 
 @pytest.fixture
@@ -243,13 +243,13 @@ def test_nearest_name():
 
 def test_names_are_listed_once_and_long_lists_are_cut():
     few, many, more = ["b", "a"], [f"joint_{i}" for i in range(30)], [f"frame_{i}" for i in range(70)]
-    assert unknown_name_details("zzz", few) == {"allowed": "b, a", "hint": ""}
-    assert unknown_name_details("zzz", []) == {"allowed": "none", "hint": ""}
+    assert unknown_name_error_arguments("zzz", few) == {"allowed": "b, a", "hint": ""}
+    assert unknown_name_error_arguments("zzz", []) == {"allowed": "none", "hint": ""}
     # nothing is near: all of them, for somebody who looks for a name
-    assert unknown_name_details("zzz", many) == {"allowed": ", ".join(many), "hint": ""}
-    said = unknown_name_details("joint_7x", many)
+    assert unknown_name_error_arguments("zzz", many) == {"allowed": ", ".join(many), "hint": ""}
+    said = unknown_name_error_arguments("joint_7x", many)
     assert said["hint"] == "did you mean 'joint_7'?"
     assert said["allowed"].startswith("joint_7, ")
     assert said["allowed"].endswith(" and 22 more")
-    assert unknown_name_details("zzz", more)["allowed"] == ", ".join(more[:8]) + " and 62 more"
+    assert unknown_name_error_arguments("zzz", more)["allowed"] == ", ".join(more[:8]) + " and 62 more"
     assert nearest_name_hint("zzz", more).count("frame_") == 8

@@ -15,7 +15,7 @@ from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import urdf as urdf_files
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
 from yid_ocp.model.rotations import homogeneous_transform
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, resolve_urdf_path
 
 BODY = '<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
@@ -66,7 +66,7 @@ def test_kept_joints_in_the_order_given(urdf_folder):
     robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=names)
     # parents come first, the rest as given
     assert robot.joint_names == ("slide", "swing", "nod", "spin")
-    assert robot.parent_indices == (-1, 0, 1, 0)
+    assert robot.parent_joint_indices == (-1, 0, 1, 0)
     assert robot.name == "mixed_joints"
     assert robot.ancestor_joint_indices(robot.joint_index("nod")) == (0, 1, 2)
     assert robot.ancestor_joint_indices(-1) == ()
@@ -215,7 +215,10 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
         (lambda path: read_urdf(path).joint_index("slider"), ["'slider'", "'slide'", "mixed_joints"]),
         (lambda path: read_urdf(path).frame("tol"), ["frame 'tol'", "'tool'"]),
         (lambda path: read_urdf(path).with_attached_mechanism(read_urdf(path)), ["two parts", "'bracket'"]),
-        (lambda path: read_urdf(path).with_attached_mechanism(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
+        (
+            lambda path: read_urdf(path).with_attached_mechanism(floating_joint_mechanism("c"), "rotr"),
+            ["'rotr'", "'rotor'"],
+        ),
     ],
 )
 def test_errors_name_what_is_wrong_and_what_is_near(urdf_folder, action, words):

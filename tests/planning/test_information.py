@@ -12,7 +12,7 @@ from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.planning.information_plan import plan_informative_motion
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
 from yid_ocp.planning.motion_search import DOptimalityCriterion, EffectDiscriminationCriterion, InformativeMotionSearch
-from yid_ocp.planning.planned_experiment import PlannedExperiment
+from yid_ocp.planning.planned_experiment import ParameterizedExperiment
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
 PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
@@ -24,7 +24,7 @@ OPTIONS = PlanOptions(goal="information", limits=LIMITS, **SIZES)
 
 def problem_of(limited_urdf, free=FREE, **how):
     step = pendulum_step(limited_urdf.parent, **how)
-    options = ProblemOptions(path_cutoff=15.0, tracking_filter="none")
+    options = ProblemOptions(path_cutoff=15.0, arm_tracking_feedback="none")
     return EstimationProblem(step, [taken(step, 3, steps=140)], free, options)
 
 
@@ -40,12 +40,12 @@ def driven_problem(limited_urdf):
 
 @pytest.fixture(scope="module")
 def moved_experiment(moved_problem):
-    return PlannedExperiment.from_options(moved_problem, {}, OPTIONS)
+    return ParameterizedExperiment.from_options(moved_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def driven_experiment(driven_problem):
-    return PlannedExperiment.from_options(driven_problem, {}, OPTIONS)
+    return ParameterizedExperiment.from_options(driven_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from small_problems import pendulum_step
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate
-from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanLimits, PlanOptions, SplinePath
+from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanLimits, PlanOptions, SplinePath
 from yid_ocp.planning.motion_plan import ParameterCovariance, plan_motion_to_target
-from yid_ocp.planning.motion_search import PlanResidualsAndLimits, PlanShootingProblem
+from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionSearch
 
 START, GOAL = 0.2, 0.7
 
@@ -29,7 +29,7 @@ def rested(step, theta, angle=START, path=None):
 
 def places(mover, state, name="tip"):
     """Positions of a frame along states."""
-    return mover.frame_trajectories(FramePositionFunction(mover.step.system, [name]), state)[:, 0]
+    return mover.frame_position_trajectories(FramePositionEvaluator(mover.step.system, [name]), state)[:, 0]
 
 
 def elsewhere(plan, change):
@@ -59,17 +59,18 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.3))
     "more",
     [
         {"goal": "place", "effort_weight": 0.5, "limits": PlanLimits(max_spring_angle=0.5)},
-        {"goal": "path", "waypoint_offsets": ((0.0, 0.1, 0.0),)},
+        {"goal": "path", "waypoint_offsets_from_start": ((0.0, 0.1, 0.0),)},
         {"goal": "box", "box": BOX},
     ],
     ids=["place", "path", "box"],
 )
 def test_slopes_are_derivatives(moved, wanted, more):
     options, mover = replace(wanted, **more), rested(moved, moved.system.parameters.vector())
-    frames, simple = FramePositionFunction(moved.system, ("tip", "lower")), mover.path.straight_line_coefficients([0.4])
+    frames = FramePositionEvaluator(moved.system, ("tip", "lower"))
+    simple = mover.path.straight_line_coefficients([0.4])
     inside = frames if options.box else None
-    rows = PlanResidualsAndLimits(mover, options, frames, np.array(options.target_position), simple, inside)
-    shooting = PlanShootingProblem([rows], simple.shape)
+    rows = PlanResidualAndLimitFunctions(mover, options, frames, np.array(options.target_position), simple, inside)
+    shooting = TargetMotionSearch([rows], simple.shape)
     rng, x, e = np.random.default_rng(5), simple.ravel() + 0.1, 1e-5
     way = rng.normal(size=x.size)
     before, after, here = (shooting._residual_and_limit_values(y) for y in (x - e * way, x + e * way, x))
@@ -155,7 +156,7 @@ def test_a_path_is_followed(moved, wanted):
     begin = point_at(moved, START)
     via = tuple(tuple(float(x) for x in point_at(moved, angle) - begin) for angle in (0.45, 0.8))
     more = {"duration": 1.5, "n_spline_coefficients": 12, "position_tolerance": 5e-3}
-    options = replace(wanted, goal="path", waypoint_offsets=via, **more)
+    options = replace(wanted, goal="path", waypoint_offsets_from_start=via, **more)
     followed = plan_motion_to_target(moved, options)
     assert followed.is_successful, followed.message
     direct = plan_motion_to_target(moved, replace(options, goal="place")).point_trajectories["tip"]
@@ -215,7 +216,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"target_position": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "nearer place")),
         ({"point": "tipp"}, ("no frame 'tipp'",)),
         ({"point": None}, ("no point is named",)),
-        ({"target_offset": (0.0, 0.1, 0.0)}, ("said twice", "one of place and shift")),
+        ({"target_offset_from_start": (0.0, 0.1, 0.0)}, ("said twice", "one of place and shift")),
         ({"target_position": None}, ("nothing says where the point is to arrive",)),
         ({"start_joint_positions": {"shoulder": 1.5}}, ("starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2")),
         ({"start_joint_positions": {"sholder": 0.5}}, ("'sholder' is no joint that moves", "did you mean 'shoulder'?")),

@@ -9,13 +9,13 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.step import simulate
-from yid_ocp.planning.joint_paths import FramePositionFunction
+from yid_ocp.planning.joint_paths import FramePositionEvaluator
 from yid_ocp.workflow.plan import run_plan
-from yid_ocp.workflow.run_inputs import given_or_shipped_recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {
-    "plan_place": ("model.object.links=2", "plan.target_offset=[-0.01, 0.02, 0.015]"),
+    "plan_place": ("model.object.links=2", "plan.target_offset_from_start=[-0.01, 0.02, 0.015]"),
     "plan_cable": ("model.object.segments.cable.links=4",),
 }
 
@@ -62,35 +62,35 @@ def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
 
 
 def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
-    path = "goal=path", "waypoint_offsets=[[-0.01, 0.01, 0.02]]", "duration=1.6", "n_spline_coefficients=8"
+    path = "goal=path", "waypoint_offsets_from_start=[[-0.01, 0.01, 0.02]]", "duration=1.6", "n_spline_coefficients=8"
     more = (f"plan.{entry}" for entry in (*path, "position_tolerance=0.004"))
     run, outcome = planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], *more)
     assert outcome.is_successful, outcome.result["message"]
     tip, t = outcome.output.point_trajectories["w_T3"], outcome.output.t
     halfway = tip[int(np.argmin(np.abs(t - 0.8)))] - tip[0]
-    off = np.linalg.norm(halfway - run.plan.waypoint_offsets[0])
+    off = np.linalg.norm(halfway - run.plan.waypoint_offsets_from_start[0])
     assert off <= outcome.result["off_path"] + 1e-9
     assert outcome.result["off_path"] < 0.01
-    aside = np.linalg.norm(run.plan.waypoint_offsets[0] - 0.5 * (outcome.output.target_position - tip[0]))
+    aside = np.linalg.norm(run.plan.waypoint_offsets_from_start[0] - 0.5 * (outcome.output.target_position - tip[0]))
     assert aside > 0.01, "the way must not lead there by itself"
 
 
 def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, tmp_path):
     name = "dual_arm_vision"
-    way = "plan={point: w_T1, target_offset: [0.03, 0.03, 0.0], duration: 0.8, hold_duration: 0.3}"
+    way = "plan={point: w_T1, target_offset_from_start: [0.03, 0.03, 0.0], duration: 0.8, hold_duration: 0.3}"
     run, outcome = planned(repository, tmp_path, name, "model.object.links=2", STIFF, way)
     assert outcome.is_successful, outcome.result["message"]
     assert outcome.result["swing"] < run.plan.point_rest_speed_tolerance
     found = outcome.output
     # it begins where the recording does, and both arms take part
-    recorded = read_recording(given_or_shipped_recording_path(run.recordings.estimate[0])).joints
+    recorded = read_recording(resolve_recording_path(run.recordings.estimate[0])).joints
     first = recorded.position[0, [recorded.names.index(name) for name in found.joint_names]]
     np.testing.assert_allclose(found.joint_positions[0], first, atol=5e-3)
     travel = dict(zip(found.joint_names, np.ptp(found.joint_positions, axis=0), strict=True))
     assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
     system = found.simulator.step.system
     names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    at = found.simulator.frame_trajectories(FramePositionFunction(system, names), found.rollout.state)
+    at = found.simulator.frame_position_trajectories(FramePositionEvaluator(system, names), found.rollout.state)
     at = at.reshape(len(found.t), -1, 2, 3)
     assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
 
@@ -115,13 +115,13 @@ def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit,
 def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):
     file = repository / "configs" / "deft_bdlo1.yaml"
     run = load_config(file)
-    if not given_or_shipped_recording_path(run.recordings.estimate[0]).is_file():
+    if not resolve_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
-    way = "plan={point: p6, target_offset: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
+    way = "plan={point: p6, target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
     fewer = (
-        "points_along_child_branches={}",
+        "child_branch_point_names={}",
         "branch_properties={}",
-        "points_along_parent_branch=[p0, p1, p4, p6, p8, p11, p12]",
+        "parent_branch_point_names=[p0, p1, p4, p6, p8, p11, p12]",
     )
     coarse = [f"model.object.{entry}" for entry in fewer]
     coarse += ["model.object.branch_properties={parent: {separate_twist_damping: true, linear_density: 0.05}}"]

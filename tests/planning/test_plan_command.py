@@ -13,7 +13,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.report.diagnosis_summaries import _planning_command
-from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, summary_terminal_lines
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.plan import (
     compile_step_for_planning,
     discrimination_plan_settings,
@@ -24,13 +24,13 @@ from yid_ocp.workflow.simulate import run_simulate
 
 PLAN = """\
 problem: {path_cutoff: .inf}
-plan: {point: tip, target_offset: [0.0, 0.15, 0.04], start_joint_positions: {shoulder: 0.2}, duration: 0.7,
+plan: {point: tip, target_offset_from_start: [0.0, 0.15, 0.04], start_joint_positions: {shoulder: 0.2}, duration: 0.7,
   hold_duration: 0.3, position_tolerance: 0.02}
 """
 INFORMATION = """\
   elbow.damping: {free: true}
 recordings: {estimate: [RECORDING]}
-problem: {path_cutoff: 15.0, tracking_filter: none}
+problem: {path_cutoff: 15.0, arm_tracking_feedback: none}
 plan:
   {goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2,
     limits: {max_acceleration: 15.0}}
@@ -177,7 +177,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
     planned = read_recording(tmp_path / "out" / "recording.h5")
     np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
     assert '<section id="information">' in (tmp_path / "out" / "report.html").read_text()
-    words = "\n".join(summary_terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result)))
+    words = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result)))
     for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"± {100 * known.std_planned:.2g} %" in words
@@ -199,7 +199,9 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
     assert {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]} == {PAIR, PAIR[::-1]}
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
-    assert PAIR[0] in "\n".join(summary_terminal_lines(SUMMARY_BY_FORMAT[outcome.result["format"]](outcome.result)))
+    assert PAIR[0] in "\n".join(
+        summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[outcome.result["format"]](outcome.result))
+    )
 
 
 @pytest.mark.parametrize(

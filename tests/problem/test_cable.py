@@ -15,13 +15,13 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (
     CableBranchOptions,
     CableOptions,
-    cable_system,
+    clamped_cable_system,
     edge_length_parameter_values,
-    read_vertex_positions,
+    read_vertex_positions_by_name,
 )
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.problem.recorded_inputs import prescribed_path
+from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.solvers import GaussNewton, solve
 
@@ -77,16 +77,16 @@ def clamps():
 
 
 def as_recording(cable, t, courses, name="made"):
-    rest = cable.undeformed_polyline(cable.vertices)
-    seen = np.stack([courses.get(v, np.tile(rest[i], (len(t), 1))) for i, v in enumerate(cable.vertices)], axis=1)
-    return Recording(points=(PointGroup("points", cable.vertices, t, seen),), name=name)
+    rest = cable.undeformed_polyline(cable.vertex_names)
+    seen = np.stack([courses.get(v, np.tile(rest[i], (len(t), 1))) for i, v in enumerate(cable.vertex_names)], axis=1)
+    return Recording(points=(PointGroup("points", cable.vertex_names, t, seen),), name=name)
 
 
 def vertex_positions(cable, system):
     """CasADi function of the positions of all vertices, of q and theta."""
     q = ca.SX.sym("q", system.n_coordinates)
     at = forward_kinematics(system.mechanism, q).frame_position
-    return ca.Function("places", [q, system.parameters.symbols], [at(v) for v in cable.vertices])
+    return ca.Function("places", [q, system.parameters.symbols], [at(v) for v in cable.vertex_names])
 
 
 @pytest.fixture(scope="module")
@@ -95,13 +95,15 @@ def twin(cable, clamps):
     t, held = clamps
     options = CableOptions(
         default_branch=CableBranchOptions(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4),
-        lengths_per_recording=False,
+        has_edge_lengths_per_recording=False,
     )
     stub = as_recording(cable, t, held)
-    system = cable_system(typical_point_pair_distances(cable.edges, [as_recording(cable, t, {})]), cable, options)
+    system = clamped_cable_system(
+        typical_point_pair_distances(cable.edges, [as_recording(cable, t, {})]), cable, options
+    )
     step = compile_step(system, PERIOD)
-    path = prescribed_path(
-        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_pose_definitions
+    path = prescribed_coordinates_at_nodes(
+        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_poses_from_points
     )
     theta = system.parameters.vector(TRUTH)
     rest = EquilibriumSolver(step).solve(path[0], theta)
@@ -110,7 +112,7 @@ def twin(cable, clamps):
     assert swept.status.is_converged, swept.status.message
     places = vertex_positions(cable, system).map(len(swept.state))
     positions = places(swept.state[:, : system.n_coordinates].T, theta)
-    seen = {v: np.array(p).T for v, p in zip(cable.vertices, positions, strict=True)}
+    seen = {v: np.array(p).T for v, p in zip(cable.vertex_names, positions, strict=True)}
     return step, options, as_recording(cable, t, seen, "twin")
 
 
@@ -118,7 +120,7 @@ def test_a_cable_names_segments_clamps_junctions_and_vertices(cable, twin):
     system = twin[0].system
     assert [s.name for s in system.segment_layouts] == ["parent", "c"]
     assert system.prescribed[:6] == tuple(f"clamp_start_{k}" for k in ("x", "y", "z", "rx", "ry", "rz"))
-    assert set(cable.vertices) | {"junction_c", "clamp_start", "clamp_end"} <= set(system.mechanism.frames)
+    assert set(cable.vertex_names) | {"junction_c", "clamp_start", "clamp_end"} <= set(system.mechanism.frames)
     assert system.n_constraints == 5
     assert cable.free_vertex_names == ("p2", "p3", "p4", "c1", "c2")
     assert cable.clamped_vertex_names == ("p0", "p1", "p5", "p6")
@@ -128,7 +130,7 @@ def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
     system = twin[0].system
     places = vertex_positions(cable, system)
     at = np.array([np.array(p).ravel() for p in places(np.zeros(system.n_coordinates), system.parameters.vector())])
-    shape = cable.undeformed_polyline(cable.vertices)
+    shape = cable.undeformed_polyline(cable.vertex_names)
 
     def distances(points):
         return np.linalg.norm(points[:, None] - points[None], axis=2)
@@ -141,7 +143,7 @@ def test_the_values_of_a_twin_are_found_from_its_vertices(real, twin_options, ca
     settings = replace(
         twin_options([recording], options),
         # the first edge of the twin is not seen bent, so its roll is given here and fitted elsewhere
-        start_fit_parameters=(),
+        initial_state_fit_parameters=(),
         parameters_by_recording={recording.name: {"clamp_start.roll": TRUTH["clamp_start.roll"]}},
     )
     free = ("parent.bend", "parent.damping", "c.bend")
@@ -184,7 +186,7 @@ def test_held_out_starts_use_no_frame_after_the_second(twin_options, cable, twin
 
 def test_edges_are_as_long_as_measured(cable):
     t = PERIOD * np.arange(4)
-    seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertices}
+    seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertex_names}
     recording = as_recording(cable, t, seen)
     lengths = typical_point_pair_distances(cable.edges, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
@@ -192,7 +194,7 @@ def test_edges_are_as_long_as_measured(cable):
     values = edge_length_parameter_values(cable, typical_point_pair_distances(cable.edges, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
     assert set(values) <= set(
-        cable_system(typical_point_pair_distances(cable.edges, [recording]), cable).parameters.names
+        clamped_cable_system(typical_point_pair_distances(cable.edges, [recording]), cable).parameters.names
     )
     np.testing.assert_array_equal(_measured_positions(recording, "c1"), seen["c1"])
 
@@ -214,12 +216,12 @@ def test_a_cable_that_does_not_fit_together_is_refused(arguments, text):
 def test_vertices_are_read_from_a_table(tmp_path):
     path = tmp_path / "vertices.csv"
     path.write_text("point,x,y,z\np0,1,2,3\n")
-    np.testing.assert_array_equal(read_vertex_positions(path)["p0"], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(read_vertex_positions_by_name(path)["p0"], [1.0, 2.0, 3.0])
     path.write_text("point,x,y\np0,1,2\n")
     with pytest.raises(DataError, match="malformed"):
-        read_vertex_positions(path)
+        read_vertex_positions_by_name(path)
     with pytest.raises(DataError, match="no such file"):
-        read_vertex_positions(tmp_path / "none.csv")
+        read_vertex_positions_by_name(tmp_path / "none.csv")
 
 
 def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, real):
@@ -228,7 +230,9 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, 
         pytest.skip(f"the recordings are not there: {folder}")
     cable, recording = real.branched_cable(folder), read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(shape_memory_fraction=0.75)
-    step = compile_step(cable_system(typical_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD)
+    step = compile_step(
+        clamped_cable_system(typical_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD
+    )
     settings = replace(real.cable_options(cable, [recording], options), duration=1.0)
     problem = EstimationProblem(step, [recording], ("parent.bend", "a.bend"), settings)
     error = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)[recording.name]

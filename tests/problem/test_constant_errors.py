@@ -13,7 +13,7 @@ from yid_ocp.problem.measurements import (
     estimated_constant_errors,
     subtract_estimated_biases,
     whitened_for_sensor_biases,
-    whitened_sensitivities_to_unit_biases,
+    whitened_sensitivities_to_standardized_biases,
 )
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
@@ -25,7 +25,7 @@ OFFSETS = {f"effort_offset@{joint}.offset": std for joint, std in BIAS.items()}
 def options(bias=None, **more):
     # accelerations of an unsmoothed path would drown the constants, were the encoders any worse
     sensors = {"joints.effort": SensorOptions(bias_std=bias), "joints.position": SensorOptions(std=1e-4)}
-    return ProblemOptions(path_cutoff=math.inf, weak_prior_std_as_factor=0.0, sensors=sensors, **more)
+    return ProblemOptions(path_cutoff=math.inf, weak_prior_geometric_std=0.0, sensors=sensors, **more)
 
 
 def arm(folder, bias, free, recordings=2, **how):
@@ -79,7 +79,7 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     name = "effort_offset@elbow.offset"
     recorded = [taken(step, 4, camera=False)]
     sensors = {"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.5})}
-    given = ProblemOptions(path_cutoff=math.inf, weak_prior_std_as_factor=0.0, sensors=sensors)
+    given = ProblemOptions(path_cutoff=math.inf, weak_prior_geometric_std=0.0, sensors=sensors)
     stated = EstimationProblem(step, recorded, ("elbow.mass",), given)
     bare = replace(given, sensors={"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.0})})
     spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))
@@ -118,10 +118,10 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
 def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
-    counted = problem.whitened_held_out_residual(0, episode, result).residual
+    counted = problem.whitened_held_out_prediction_residual(0, episode, result).residual
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     plain = np.concatenate([samples.residual_and_jacobian(y).residual for samples, y in pairs])
-    slopes = whitened_sensitivities_to_unit_biases(episode.measurements)
+    slopes = whitened_sensitivities_to_standardized_biases(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

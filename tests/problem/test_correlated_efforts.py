@@ -31,7 +31,7 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     correlation = np.array([[[1.0, 0.8, -0.3], [0.8, 1.0, 0.1], [-0.3, 0.1, 1.0]]] * 2)
     made = measured(efforts("a", "b", "c"), [0, 1], [0.0, 0.0], [[1.0, 2.0, 3.0], [4.0, NAN, 6.0]])
     made = replace(made, noise_correlation=correlation, weight=made.weight * 2.0)
-    mixing = made.output_decorrelation_matrix.toarray()
+    mixing = made.residual_decorrelation_matrix.toarray()
     np.testing.assert_allclose(mixing, mixing.T, atol=1e-12)
     covariance = np.zeros((5, 5))
     covariance[:3, :3] = correlation[0]
@@ -40,11 +40,11 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     predicted = np.array([[0.0, 1.0, 5.0], [1.0, 9.0, 2.0]])
     plain = 2.0 * np.array([-1.0, -1.0, 2.0, -3.0, -4.0])
     np.testing.assert_allclose(made.residual_and_jacobian(predicted).residual, mixing @ plain, rtol=1e-12)
-    np.testing.assert_allclose(made.whitened_residual(predicted)[made.used_output_mask], mixing @ plain, rtol=1e-12)
+    np.testing.assert_allclose(made.whitened_residual(predicted)[made.positive_weight_mask], mixing @ plain, rtol=1e-12)
     assert made.whitened_residual(predicted)[1, 1] == 0.0
     slopes = np.random.default_rng(0).standard_normal((2, 3, 4))
     found = made.residual_and_jacobian(predicted, slopes, threshold=1.5)
-    seen = made.used_output_mask
+    seen = made.positive_weight_mask
     expected = found.robust_factor[:, None] * (mixing @ (2.0 * slopes[seen]))
     np.testing.assert_allclose(found.jacobian, expected, rtol=1e-12)
     pull = np.random.default_rng(1).standard_normal((2, 3))
@@ -57,7 +57,7 @@ def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",),
     group = JointGroup(
         JOINTS, t, path, effort=effort, position_std=angle, effort_std=std, **{"effort_kind": "sample"} | joint
     )
-    options = ProblemOptions(path_cutoff=cutoff, weak_prior_std_as_factor=0.0)
+    options = ProblemOptions(path_cutoff=cutoff, weak_prior_geometric_std=0.0)
     return EstimationProblem(step, [Recording(group, name="arm")], free, options, values)
 
 
@@ -94,7 +94,7 @@ def test_residuals_of_a_right_model_are_white_among_joints(urdf_folder):
 def correlated_problem(folder, cutoff=math.inf, **how):
     step = pendulum_step(folder, **how)
     names = ("shoulder.damping", "elbow.damping")
-    options = ProblemOptions(weak_prior_std_as_factor=0.0, path_cutoff=cutoff)
+    options = ProblemOptions(weak_prior_geometric_std=0.0, path_cutoff=cutoff)
     made = EstimationProblem(step, [taken(step, 1, steps=40 if math.isinf(cutoff) else 90)], names, options)
     return made.with_episodes([correlated(episode) for episode in made.episodes], ())
 
@@ -111,7 +111,7 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
     np.testing.assert_allclose(problem.cost_and_gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
     program = transcribe(problem)
-    arguments, theta = program.solver_arguments, program.block_layout("theta").index.ravel()
+    arguments, theta = program.solver_arguments, program.named_block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9})
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
@@ -135,7 +135,7 @@ def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     [samples] = (s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     slopes = samples.weight[:, :, None] * np.diag(linear.reference_std[at])
     assert np.array_equal(samples.sensor.effort_joints, JOINTS)
-    seen = samples.output_decorrelation_matrix @ slopes[samples.used_output_mask]
+    seen = samples.residual_decorrelation_matrix @ slopes[samples.positive_weight_mask]
     # but for the first and the last step, of which a node sees half
     np.testing.assert_allclose(found, seen.T @ seen, rtol=0.03)
     assert abs(found[0, 1]) > 0.05 * found.diagonal().min()

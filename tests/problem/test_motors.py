@@ -17,10 +17,10 @@ from small_problems import (
     torque_function,
 )
 
-from yid_ocp.data.recording import validate_recording
+from yid_ocp.data.recording import validated_recording
 from yid_ocp.effects import candidate_kinds_and_locations
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import applied_joint_torque, simulate
+from yid_ocp.integrator.step import applied_driven_joint_torques, simulate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorOptions, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
@@ -31,8 +31,8 @@ VALUES = {
     "elbow.servo_torque_limit": 3.0, "elbow.servo_gain_factor": 100.0,
 }  # fmt: skip
 DC = PositionServoOptions(motor=MotorOptions("dc"))
-FIRMWARE = PositionServoOptions(motor=MotorOptions("dc", "mx64"), firmware=("derivative", "dead_band"))
-INTEGRATING = replace(FIRMWARE, firmware=("integral", "derivative", "dead_band"))
+FIRMWARE = PositionServoOptions(motor=MotorOptions("dc", "mx64"), firmware_terms=("derivative", "dead_band"))
+INTEGRATING = replace(FIRMWARE, firmware_terms=("integral", "derivative", "dead_band"))
 TERMS = {"integral": 3.0, "derivative": 0.7, "dead_band": 0.02}
 FIRMWARE_VALUES = VALUES | {f"{joint}.servo_{term}": value for joint in PENDULUM for term, value in TERMS.items()}
 
@@ -59,11 +59,11 @@ def test_a_firmware_damps_within_its_duty_and_ignores_small_errors(urdf_folder) 
     assert torque([-0.1, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == pytest.approx(-60 * 0.08, abs=1e-3)
     assert torque([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == 0.0
     with pytest.raises(ConfigError, match="has a derivative term already"):
-        PositionServoOptions(firmware=("derivative",))
+        PositionServoOptions(firmware_terms=("derivative",))
 
 
 def test_an_integral_takes_the_sag_away_and_stands_still_while_the_motor_is_off(urdf_folder) -> None:
-    step = pendulum_step(urdf_folder, driven=PENDULUM, servos=replace(DC, firmware=("integral",)))
+    step = pendulum_step(urdf_folder, driven=PENDULUM, servos=replace(DC, firmware_terms=("integral",)))
     command = np.tile([0.4, -0.3], (901, 1))
     enabled = np.ones((901, 2))
     enabled[600:] = 0.0
@@ -76,7 +76,7 @@ def test_an_integral_takes_the_sag_away_and_stands_still_while_the_motor_is_off(
     assert z[601:] == pytest.approx(np.tile(z[600], (300, 1)), abs=1e-9)
     middle = (q[1:601] + q[:600]) / 2
     assert z[600] == pytest.approx(H * np.sum(command[0] - middle, axis=0), abs=1e-9)
-    torque = applied_joint_torque(step, made.theta, found.rollout)
+    torque = applied_driven_joint_torques(step, made.theta, found.rollout)
     assert torque[599] == pytest.approx(np.array([60.0, 25.0]) * 3.0 * z[600], rel=0.02)
 
 
@@ -160,11 +160,11 @@ def test_a_column_switches_motors_within_a_recording(step) -> None:
     off = problem.episodes[0].torque >= MOTOR_OFF_COMMAND / 2
     assert not off[:, 0].any()
     assert list(np.flatnonzero(off[:, 1])) == list(range(20, 35))
-    found = problem.simulate_recording().joints
+    found = problem.simulate_noisy_recording().joints
     assert np.array_equal(found.torque_enable[:60], enabled[:60])
     assert found.position_command == pytest.approx(moved.position_command)
     with pytest.raises(DataError, match="neither 0 nor 1"):
-        validate_recording(recording(swing(torque_enable=np.full((61, 2), 0.5))))
+        validated_recording(recording(swing(torque_enable=np.full((61, 2), 0.5))))
 
 
 LADDER = {

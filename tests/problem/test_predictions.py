@@ -13,10 +13,10 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     constant_position_baseline,
-    interpolated_displacement_baseline,
-    mean_clamp_displacement_baseline,
-    measured_point_positions,
+    interpolated_displacement_position_baseline,
+    mean_clamp_displacement_baseline_prediction,
     position_rmse,
+    recorded_point_positions,
     rmse_unit_and_count_by_channel,
 )
 
@@ -31,7 +31,7 @@ def problem(urdf_folder):
 
 def test_what_is_simulated_is_what_is_found(problem):
     truth = {"elbow.stiffness": 4.2, "elbow.damping": 0.31}
-    made = problem.simulate_recording(truth)
+    made = problem.simulate_noisy_recording(truth)
     assert made.name == "run_1_simulated"
     assert {name: made.true_parameters[name] for name in FREE} == truth
     assert np.array_equal(made.points[0].t, problem.episodes[0].recording.points[0].t)
@@ -45,11 +45,11 @@ def test_what_is_simulated_is_what_is_found(problem):
 
 
 def test_its_own_values_without_any_and_noise_by_its_seed(problem):
-    plain, first, same, other = (problem.simulate_recording(seed=seed) for seed in (None, 3, 3, 4))
+    plain, first, same, other = (problem.simulate_noisy_recording(seed=seed) for seed in (None, 3, 3, 4))
     own = problem.evaluate(problem.initial_unknowns, derivatives=False).episode_predictions[0]
     [samples] = [s for s in problem.episodes[0].measurements if s.sensor.group_name == plain.points[0].name]
     predicted = own.predicted_outputs[problem.episodes[0].measurements.index(samples)]
-    where = samples.used_output_mask
+    where = samples.positive_weight_mask
     assert np.allclose(plain.points[0].position.reshape(predicted.shape)[where], predicted[where], atol=1e-12)
     assert np.array_equal(first.points[0].position, same.points[0].position, equal_nan=True)
     assert not np.array_equal(first.points[0].position, other.points[0].position, equal_nan=True)
@@ -63,7 +63,7 @@ def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
     source = taken(step, 1)
     source = replace(source, joints=replace(source.joints, effort_bias_std=0.5))
     problem = EstimationProblem(step, [source], ("elbow.mass",), ProblemOptions(path_cutoff=np.inf))
-    plain, *many = (problem.simulate_recording(seed=seed).joints for seed in (None, *range(40)))
+    plain, *many = (problem.simulate_noisy_recording(seed=seed).joints for seed in (None, *range(40)))
     angle, effort = (np.array([getattr(one, name) for one in many]) for name in ("position", "effort"))
     angle, effort = angle - plain.position, effort - plain.effort
     np.testing.assert_allclose(np.std(angle, axis=(0, 1)), 1e-3, rtol=0.1)
@@ -80,7 +80,7 @@ def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
 
 def test_a_parameter_that_is_not_there_is_named(problem):
     with pytest.raises(ConfigError, match=r"there is no parameter 'elbow\.stifness'") as caught:
-        problem.simulate_recording({"elbow.stifness": 1.0})
+        problem.simulate_noisy_recording({"elbow.stifness": 1.0})
     assert caught.value.hint == "did you mean 'elbow.stiffness'?"
 
 
@@ -145,24 +145,26 @@ def recording():
 
 def test_stay_repeats_the_last_given_frame(recording):
     predicted = constant_position_baseline(recording, NAMES)
-    np.testing.assert_array_equal(predicted[:2], measured_point_positions(recording, NAMES)[:2])
+    np.testing.assert_array_equal(predicted[:2], recorded_point_positions(recording, NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 
 def test_all_points_move_with_the_mean_of_the_clamps(recording):
-    predicted = mean_clamp_displacement_baseline(recording, ("p2", "c1"), ("p0", "p4"))
+    predicted = mean_clamp_displacement_baseline_prediction(recording, ("p2", "c1"), ("p0", "p4"))
     np.testing.assert_allclose(predicted[-1, :, 2], 2e-3 * 9)
     np.testing.assert_allclose(predicted[-1, :, :2], [[0.2, 0.0], [0.2, 0.1]])
 
 
 def test_linear_carry_interpolates_along_the_arc_and_children_follow_their_junction(recording):
-    predicted = interpolated_displacement_baseline(recording, ("p1", "p2", "p3", "c1", "c2"), PARENT, CHILDREN)
+    predicted = interpolated_displacement_position_baseline(recording, ("p1", "p2", "p3", "c1", "c2"), PARENT, CHILDREN)
     # arc length as in the last given frame; the ends' heights differ by 2 mm there, which lengthens the chain by 1e-5
     np.testing.assert_allclose(predicted[-1, :, 2] / 9e-3, [1.4, 1.8, 2.6, 1.8, 1.8], rtol=1e-3)
 
 
 def test_linear_carry_between_inner_points_holds_the_ends_beyond_them(recording):
-    predicted = interpolated_displacement_baseline(recording, ("p2",), PARENT, CHILDREN, clamped=("p0", "p1", "p4"))
+    predicted = interpolated_displacement_position_baseline(
+        recording, ("p2",), PARENT, CHILDREN, clamped=("p0", "p1", "p4")
+    )
     np.testing.assert_allclose(predicted[-1, 0, 2], 3 * 9e-3 * 0.25, rtol=1e-3)
 
 
@@ -174,8 +176,8 @@ def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
     free = ("p1", "p2", "p3", "c1", "c2")
     for method in (
         lambda r: constant_position_baseline(r, free),
-        lambda r: mean_clamp_displacement_baseline(r, free, ("p0", "p4")),
-        lambda r: interpolated_displacement_baseline(r, free, PARENT, CHILDREN),
+        lambda r: mean_clamp_displacement_baseline_prediction(r, free, ("p0", "p4")),
+        lambda r: interpolated_displacement_position_baseline(r, free, PARENT, CHILDREN),
     ):
         np.testing.assert_array_equal(method(recording)[2:], method(other)[2:])
 
@@ -196,7 +198,7 @@ def test_prediction_error_is_euclidean_and_leaves_out_given_frames_and_gaps():
         (lambda r: constant_position_baseline(r, ("p9",)), "not recorded"),
         (lambda r: constant_position_baseline(r, ("p1",), given=0), "given = 0"),
         (lambda r: constant_position_baseline(r, ("p1",), given=11), "given = 11"),
-        (lambda r: interpolated_displacement_baseline(r, ("c1",), PARENT), "belongs to no branch"),
+        (lambda r: interpolated_displacement_position_baseline(r, ("c1",), PARENT), "belongs to no branch"),
         (lambda r: position_rmse(np.zeros((3, 1, 3)), np.zeros((4, 1, 3))), "differ in shape"),
     ],
 )
@@ -218,7 +220,7 @@ def driven(urdf_folder):
 
 
 def sprung(step, recording, **options):
-    made = ProblemOptions(tracking_filter="proportional", tracking_filter_gains=(9.0,), **options)
+    made = ProblemOptions(arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,), **options)
     return EstimationProblem(step, [recording], ("elbow.stiffness",), made)
 
 

@@ -23,7 +23,7 @@ def pendulum(urdf_folder):
     taken = {seed: record(seed, 40, bend=0.3) for seed in (1, 2, 3)}
 
     def make(kind):
-        options = ProblemOptions(initial_state=kind, start_fit_window=0.02)
+        options = ProblemOptions(initial_state=kind, initial_state_fit_window=0.02)
         free = ("elbow.damping", "shoulder.damping")
         return EstimationProblem(step, [taken[1], taken[2]], free, options, held_out=[taken[3]])
 

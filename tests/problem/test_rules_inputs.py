@@ -16,11 +16,11 @@ from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,
     mean_step_input_delay_derivative,
     mean_step_inputs,
-    prescribed_path,
-    recorded_sensor_kinds,
+    prescribed_coordinates_at_nodes,
+    recorded_signal_kinds,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_from_path_cutoff
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_with_path_cutoff
 
 PLAIN = LowPassFilter(math.inf)
 
@@ -159,9 +159,9 @@ RECORDED = {
 
 @pytest.mark.parametrize(("made", "expected"), RECORDED.values(), ids=RECORDED)
 def test_sensors_are_known_by_what_was_recorded(made, expected):
-    assert recorded_sensor_kinds([made]) == expected
+    assert recorded_signal_kinds([made]) == expected
     with_efforts, both = RECORDED["efforts"]
-    assert recorded_sensor_kinds([with_efforts, made]) == expected | both
+    assert recorded_signal_kinds([with_efforts, made]) == expected | both
 
 
 # -- prescribed paths -------------------------------------------------------------------------------------------------
@@ -176,15 +176,15 @@ def test_a_prescribed_joint_follows_its_recorded_positions():
     position = np.stack([np.sin(t), t**2], axis=1)
     made = recording(joints(["a", "b"], t, position))
     grid = TimeGrid(2.0, 0.025, 40)
-    found = prescribed_path(made, moving("b", "a"), grid, PLAIN)
+    found = prescribed_coordinates_at_nodes(made, moving("b", "a"), grid, PLAIN)
     np.testing.assert_allclose(found[:, 0], grid.node_times**2, atol=1e-9)
     np.testing.assert_allclose(found[:, 1], np.sin(grid.node_times), atol=1e-4)
-    beyond = prescribed_path(made, moving("b"), TimeGrid(1.9, 0.1, 13), PLAIN)
+    beyond = prescribed_coordinates_at_nodes(made, moving("b"), TimeGrid(1.9, 0.1, 13), PLAIN)
     assert beyond[0, 0] == pytest.approx(4.0)
     assert beyond[-1, 0] == pytest.approx(9.0)
-    assert prescribed_path(made, moving(), grid, PLAIN).shape == (41, 0)
+    assert prescribed_coordinates_at_nodes(made, moving(), grid, PLAIN).shape == (41, 0)
     with pytest.raises(DataError, match="'a' is prescribed but the recording has no joints"):
-        prescribed_path(pointed(), moving("a"), grid, PLAIN)
+        prescribed_coordinates_at_nodes(pointed(), moving("a"), grid, PLAIN)
 
 
 def clamped(origin, towards, t=None):
@@ -193,7 +193,9 @@ def clamped(origin, towards, t=None):
 
 
 def path_of(made, grid, roll):
-    return prescribed_path(made, moving(*AXES), grid, PLAIN, (ClampPoseDefinition("end", "o", "d", roll),))
+    return prescribed_coordinates_at_nodes(
+        made, moving(*AXES), grid, PLAIN, (ClampPoseDefinition("end", "o", "d", roll),)
+    )
 
 
 AXES = tuple(f"end_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
@@ -322,7 +324,7 @@ def test_at_some_nodes_it_is_the_same_filter(low_pass):
 
 def test_two_passes_are_one_after_the_other():
     t, values = 0.01 * np.arange(301), np.random.default_rng(1).standard_normal((301, 2))
-    once, twice = LowPassFilter(5.0), effort_filter_from_path_cutoff(5.0)
+    once, twice = LowPassFilter(5.0), effort_filter_with_path_cutoff(5.0)
     np.testing.assert_allclose(twice(t, values)[80:-80], once(t, once(t, values))[80:-80], atol=1e-3)
     assert (once.settling_time, twice.settling_time) == pytest.approx((0.574, 0.768), abs=1e-3)
     assert (twice.cutoff, twice.passes) == (5.0, 2)

@@ -10,9 +10,9 @@ from yid_ocp.errors import DataError
 from yid_ocp.problem.measurements import (
     TimeGrid,
     huber_loss_and_residual_factors,
-    locate_measurements_on_grid,
-    make_time_grid,
+    measurements_on_grid,
     measurements_with_paper_weights,
+    recording_time_grid,
 )
 from yid_ocp.sensors.base import SensorData
 
@@ -33,16 +33,16 @@ def test_a_time_lies_between_two_nodes():
 def test_a_grid_covers_the_recording_or_as_much_as_is_wanted(last, duration, steps):
     t = 3.0 + np.array([0.0, last])
     made = recording(joints(["a"], t, np.zeros((2, 1))), seen(["p"], [0.0, 9.0], np.zeros((2, 1, 3))))
-    found = make_time_grid(made, 0.1, duration)
+    found = recording_time_grid(made, 0.1, duration)
     assert (found.start_time, found.time_step, found.steps) == (3.0, 0.1, steps)
     np.testing.assert_allclose(found.node_times, 3.0 + 0.1 * np.arange(steps + 1))
 
 
 def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
     made = recording(None, seen(["p"], [1.0, 1.4], np.zeros((2, 1, 3))))
-    assert (make_time_grid(made, 0.1).start_time, make_time_grid(made, 0.1).steps) == (1.0, 4)
+    assert (recording_time_grid(made, 0.1).start_time, recording_time_grid(made, 0.1).steps) == (1.0, 4)
     with pytest.raises(DataError, match=r"0\.4 s of data are shorter than two time steps of 0\.3 s"):
-        make_time_grid(made, 0.3)
+        recording_time_grid(made, 0.3)
 
 
 def test_hubers_loss_is_square_first_and_then_straight():
@@ -66,7 +66,7 @@ def test_rows_are_whitened_differences_where_something_was_measured():
     assert found.cost == pytest.approx(0.5 * (4 + 1 + 100))
     assert found.jacobian is None
     assert TWO.n_residuals == 3
-    np.testing.assert_array_equal(TWO.used_output_mask, [[True, False], [True, True]])
+    np.testing.assert_array_equal(TWO.positive_weight_mask, [[True, False], [True, True]])
 
 
 def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
@@ -80,13 +80,13 @@ def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
 
 def test_every_output_has_its_channel():
     made = measured(points("p", "r"), [0], [0.0], np.zeros((1, 6)))
-    assert made.output_channel_names == ("points.p",) * 3 + ("points.r",) * 3
-    assert TWO.output_channel_names == ("joints.effort.a", "joints.effort.b")
+    assert made.channel_name_per_output == ("points.p",) * 3 + ("points.r",) * 3
+    assert TWO.channel_name_per_output == ("joints.effort.a", "joints.effort.b")
 
 
 def located(t, value, std, *span):
     data = SensorData(efforts("a"), np.array(t), np.array(value)[:, None], np.array(std)[:, None], *span)
-    return locate_measurements_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
+    return measurements_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
 
 
 def test_data_are_placed_on_nodes_and_whitened():
@@ -143,19 +143,19 @@ LATE = {
 
 @pytest.mark.parametrize(("node", "fraction", "steps", "late_node", "late_fraction"), LATE.values(), ids=LATE)
 def test_a_late_sample_is_that_of_before_within_the_span(node, fraction, steps, late_node, late_fraction):
-    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).shifted_earlier_by(np.array([steps]))
+    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).shifted_earlier_by_steps(np.array([steps]))
     assert made.node.tolist() == [[late_node]]
     np.testing.assert_allclose(made.fraction, [[late_fraction]], atol=1e-12)
 
 
 def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
     made = measured(efforts("a", "b"), [5, 6], [0.5, 0.0], np.zeros((2, 2)), span=(0, 10))
-    made = made.shifted_earlier_by(np.array([0.25, 2.0]))
+    made = made.shifted_earlier_by_steps(np.array([0.25, 2.0]))
     assert made.node.tolist() == [[5, 3], [5, 4]]
     np.testing.assert_allclose(made.fraction, [[0.25, 0.5], [0.75, 0.0]])
     assert made.evaluation_nodes.tolist() == [2, 3, 4, 5, 6]
     for node, nodes in ((0, [0, 1]), (3, [1, 2, 3])):
-        near_an_end = measured(efforts("a"), [node], [0.0], [[1.0]], span=(0, 3)).shifted_earlier_by(np.zeros(1))
+        near_an_end = measured(efforts("a"), [node], [0.0], [[1.0]], span=(0, 3)).shifted_earlier_by_steps(np.zeros(1))
         assert near_an_end.evaluation_nodes.tolist() == nodes
     at_nodes = np.array([[k, 10 * k] for k in made.evaluation_nodes], float)
     np.testing.assert_allclose(made.interpolate_to_samples(at_nodes), [[5.25, 35.0], [5.75, 40.0]])
@@ -176,20 +176,20 @@ RATES = {
 @pytest.mark.parametrize(("node", "fraction", "steps", "rate"), RATES.values(), ids=RATES)
 def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node, fraction, steps, rate):
     plain = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8))
-    late = plain.shifted_earlier_by(np.array([steps]))
+    late = plain.shifted_earlier_by_steps(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in late.evaluation_nodes])
-    np.testing.assert_allclose(late.prediction_rate_per_step(at_nodes, plain, np.array([steps])), [[rate]])
+    np.testing.assert_allclose(late.prediction_change_per_step(at_nodes, plain, np.array([steps])), [[rate]])
     # others beside it make no difference
     several = measured(efforts("a"), [2, node, 8], [0.25, fraction, 0.0], np.ones((3, 1)), span=(2, 8))
-    all_late = several.shifted_earlier_by(np.array([steps]))
+    all_late = several.shifted_earlier_by_steps(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in all_late.evaluation_nodes])
-    np.testing.assert_allclose(all_late.prediction_rate_per_step(at_nodes, several, np.array([steps]))[1], [rate])
+    np.testing.assert_allclose(all_late.prediction_change_per_step(at_nodes, several, np.array([steps]))[1], [rate])
 
 
 def test_late_samples_of_which_a_short_piece_holds_none_change_by_nothing():
     none = measured(efforts("a"), np.zeros(0, int), np.zeros(0), np.zeros((0, 1)), span=(2, 8))
-    late = none.shifted_earlier_by(np.array([0.5]))
-    assert late.prediction_rate_per_step(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
+    late = none.shifted_earlier_by_steps(np.array([0.5]))
+    assert late.prediction_change_per_step(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
     assert late.interpolate_to_samples(np.zeros((0, 1, 3))).shape == (0, 1, 3)
 
 
@@ -204,5 +204,5 @@ CLOCKS = {
 def test_a_clock_in_other_units_or_that_jumps_does_not_make_an_endless_rollout(t, time_step):
     made = recording(joints(["a"], t, np.zeros((len(t), 1))))
     with pytest.raises(DataError, match="times are in seconds and the clock does not jump"):
-        make_time_grid(made, time_step)
-    assert make_time_grid(made, 100 * time_step).steps > 2
+        recording_time_grid(made, time_step)
+    assert recording_time_grid(made, 100 * time_step).steps > 2

@@ -18,8 +18,8 @@ DELAYED = (("effort_delay", "gripper", {"delay": 0.0137}), ("effort_offset", "sh
 SOFT = (("joint_coulomb", "elbow", {"tau_c": 0.05}), ("gravity_tilt", "world", {"rx": 0.03, "ry": 0.02}))
 STICKING = (("joint_presliding", "shoulder", {"tau_c": 0.3, "yield_angle": 0.02}),)
 
-TRACKED = {"tracking_filter": "proportional", "tracking_filter_gains": (9.0,)}
-FILTERED = {"tracking_filter": "lqr"}
+TRACKED = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
+FILTERED = {"arm_tracking_feedback": "lqr"}
 CASES = {
     "free": ((), {}, {}),
     "estimated start": ((), {}, {"initial_state": "estimated"}),
@@ -28,7 +28,7 @@ CASES = {
     "prescribed": (MISREAD + LATE, {"prescribed": ("shoulder",)}, {}),
     "prescribed gears": (GEARS + HEAVY, {"prescribed": ("shoulder",)}, {}),
     "all prescribed": (MISREAD, {"prescribed": PENDULUM}, {}),
-    "driven": (DELAYED + MISREAD, {"driven": ("shoulder",)}, {"tracking_filter": "none"}),
+    "driven": (DELAYED + MISREAD, {"driven": ("shoulder",)}, {"arm_tracking_feedback": "none"}),
     "driven, proportional": (MISREAD + GEARS, {"driven": ("shoulder",)}, TRACKED),
     "driven, filtered": (MISREAD + HEAVY + LATE, {"driven": ("shoulder",)}, FILTERED),
     "driven, filtered, both": (MISREAD + HEAVY, {"driven": PENDULUM}, FILTERED),
@@ -97,7 +97,7 @@ def test_without_derivatives_the_cost_is_the_same(problem):
 def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
     whole = problem_of(urdf_folder, "driven, filtered")
     x, few = moved(whole), whole.unknown_names[1:4]
-    part = whole.with_compiled_parameters_free(few).with_parameter_values(
+    part = whole.with_free_parameters_without_recompiling(few).with_parameter_values(
         dict(zip(whole.unknown_names, x, strict=True))
     )
     own = np.array([x[whole.unknown_names.index(name)] for name in few])
@@ -106,7 +106,9 @@ def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
     np.testing.assert_allclose(one.residual[part.residual_rows.data], two.residual[data], atol=1e-9)
     columns = [whole.unknown_names.index(name) for name in few]
     np.testing.assert_allclose(one.jacobian[part.residual_rows.data], two.jacobian[data][:, columns], atol=1e-7)
-    none = whole.with_compiled_parameters_free(()).with_parameter_values(dict(zip(whole.unknown_names, x, strict=True)))
+    none = whole.with_free_parameters_without_recompiling(()).with_parameter_values(
+        dict(zip(whole.unknown_names, x, strict=True))
+    )
     alone = none.evaluate(np.zeros(0))
     np.testing.assert_allclose(alone.residual, two.residual[data], atol=1e-9)
     assert alone.jacobian.shape == (len(alone.residual), 0)
@@ -185,22 +187,22 @@ def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder)
 
 def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
     plain = problem_of(urdf_folder, "free", seeds=(1,))
-    assert plain.uses_inputs_as_recorded
+    assert plain.has_no_input_corrections
     for case in ("prescribed", "prescribed gears", "driven", "driven, filtered", "robust"):
-        assert not problem_of(urdf_folder, case, seeds=(1,)).uses_inputs_as_recorded, case
+        assert not problem_of(urdf_folder, case, seeds=(1,)).has_no_input_corrections, case
     neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.inverse": 1.0}
     made = problem_of(urdf_folder, "all prescribed", seeds=(1,))
-    assert not made.with_parameter_values(neutral).uses_inputs_as_recorded, "a free one may change it"
-    fixed = made.with_compiled_parameters_free(("elbow.damping",))
-    assert fixed.with_parameter_values(neutral).uses_inputs_as_recorded
-    assert not fixed.with_parameter_values(neutral | {"encoder_offset@shoulder.offset": 0.01}).uses_inputs_as_recorded
-    assert problem_of(urdf_folder, "local", seeds=(1,)).uses_inputs_as_recorded
+    assert not made.with_parameter_values(neutral).has_no_input_corrections, "a free one may change it"
+    fixed = made.with_free_parameters_without_recompiling(("elbow.damping",))
+    assert fixed.with_parameter_values(neutral).has_no_input_corrections
+    assert not fixed.with_parameter_values(neutral | {"encoder_offset@shoulder.offset": 0.01}).has_no_input_corrections
+    assert problem_of(urdf_folder, "local", seeds=(1,)).has_no_input_corrections
 
 
 def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_folder):
     problem = problem_of(urdf_folder, "driven and prescribed", seeds=(1,))
     rollout = problem.evaluate(problem.initial_unknowns, False).episode_predictions[0].rollout
-    effort = problem.predictor.node_values(rollout).load
+    effort = problem.predictor.state_values_at_nodes(rollout).load
     assert effort.shape == (STEPS + 1, 2)
     np.testing.assert_array_equal(effort[:-1, 0], rollout.effort[:, 0])
     np.testing.assert_array_equal(effort[:-1, 1], rollout.torque[:, 0])
@@ -211,7 +213,7 @@ def test_readings_along_a_trajectory_are_those_of_its_rollout(urdf_folder):
     problem = problem_of(urdf_folder, "free", seeds=(1,))
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x, False)
-    state, theta = evaluation.episode_predictions[0].rollout.state, problem.theta_and_initial_state_offset(x, 0)[0]
+    state, theta = evaluation.episode_predictions[0].rollout.state, problem.theta_and_initial_state_deviation(x, 0)[0]
     by_state = np.zeros((STEPS + 1, 4, len(x)))
     for k, samples in enumerate(problem.episodes[0].measurements):
         along, slopes = problem.predictor.readings_along_trajectory(samples, state, by_state, theta)
@@ -229,7 +231,7 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     problem = problem_of(urdf_folder, "driven, filtered, both", seeds=(1,))
     episode, vector = problem.episodes[0], problem.system.parameters.vector
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
-    none, shifted = np.zeros(problem.step.sizes["nx"]), problem.predictor.inputs_with_reference_momentum_shift
+    none, shifted = np.zeros(problem.step.sizes["nx"]), problem.predictor.inputs_with_effect_momentum_shift
     assert shifted(episode, vector(neutral), (), none).momentum_shift is None
     name = "rotor_inertia@shoulder.armature"
     found = shifted(episode, vector(neutral | {name: 0.05}), (name,), none)

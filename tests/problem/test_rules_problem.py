@@ -50,8 +50,8 @@ def test_unknowns_are_shared_ones_then_those_of_every_recording():
     own = [f"{name}[{recording}]" for recording in ("one", "two") for name in ("l", "start.q.x", "start.p.x")]
     assert LAYOUT.unknown_names == ("a", "b", *own)
     assert LAYOUT.free_parameters == ("a", "b", "l")
-    assert LAYOUT.unknown_indices_of_recording(0).tolist() == [0, 1, 2, 3, 4]
-    assert LAYOUT.unknown_indices_of_recording(1).tolist() == [0, 1, 5, 6, 7]
+    assert LAYOUT.unknown_indices_affecting_recording(0).tolist() == [0, 1, 2, 3, 4]
+    assert LAYOUT.unknown_indices_affecting_recording(1).tolist() == [0, 1, 5, 6, 7]
 
 
 def test_blocks_and_values_find_their_places():
@@ -64,12 +64,12 @@ def test_blocks_and_values_find_their_places():
 def test_a_recording_has_its_own_values_and_start(make):
     problem = make(local_parameters=("elbow.rest",), initial_state="estimated")
     x = np.arange(1.0, 1 + len(problem.unknown_names))
-    theta, offset = problem.theta_and_initial_state_offset(x, 1)
+    theta, offset = problem.theta_and_initial_state_deviation(x, 1)
     names = problem.system.parameters.names
     assert [theta[names.index(name)] for name in ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")] == [1, 2, 8]
     assert offset.tolist() == [9, 10, 11, 12]
     assert theta[names.index("elbow.damping")] == 0.2
-    assert problem.theta_and_initial_state_offset(x, 0)[1].tolist() == [4, 5, 6, 7]
+    assert problem.theta_and_initial_state_deviation(x, 0)[1].tolist() == [4, 5, 6, 7]
     assert problem.theta[names.index("elbow.rest")] == 0.1
     assert (problem.shared_parameters, problem.local_parameters) == (FREE[:2], FREE[2:])
 
@@ -92,7 +92,7 @@ def test_start_bounds_and_values_by_name(make):
 
 def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, free_step):
     """The momentum's prior is that of a velocity times the inertia at the joint."""
-    problem = make(initial_state="estimated", start_configuration_std=0.07, start_velocity_std=0.3, seeds=(1,))
+    problem = make(initial_state="estimated", initial_configuration_std=0.07, initial_velocity_std=0.3, seeds=(1,))
     theta = free_step.system.parameters.vector()
     inertia = [momentum(free_step, np.zeros(2), velocity, theta)[i] for i, velocity in enumerate(np.eye(2))]
     # two rods: 1/3 m l^2 and more about the shoulder
@@ -110,7 +110,7 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
 
 
 def test_stated_priors_are_gaussian_about_the_start(make):
-    problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_std_as_factor=0.0)
+    problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_geometric_std=0.0)
     x = np.array([7.0, 4.0, 0.14])
     residual, rows = problem.prior_residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [2.0, 2.0])
@@ -120,7 +120,7 @@ def test_stated_priors_are_gaussian_about_the_start(make):
 
 
 def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
-    problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_std_as_factor=10.0)
+    problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_geometric_std=10.0)
     x = np.array([7.0, 30.0, 0.5])
     residual, rows = problem.prior_residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [0.5, 1.0])
@@ -145,14 +145,14 @@ def test_the_weak_priors_logarithm_ends_smoothly_where_the_ratio_is_small():
 
 
 @pytest.mark.parametrize(
-    "options", [{"weak_prior_std_as_factor": 1.0}, {"weak_prior_std_as_factor": 0.0}, {"weighting": "paper"}]
+    "options", [{"weak_prior_geometric_std": 1.0}, {"weak_prior_geometric_std": 0.0}, {"weighting": "paper"}]
 )
 def test_some_problems_have_no_weak_prior(make, options):
     problem = make(**options)
     residual, rows = problem.prior_residual_and_jacobian(problem.initial_unknowns)
     assert residual.shape == (0,)
     assert rows.shape == (0, 3)
-    assert make(weak_prior_std_as_factor=1.1).prior_residual_and_jacobian(problem.initial_unknowns)[0].shape == (2,)
+    assert make(weak_prior_geometric_std=1.1).prior_residual_and_jacobian(problem.initial_unknowns)[0].shape == (2,)
 
 
 def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(make):
@@ -170,7 +170,7 @@ def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(m
 
 
 def test_the_residual_is_made_of_measurements_then_priors(make):
-    problem = make(prior_stds={"elbow.stiffness": 1.0}, weak_prior_std_as_factor=5.0)
+    problem = make(prior_stds={"elbow.stiffness": 1.0}, weak_prior_geometric_std=5.0)
     evaluation = problem.evaluate(problem.initial_unknowns + np.array([1.0, 2.0, 0.1]))
     rows = problem.residual_rows
     assert [[part.stop - part.start for part in group] for group in rows.measurements] == [[75, 39], [75, 39]]
@@ -210,7 +210,7 @@ def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
     evaluation = problem.evaluate(x, derivatives=False)
     assert evaluation.jacobian is None
     result = evaluation.episode_predictions[0]
-    theta, _ = problem.theta_and_initial_state_offset(x, 0)
+    theta, _ = problem.theta_and_initial_state_deviation(x, 0)
     state = result.equilibrium.state
     np.testing.assert_allclose(result.rollout.state, roll(free_step, theta, state[:2], state[2:], 24).state, atol=1e-12)
 
@@ -275,11 +275,15 @@ def held(free_step, make, roll):
 
 @pytest.mark.parametrize(("configuration", "velocity"), [(0.05, 0.2), (0.01, 0.05), (1.0, 5.0)])
 def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, configuration, velocity):
-    options = {"initial_state": "estimated", "start_configuration_std": configuration, "start_velocity_std": velocity}
+    options = {
+        "initial_state": "estimated",
+        "initial_configuration_std": configuration,
+        "initial_velocity_std": velocity,
+    }
     problem = make(held_out=held, **options)
     x = problem.initial_unknowns
     short = truncate_episode(problem.held_out[1], 20)
-    theta, _ = problem.theta_and_initial_state_offset(x, 0)
+    theta, _ = problem.theta_and_initial_state_deviation(x, 0)
 
     std = problem.initial_state_prior_std
 
@@ -311,7 +315,8 @@ def test_a_held_out_part_of_a_recording_shares_its_start(make):
     split = problem.with_episodes(problem.episodes, [part])
     x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
     assert (
-        split.held_out_prediction_inputs(x)[0][2].tolist() == problem.theta_and_initial_state_offset(x, 1)[1].tolist()
+        split.held_out_prediction_inputs(x)[0][2].tolist()
+        == problem.theta_and_initial_state_deviation(x, 1)[1].tolist()
     )
     np.testing.assert_array_equal(
         split.predict_held_out(x)[0][1].predicted_outputs[0],
@@ -335,7 +340,7 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
 
 def test_problems_that_free_other_parameters_share_all_else(make):
     problem = make(may_free=("elbow.damping",), local_parameters=("elbow.rest",))
-    other = problem.with_compiled_parameters_free(("elbow.damping", "shoulder.stiffness"))
+    other = problem.with_free_parameters_without_recompiling(("elbow.damping", "shoulder.stiffness"))
     assert other.unknown_names == ("elbow.damping", "shoulder.stiffness")
     assert other.episodes is problem.episodes
     assert other.model_functions is problem.model_functions
@@ -357,8 +362,8 @@ def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
     shorter = problem.truncated_to_duration(0.1)
     assert (shorter.episodes[0].grid.steps, shorter.held_out, shorter.free) == (10, (), FREE)
     assert shorter.theta[index("elbow.damping")] == 0.7
-    changed = problem.with_options(replace(problem.options, weak_prior_std_as_factor=3.0))
-    assert (changed.options.weak_prior_std_as_factor, len(changed.held_out), changed.free) == (3.0, 2, FREE)
+    changed = problem.with_options(replace(problem.options, weak_prior_geometric_std=3.0))
+    assert (changed.options.weak_prior_geometric_std, len(changed.held_out), changed.free) == (3.0, 2, FREE)
     fewer = problem.with_free_parameters(("elbow.stiffness",), {"elbow.stiffness": 5.0})
     assert (fewer.free, fewer.options.local_parameters, fewer.options.prior_stds) == (("elbow.stiffness",), (), {})
     assert fewer.initial_unknowns.tolist() == [5.0]

@@ -163,7 +163,7 @@ def swung(step, seed=4, std=0.02):
 
 
 def test_a_problem_fits_its_starts_once_at_its_own_parameters(step):
-    options = ProblemOptions(initial_state="fitted_to_points", start_fit_window=0.01)
+    options = ProblemOptions(initial_state="fitted_to_points", initial_state_fit_window=0.01)
     problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options, held_out=[swung(step, 5)])
     expected = solved(step, problem.episodes[0].measurements, 0.01)
     np.testing.assert_allclose(problem.episodes[0].fixed_initial_state.state, expected.state)
@@ -178,7 +178,7 @@ def test_a_problem_fits_its_starts_once_at_its_own_parameters(step):
 
 
 def test_the_points_of_a_start_may_have_a_noise_of_their_own(step):
-    usual = ProblemOptions(initial_state="fitted_to_points", start_fit_window=0.01)
+    usual = ProblemOptions(initial_state="fitted_to_points", initial_state_fit_window=0.01)
     sharp = replace(usual, start_point_noise_std=1e-4)
     states = []
     for options in (usual, sharp):
@@ -206,7 +206,7 @@ def test_known_starts_and_values_are_taken_as_they_are(step):
     theta = problem.predictor.theta_with_episode_values(problem.episodes[0], problem.theta)
     assert theta[problem.system.parameters.index("elbow.rest")] == 0.5
     assert problem.theta[problem.system.parameters.index("elbow.rest")] == 0.1
-    start = problem.initial_state(problem.episodes[0], problem.theta)
+    start = problem.initial_state_of_episode(problem.episodes[0], problem.theta)
     np.testing.assert_array_equal(start.state, state)
     assert (start.state_sensitivity.shape, start.equilibrium, start.failure_message) == ((4, 1), None, "")
     assert not start.state_sensitivity.any()
@@ -222,7 +222,7 @@ def test_an_estimated_start_is_offset_from_a_known_one(step):
     offset = np.array([0.01, 0.02, 0.003, 0.004])
     rollout = problem.evaluate(np.concatenate([[3.0], offset]), False).episode_predictions[0].rollout
     np.testing.assert_allclose(rollout.state[0], state + offset)
-    start = problem.initial_state(problem.episodes[0], problem.theta, offset)
+    start = problem.initial_state_of_episode(problem.episodes[0], problem.theta, offset)
     np.testing.assert_allclose(start.state, state + offset)
     np.testing.assert_array_equal(start.state_sensitivity, np.hstack([np.zeros((4, 1)), np.eye(4)]))
 
@@ -231,7 +231,7 @@ def test_a_start_at_rest_that_does_not_exist_is_said(step):
     problem = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
     theta = problem.system.parameters.vector() * 1.0
     theta[problem.system.parameters.index("elbow.rest")] = 1e8
-    start = problem.initial_state(problem.episodes[0], theta)
+    start = problem.initial_state_of_episode(problem.episodes[0], theta)
     assert start.failure_message.startswith("run_4: no equilibrium")
     assert start.state_sensitivity.shape == (4, 1)
     assert not start.equilibrium.is_converged
@@ -311,7 +311,7 @@ def rod_problem(step, state, first=0.1, std=1e-3, **options):
     place = np.tile(place.ravel(), (len(late), 1, 1))
     camera = seen([MIDDLE], late, place, "points_camera", std=np.full(place.shape, std))
     made = recording(joints(["shoulder", "elbow"], t, np.tile(POSTURE, (len(t), 1))), camera)
-    settings = ProblemOptions(weak_prior_std_as_factor=0.0, path_cutoff=np.inf, **options)
+    settings = ProblemOptions(weak_prior_geometric_std=0.0, path_cutoff=np.inf, **options)
     return EstimationProblem(step, [made], ("T1.bend",), settings, held_out=[made])
 
 

@@ -26,10 +26,10 @@ from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
 from yid_ocp.report.html import _plotly_script, _shared_script, write_report, write_shared_plotly_script
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
-from yid_ocp.report.terminal import SUMMARY_BY_FORMAT
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT
 from yid_ocp.workflow.build_problem import load_problem
 from yid_ocp.workflow.diagnose import _held_out_predictions
-from yid_ocp.workflow.solve import solve_result
+from yid_ocp.workflow.solve import solution_to_result_dict
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 COMMANDS = {
@@ -88,7 +88,9 @@ def written(findings: ReportData, folder: Path) -> str:
 def findings(solved, **changes) -> ReportData:
     problem, solution, *_ = solved
     made = {"command": "yid-ocp solve p.yaml", "date": "2026-01-02 03:04:05+00:00"}
-    result = solve_result(problem, solution, []) | made | {"inputs": {"a": "0" * 64}, "versions": {"python": "3"}}
+    result = (
+        solution_to_result_dict(problem, solution, []) | made | {"inputs": {"a": "0" * 64}, "versions": {"python": "3"}}
+    )
     return ReportData("run <one>", "A & B.", result | changes, problem, solution)
 
 
@@ -292,7 +294,7 @@ def solved_page(tmp_path_factory, pendulum_data) -> Path:
 
 def test_a_page_says_what_the_terminal_says(solved_page):
     result = json.loads((solved_page.parent / "result.json").read_text())
-    said = terminal.summary_terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result))
+    said = terminal.summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))
     assert_same_words("\n".join([*said, "run folder: x"]), text_of(solved_page.read_text(encoding="utf-8")))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.data import JointGroup, Recording
-from yid_ocp.inference.uncertainty import VERDICT_PREDICATES, VERDICT_TABLE_TEXTS, parameter_verdict
+from yid_ocp.inference.uncertainty import VERDICT_SENTENCE_TEXTS, VERDICT_TABLE_TEXTS, parameter_verdict
 from yid_ocp.report import diagnosis_summaries, summaries, terminal  # noqa: F401, they register
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 
@@ -55,7 +55,7 @@ def judged(said: str) -> dict:
 
 
 def told(form: str, result: dict) -> list[str]:
-    return terminal.summary_terminal_lines(terminal.SUMMARY_BY_FORMAT[form](result))
+    return terminal.summary_terminal_lines(terminal.SUMMARY_BY_RESULT_FORMAT[form](result))
 
 
 def line_of(lines: list[str], name: str) -> str:
@@ -65,7 +65,7 @@ def line_of(lines: list[str], name: str) -> str:
 def test_every_verdict_has_its_words():
     possible = {parameter_verdict(1.0, std) for std in (0.01, 1.0, 100.0, float("inf"))} | {"fixed"}
     possible |= {parameter_verdict(1.0, 0.01, explains=False), parameter_verdict(1.0, 0.01, at_bound=True)}
-    assert set(VERDICT_PREDICATES) == set(VERDICT_TABLE_TEXTS) == possible
+    assert set(VERDICT_SENTENCE_TEXTS) == set(VERDICT_TABLE_TEXTS) == possible
     assert VERDICT_TABLE_TEXTS["identifiable"] == "found"
 
 

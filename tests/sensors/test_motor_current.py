@@ -51,7 +51,7 @@ def step(urdf_folder):
 
 
 def problem_of(step, made, options=KNOWN) -> EstimationProblem:
-    settings = ProblemOptions(path_cutoff=10.0, weak_prior_std_as_factor=0.0, sensors={"motors_left.current": options})
+    settings = ProblemOptions(path_cutoff=10.0, weak_prior_geometric_std=0.0, sensors={"motors_left.current": options})
     return EstimationProblem(step, [made], tuple(TRUTH), settings)
 
 
@@ -84,7 +84,7 @@ def test_currents_say_what_efforts_say(step, made):
 
 def test_a_synthetic_recording_holds_currents(step, made):
     problem = problem_of(step, made)
-    again = problem.simulate_recording(TRUTH, seed=1)
+    again = problem.simulate_noisy_recording(TRUTH, seed=1)
     [motors] = again.channel_groups
     assert (motors.name, motors.names, motors.values_by_quantity["current"].shape) == (
         "motors_left",

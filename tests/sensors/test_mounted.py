@@ -21,7 +21,7 @@ from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.recorded_inputs import recorded_sensor_kinds
+from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 from yid_ocp.sensors import sensor_reading_function
 from yid_ocp.sensors.imu import _Accelerometer, _Gyroscope
 from yid_ocp.sensors.wrist import _WristForceSensor, _WristTorqueSensor
@@ -112,13 +112,13 @@ def recorded(urdf: Path) -> Recording:
     """A motion of arm and rod in MuJoCo, with its own sensors on the lower link and at the rod's end, without noise."""
     mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install 'yid-ocp[blind]'")
     from yid_ocp.virtual.joint_motion import MultisineMotion
-    from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
+    from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
     from yid_ocp.virtual.mujoco_simulation import MujocoScene, TrackingController, settle_to_equilibrium
 
     system, step = holding(urdf, driven=ARM), 2e-4
     own = "".join(f"<{kind} name='{site}{kind}' site='{site}'/>" for site in ("lower", "w_T1") for kind in KINDS)
     text = mujoco_xml(system, time_step=step).replace("</mujoco>", f"<sensor>{own}</sensor></mujoco>")
-    model = compile_mjcf(text)
+    model = mujoco_model_from_mjcf(text)
     scene = MujocoScene.from_compiled_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[[model.joint(name).id for name in ARM]] = list(START.values())
@@ -150,7 +150,7 @@ def recorded(urdf: Path) -> Recording:
 
 
 def problem(system: System, recording: Recording, *free: str, step: float = 0.01, **more) -> EstimationProblem:
-    options = ProblemOptions(**{"path_cutoff": np.inf, "weak_prior_std_as_factor": 0.0, **more})
+    options = ProblemOptions(**{"path_cutoff": np.inf, "weak_prior_geometric_std": 0.0, **more})
     return EstimationProblem(compile_step(system, step, use_compiler=False), [recording], free, options)
 
 
@@ -199,7 +199,7 @@ def test_slopes_with_effects_are_those_of_differences(urdf: Path, recorded: Reco
         np.testing.assert_allclose(evaluation.jacobian[rows, i], numeric, atol=2e-6 * np.abs(numeric).max() + 4e-5)
     gradient = made.cost_and_gradient(x)[1]
     np.testing.assert_allclose(gradient, evaluation.jacobian.T @ evaluation.residual, rtol=1e-9)
-    with_sensors = candidate_kinds_and_locations(system, recorded_sensor_kinds([recorded]))
+    with_sensors = candidate_kinds_and_locations(system, recorded_signal_kinds([recorded]))
     places = {place for kind, place in with_sensors if kind == "sensor_bias"}
     assert places == {"wrist:lower", "imu:lower", "imu:w_T1"}
 
@@ -235,7 +235,7 @@ def test_stiffness_is_found_from_a_wrist_in_mujoco_and_from_a_synthetic_one(
     noisy = {q: v + noise[q] * rng.standard_normal(v.shape) for q, v in wrist.values_by_quantity.items()}
     one = replace(recorded, channel_groups=(replace(wrist, values_by_quantity=noisy),))
     made = problem(holding(urdf, prescribed=ARM), one, "T1.bend", step=0.005)
-    write_recording(made.simulate_recording({"T1.bend": 4.5}, seed=1), tmp_path / "made.h5")
+    write_recording(made.simulate_noisy_recording({"T1.bend": 4.5}, seed=1), tmp_path / "made.h5")
     again = read_recording(tmp_path / "made.h5")
     assert again.channel_groups[0].names == ("lower",)
     assert again.sensor_setting_keys[2:] == ("wrist.force", "wrist.torque")

@@ -21,7 +21,7 @@ from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import Effect, NodeState
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.sensors import ChannelKind, EffortSensor, PointSensor, Sensor, sensor_reading_function
+from yid_ocp.sensors import ChannelSpecification, EffortSensor, PointSensor, Sensor, sensor_reading_function
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 LABEL = "drift@left"
@@ -157,7 +157,7 @@ def test_a_joint_or_frame_that_is_not_there_is_refused(sensor: Sensor, system: S
 class Hand(Sensor):
     """How fast the elbow turns, how that changes and what holds the hand: what a node has beside its coordinates."""
 
-    channel = ChannelKind("hand", "touch", "1")
+    channel = ChannelSpecification("hand", "touch", "1")
     group_name: str = "hand.touch"
     frame_names = point_names = ()
 
@@ -176,7 +176,7 @@ def test_rates_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
     step = compile_step(held, H, use_compiler=False)
     t = H * np.arange(41)
     joints = JointGroup(("shoulder", "elbow"), t, np.zeros((41, 2)), effort=np.sin(4 * t)[:, None] * [1.0, 0.0])
-    options = ProblemOptions(tracking_filter="none", weighting="paper")
+    options = ProblemOptions(arm_tracking_feedback="none", weighting="paper")
     tip = PointGroup("points", ("tip",), t, np.zeros((41, 1, 3)), 1.0)
     problem = EstimationProblem(step, [Recording(joints, (tip,), name="held")], names, options)
     samples = measured(Hand(), [3, 7, 20, 39], [0.0, 0.5, 0.0, 1.0], np.zeros((4, 3)), span=(0, 40))

@@ -156,13 +156,13 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
 
 def test_open_loop_is_for_multiple_shooting(make_problem):
     """Without feedback the arm leaves the measured motion; a second of it can be rolled out, three cannot."""
-    problem = make_problem(free=("T1.bend", "T2.bend"), tracking_filter="none", duration=1.0)
+    problem = make_problem(free=("T1.bend", "T2.bend"), arm_tracking_feedback="none", duration=1.0)
     single = GaussNewton(max_iterations=15).minimize_cost(problem, problem.initial_unknowns, None)
     nodes = CONDENSED.minimize_cost(problem, problem.initial_unknowns, None)
     assert nodes.status == Status.CONVERGED, nodes.message
     assert nodes.history[-1].cost == pytest.approx(single.history[-1].cost, rel=1e-3)
     assert nodes.x == pytest.approx([22.0, 10.7], rel=0.1)
-    longer = make_problem(free=("T1.bend", "T2.bend"), tracking_filter="none", duration=3.0)
+    longer = make_problem(free=("T1.bend", "T2.bend"), arm_tracking_feedback="none", duration=3.0)
     assert not longer.evaluate(longer.initial_unknowns, derivatives=False).ok
 
 

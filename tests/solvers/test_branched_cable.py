@@ -9,11 +9,11 @@ from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.rotations import rotation_from_rpy
-from yid_ocp.model.system import System, floating_clamp
+from yid_ocp.model.system import System, floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
@@ -27,14 +27,16 @@ STD, H, STEPS = 1e-3, 0.01, 200
 @pytest.fixture(scope="module")
 def cable():
     """Makes the problem from a start, the same for all free stiffnesses [N m^2]; recorded by the model at the truth."""
-    how = {"radius": 0.005, "stiffness_per_curvature": True, "damping": 2e-4}
+    how = {"radius": 0.005, "has_stiffness_per_curvature": True, "damping": 2e-4}
     segments = [
         Segment("a", 0.3, 0.03, links=4, clamped_at_base=True, **how),
         Segment("b", 0.2, 0.02, links=3, parent="a", rest_rotation=rotation_from_rpy(0.64, 0.0, 0.0), **how),
         Segment("c", 0.15, 0.01, links=3, parent="a", rest_rotation=rotation_from_rpy(0.0, 0.64, 0.0), **how),
     ]
     item = flexible_object(segments, name="cable")
-    system = System.build(floating_clamp("clamp"), objects=[(item, "clamp", None)], prescribed=CLAMP, damping={})
+    system = System.build(
+        floating_joint_mechanism("clamp"), objects=[(item, "clamp", None)], prescribed=CLAMP, damping={}
+    )
     step = compile_step(system, H)
     t = H * np.arange(STEPS + 1)
     s = np.clip(t, 0, 1)
@@ -90,7 +92,7 @@ FINE, COARSE, DURATION = 12, 5, 3.0
 
 def arm_with_cable(links: int, mode: str) -> System:
     """A UR5 that carries 1 m of cable, bending alone."""
-    how = {"stiffness_per_curvature": True, "clamped_at_base": True}
+    how = {"has_stiffness_per_curvature": True, "clamped_at_base": True}
     how |= {name: CABLE_TRUTH[f"cable.{name}"] for name in ("bend", "damping")}
     cable = flexible_object([Segment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable")
     robot = read_urdf("package:ur5", joints=list(JOINTS))
@@ -105,7 +107,9 @@ def coarse_recording():
     motion = random_multisine_motion(system, None, seed=3, initial_joint_angles=POSTURE, excitation=excitation)
     simulation = SimulationOptions(duration=DURATION, time_step=1e-3)
     camera = PointCamera(frame_rate=30.0, point_std=1e-3, has_dropouts=False)
-    how = VirtualExperiment(motion=motion, initial_joint_angles=POSTURE, simulation=simulation, camera=camera, seed=3)
+    how = VirtualExperimentSettings(
+        motion=motion, initial_joint_angles=POSTURE, simulation=simulation, camera=camera, seed=3
+    )
     return run_virtual_experiment(system, None, how)
 
 

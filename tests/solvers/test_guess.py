@@ -13,7 +13,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, unknowns_with_active_effects
+from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, unknowns_with_neutral_effects_activated
 from yid_ocp.solvers.multiple_shooting import _ShootingIntervals
 
 START = np.array([5.0, 4.0])
@@ -50,7 +50,9 @@ def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, t
     found = guess_unknowns_and_node_states(problem, nodes_of(problem), START, misfit)
     np.testing.assert_allclose(found.x, taken * START)
     assert list(dict.fromkeys(told)) == tried
-    rest = problem.initial_state(problem.episodes[0], problem.theta_and_initial_state_offset(found.x, 0)[0])
+    rest = problem.initial_state_of_episode(
+        problem.episodes[0], problem.theta_and_initial_state_deviation(found.x, 0)[0]
+    )
     np.testing.assert_allclose(found.initial_states[0].state, rest.state, atol=1e-9)
 
 
@@ -161,17 +163,17 @@ def test_an_amplitude_seen_at_its_neutral_value_begins_there_and_one_given_at_it
     given = free.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})
     for begun in (problem, fixed, given):
         x = begun.initial_unknowns
-        np.testing.assert_array_equal(unknowns_with_active_effects(begun, x), x)
+        np.testing.assert_array_equal(unknowns_with_neutral_effects_activated(begun, x), x)
 
 
 def test_a_start_that_cannot_be_rolled_out_is_drawn_back(moved, monkeypatch):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
-    whole, plain = unknowns_with_active_effects(problem, problem.initial_unknowns), problem.evaluate
+    whole, plain = unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns), problem.evaluate
 
     def stiff(x, derivatives=True, warm=None):
         found = plain(x, derivatives, warm)
         return found if x[1] < 0.6 * whole[1] else type(found)(np.inf, found.residual, None, False, "it snaps", ())
 
     monkeypatch.setattr(problem, "evaluate", stiff)
-    drawn = unknowns_with_active_effects(problem, problem.initial_unknowns)
+    drawn = unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns)
     assert drawn[1] == pytest.approx(0.5 * whole[1])

@@ -18,10 +18,15 @@ from yid_ocp.inference.whitening import (
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram, _VectorBlock
-from yid_ocp.solvers.program_terms import GaussNewtonHessianRidge, LocalVariableFunction, ProgramTerm, ResidualTerm
+from yid_ocp.solvers.program_terms import (
+    GaussNewtonHessianRidge,
+    LocalVariableFunction,
+    MappedFunctionTerm,
+    ResidualTerm,
+)
 from yid_ocp.solvers.symbolic_transcription import problem_unknowns_from_program, transcribe
 
-TRACKED = {"tracking_filter": "proportional", "tracking_filter_gains": (9.0,)}
+TRACKED = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
 CASES = {
     "free": ((), {}, {}),
     "robust": ((), {}, {"huber_threshold": 0.8}),
@@ -32,9 +37,9 @@ CASES = {
     "known start": ((), {}, {"known_initial_states": {"run_1": [0.1, 0.2, 0.01, 0.02], "run_2": [0, 0.3, 0, -0.01]}}),
     "prescribed": ((), {"prescribed": ("shoulder",)}, {}),
     "all prescribed": ((), {"prescribed": PENDULUM}, {}),
-    "driven": ((), {"driven": ("shoulder",)}, {"tracking_filter": "none"}),
+    "driven": ((), {"driven": ("shoulder",)}, {"arm_tracking_feedback": "none"}),
     "driven, proportional": ((), {"driven": ("shoulder",)}, TRACKED),
-    "driven, filtered": ((), {"driven": ("shoulder",)}, {"tracking_filter": "lqr"}),
+    "driven, filtered": ((), {"driven": ("shoulder",)}, {"arm_tracking_feedback": "lqr"}),
     "driven and prescribed": ((), {"driven": ("elbow",), "prescribed": ("shoulder",)}, TRACKED),
 }
 
@@ -64,7 +69,7 @@ def rolled_out(problem, program, x):
     w[program.variables["theta"].index.ravel()] = x[:shared]
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         state = result.rollout.state
-        own = x[problem.unknowns.unknown_indices_of_recording(i)[shared:]]
+        own = x[problem.unknowns.unknown_indices_affecting_recording(i)[shared:]]
         parts = {"q": state[:, :n].T, "p": state[:, n : 2 * n].T, "z": state[:, 2 * n :].T}
         parts |= {"lam": result.rollout.multipliers.T, "local": own[: len(problem.local_parameters), None]}
         if result.equilibrium is not None:
@@ -124,8 +129,10 @@ def test_its_reduced_gradient_is_the_problems(problem):
         # the program holds the first state where the problem holds its offset from rest, which moves with theta
         count = len(problem.shared_parameters)
         for i, episode in enumerate(problem.episodes):
-            by = problem.initial_state(episode, problem.theta_and_initial_state_offset(x, i)[0]).state_sensitivity[rows]
-            at = problem.unknowns.unknown_indices_of_recording(i)[len(problem.unknowns.free_parameters) :]
+            by = problem.initial_state_of_episode(
+                episode, problem.theta_and_initial_state_deviation(x, i)[0]
+            ).state_sensitivity[rows]
+            at = problem.unknowns.unknown_indices_affecting_recording(i)[len(problem.unknowns.free_parameters) :]
             expected[:count] -= by[:, :count].T @ expected[at]
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
 
@@ -155,7 +162,7 @@ def test_internal_coordinates_are_among_the_states(paper_systems, recording, one
         step, [recording], ("T1.bend", effect.parameters.names[0]), ProblemOptions(duration=0.05)
     )
     program = transcribe(problem)
-    assert program.block_layout("z").index.shape == (step.sizes["nz"], 6)
+    assert program.named_block("z").index.shape == (step.sizes["nz"], 6)
     x = problem.initial_unknowns * 4
     w, evaluation = rolled_out(problem, program, x)
     cost, defects = values_at(program, w, program.f, program.g)
@@ -212,7 +219,7 @@ def test_blocks_are_named_after_what_they_hold(urdf_folder):
 @pytest.mark.parametrize("encoders", [False, True])
 @pytest.mark.parametrize(
     "feedback",
-    [TRACKED, {"tracking_filter": "lqr"}, {"tracking_filter": "none"}],
+    [TRACKED, {"arm_tracking_feedback": "lqr"}, {"arm_tracking_feedback": "none"}],
     ids=["angles", "momenta_too", "none"],
 )
 def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, encoders, feedback):
@@ -234,7 +241,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
         episode = replace(episode, tracking_feedback=replace(episode.tracking_feedback, reference=reference))
     samples = []
     for s, y in zip(episode.measurements, plain.predicted_outputs, strict=True):
-        weight = np.where(s.used_output_mask, 1e4 / size, 0.0)
+        weight = np.where(s.positive_weight_mask, 1e4 / size, 0.0)
         samples.append(replace(s, value=y + size * 1e-4 * rng.standard_normal(y.shape), weight=weight))
     white = rng.standard_normal(len(np.unique(errors.sample_of_step)))
     wrong = errors.torque_std * white[errors.sample_of_step][:, None]
@@ -246,17 +253,17 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     assert problem_whitened_by_sensor_noise(problem).evaluate(x).cost > 3 * expected
     program = transcribe(problem)
     arguments = program.solver_arguments
-    theta = program.block_layout("theta").index.ravel()
+    theta = program.named_block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
     found = solver(**arguments)
     assert solver.stats()["success"], solver.stats()["return_status"]
     # beside encoders no torque is taken as better than a thousandth: errors are then not small enough to be linear;
     # where momenta are followed, the noise of the step before is taken for this step's
-    exact = not encoders and feedback["tracking_filter"] != "lqr"
+    exact = not encoders and feedback["arm_tracking_feedback"] != "lqr"
     assert float(found["f"]) == pytest.approx(expected, rel=1e-4 if exact else 4e-3)
-    assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["tracking_filter"] != "none")
-    assert program.block_layout("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
+    assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["arm_tracking_feedback"] != "none")
+    assert program.named_block("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
 
 
 def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):
@@ -285,18 +292,18 @@ def chain(use_compiler=False, threshold=math.inf, ridge=None):
         "motion", [v, d, s], ca.vertcat(v[3] - v[1] - d * ca.sin(v[2]) * v[0] * s, v[2] * v[0]), None, use_compiler
     )
     places = np.array([[0, 1 + 2 * k, 2 + 2 * k, 3 + 2 * k] for k in range(COUNT)])
-    stages = ProgramTerm("motion", ("gap", "work"), motion, places, np.arange(COUNT)[:, None], np.array([COUNT]))
+    stages = MappedFunctionTerm("motion", ("gap", "work"), motion, places, np.arange(COUNT)[:, None], np.array([COUNT]))
     one, two = ca.SX.sym("q", 1), ca.SX.sym("q", 2)
     none = ca.SX(0, 1)
     square = LocalVariableFunction("square", [one, none, none], one + 0.2 * one**2)
     at = np.arange(1, SIZE, 2)[:, None]
-    seen = ProgramTerm("x", ("x",), square, at, np.zeros((len(at), 0), int), np.zeros(0, int))
+    seen = MappedFunctionTerm("x", ("x",), square, at, np.zeros((len(at), 0), int), np.zeros(0, int))
     between = ca.DM(COUNT, COUNT + 1)
     for k in range(COUNT):
         between[k, k], between[k, k + 1] = 0.25, 0.75
     target, weight = COUNT + 1 + np.arange(COUNT), 2 * COUNT + 1 + np.arange(COUNT)
     pair = LocalVariableFunction("pair", [two, none, none], two[0] * two[1] - 0.3)
-    beside = ProgramTerm("y", ("y",), pair, np.array([[0, 2], [0, 4]]), np.zeros((2, 0), int), np.zeros(0, int))
+    beside = MappedFunctionTerm("y", ("y",), pair, np.array([[0, 2], [0, 4]]), np.zeros((2, 0), int), np.zeros(0, int))
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.random(COUNT), [1.5], rng.random(COUNT), 1 + rng.random(COUNT)])
     states = np.arange(1, SIZE).reshape(1, -1)

@@ -24,13 +24,13 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import (
     ArmSensorNoise,
     PointCamera,
-    VirtualExperiment,
+    VirtualExperimentSettings,
     baxter_foam_y_system,
     record_simulation,
     run_virtual_experiment,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
-from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
+from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
     MujocoScene,
     SimulationOptions,
@@ -155,7 +155,7 @@ def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) 
 def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoScene:
     """The scene with the joints a tenth of a radian from where the grippers meet another system's object."""
     scene = MujocoScene.from_compiled_model(
-        system, mujoco, compile_mjcf(mujoco_xml(system, values, time_step=time_step))
+        system, mujoco, mujoco_model_from_mjcf(mujoco_xml(system, values, time_step=time_step))
     )
     scene.data.qpos[:] = scene.model.qpos_spring
     for name, angle in grasping_joint_angles(held, TRUTH).items():
@@ -216,7 +216,9 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     system, run = SYSTEMS[1], runs(1, 1e-3, 3.0)
     motion = random_multisine_motion(system, TRUTH, seed=7)
     simulation = SimulationOptions(3.0, time_step=1e-3)
-    recording = run_virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, simulation=simulation, seed=5))
+    recording = run_virtual_experiment(
+        system, TRUTH, VirtualExperimentSettings(motion=motion, simulation=simulation, seed=5)
+    )
     joints = recording.joints
     np.testing.assert_array_equal(joints.t, np.arange(301) / 100)
     np.testing.assert_array_equal(joints.effort, run.effort)  # a camera must not disturb the experiment
@@ -240,7 +242,7 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
 def recorded(run: SimulationResult, seed: int, noise: ArmSensorNoise, camera: PointCamera | None = None) -> Recording:
     """What sensors with some noise make of a simulation of one arm."""
     simulation = SimulationOptions(time_step=1e-3, effort_kind="sample")
-    experiment = VirtualExperiment(None, None, simulation, noise, camera, seed=seed)
+    experiment = VirtualExperimentSettings(None, None, simulation, noise, camera, seed=seed)
     return record_simulation(SYSTEMS[1], TRUTH, experiment, run)
 
 
@@ -285,7 +287,7 @@ def test_torques_are_off_by_a_constant_and_by_white_noise(runs: Runs) -> None:
 def test_experiments_that_do_not_fit_are_refused() -> None:
     brief, of_two = SimulationOptions(0.1, time_step=1e-3), ArmSensorNoise(effort_std=(0.1, 0.2))
     with pytest.raises(ConfigError, match="2 standard deviations for 7 joints"):
-        run_virtual_experiment(SYSTEMS[1], None, VirtualExperiment(None, None, brief, of_two))
+        run_virtual_experiment(SYSTEMS[1], None, VirtualExperimentSettings(None, None, brief, of_two))
     with pytest.raises(ConfigError, match="arms = 3"):
         baxter_foam_y_system(3)
     system = SYSTEMS[1]

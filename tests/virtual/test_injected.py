@@ -15,8 +15,8 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState
 from yid_ocp.virtual import injected
-from yid_ocp.virtual.experiment import VirtualExperiment, recording_with_sensor_error
-from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error
+from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -148,7 +148,7 @@ def test_errors_of_cameras_are_those_of_the_table():
 def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
     """1 N m s/rad is some hundred times what an explicit step of a light branch bears: it asks little of the arm."""
     motion = random_multisine_motion(SYSTEM, TRUTH, seed=1)
-    experiment = VirtualExperiment(motion, simulation=SimulationOptions(0.3, time_step=5e-4), seed=2)
+    experiment = VirtualExperimentSettings(motion, simulation=SimulationOptions(0.3, time_step=5e-4), seed=2)
     hysteresis = InjectedEffect("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})
     braked = InjectedEffect("one_way_damping", "T3", {"size": 1.0})
     clean, pushed, light, again = (
@@ -163,7 +163,7 @@ def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
 def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
     assert len(set(injected.INJECTABLE_EFFECT_KINDS)) == len(injected.INJECTABLE_EFFECT_KINDS)
     assert set(injected.INJECTABLE_EFFECT_KINDS) <= set(EFFECTS)
-    assert not set(OUT_OF_LIBRARY_EFFECTS) & set(EFFECTS)
+    assert not set(OUT_OF_LIBRARY_FORCE_BUILDERS) & set(EFFECTS)
     tested_elsewhere = {"rotor_inertia", "standard_linear_solid", "hysteresis", *TWINS}
     assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {
         *injected._MUJOCO_MODEL_KINDS,

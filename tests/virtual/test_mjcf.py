@@ -26,9 +26,9 @@ from yid_ocp.model import (
 )
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Frame, Inertia, Placement
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics_terms, mujoco_xml
+from yid_ocp.virtual.mjcf import ParameterEvaluator, mujoco_model_from_mjcf, mujoco_xml, system_joint_dynamics_terms
 
 MECHANICAL = {
     "kelvin_voigt": ("T", {"tau": 0.05}),
@@ -83,7 +83,7 @@ OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", 
 
 def clamped_beam() -> System:
     beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=3)], name="beam")
-    clamp = floating_clamp("clamp")
+    clamp = floating_joint_mechanism("clamp")
     body = Inertia.from_values(0.3, [0.01, 0.02, 0.03], np.diag([1e-3, 2e-3, 2.5e-3]))
     clamp = replace(clamp, joints=(*clamp.joints[:-1], replace(clamp.joints[-1], bodies=(body,))))
     return System.build(clamp, objects=[(beam, "clamp", None)], driven=["clamp_x"], damping=0.1)
@@ -106,7 +106,7 @@ def assert_same_mechanics(system: System, values: dict[str, float]) -> None:
         passive += 0 if terms.dissipative_force is None else terms.dissipative_force
     points = ca.horzcat(ca.SX(3, 0), *(kinematics.frame_position(name) for name in system.point_frames))
     ours = ca.Function("ours", [q, v, system.parameters.symbols], [mass, bias, passive, points])
-    model = compile_mjcf(mujoco_xml(system, values))
+    model = mujoco_model_from_mjcf(mujoco_xml(system, values))
     data = mujoco.MjData(model)
     order = [model.joint(name).id for name in system.mechanism.joint_names]
     assert model.nv == system.n_coordinates
@@ -178,7 +178,7 @@ def test_what_has_no_term_is_refused(system: System) -> None:
 
 def test_a_part_of_the_weight(system: System) -> None:
     changed = with_effect(system, "gravity_scale", "object", {"fraction": -0.4})
-    model, whole = (compile_mjcf(mujoco_xml(s)) for s in (changed, system))
+    model, whole = (mujoco_model_from_mjcf(mujoco_xml(s)) for s in (changed, system))
     light, heavy = mujoco.MjData(model), mujoco.MjData(whole)
     for m, d in ((model, light), (whole, heavy)):
         d.qpos[:] = np.linspace(-0.5, 0.5, m.nq)
@@ -201,7 +201,7 @@ def test_recorded_torques_become_those_that_act(system: System) -> None:
     for changed, delay in ((system, 0.0), (late, 0.02)):
         if delay and not hasattr(mujoco.MjModel, "actuator_delay"):
             continue
-        model = compile_mjcf(mujoco_xml(changed, time_step=1e-3, actuators=True))
+        model = mujoco_model_from_mjcf(mujoco_xml(changed, time_step=1e-3, actuators=True))
         data = mujoco.MjData(model)
         at, found = model.joint("elbow").id, []
         for _ in range(120):
@@ -217,14 +217,14 @@ def test_recorded_torques_become_those_that_act(system: System) -> None:
 
 def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
     changed = with_effect(system, *("grasp_compliance", *OTHERS["grasp_compliance"][:2]))
-    model = compile_mjcf(mujoco_xml(changed, emulate=True))
+    model = mujoco_model_from_mjcf(mujoco_xml(changed, emulate=True))
     data = mujoco.MjData(model)
     data.qpos[:] = 0.1
     mujoco.mj_forward(model, data)
     apart = data.site("grasp_hold_holder").xpos - data.site("grasp_hold_held").xpos
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jacSite(model, data, jacobian, None, model.site("grasp_hold_held").id)
-    plain = compile_mjcf(mujoco_xml(replace(changed, grasps=()), emulate=True))
+    plain = mujoco_model_from_mjcf(mujoco_xml(replace(changed, grasps=()), emulate=True))
     other = mujoco.MjData(plain)
     other.qpos[:] = 0.1
     mujoco.mj_forward(plain, other)
@@ -234,8 +234,8 @@ def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
 
 def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
     changed = with_effect(system, "joint_coulomb", "elbow", {"tau_c": 0.4})
-    assert joint_dynamics_terms(changed, ParameterEvaluator(changed))["elbow"].dry_friction == 0.4
-    model = compile_mjcf(mujoco_xml(changed, emulate=True))
+    assert system_joint_dynamics_terms(changed, ParameterEvaluator(changed))["elbow"].dry_friction == 0.4
+    model = mujoco_model_from_mjcf(mujoco_xml(changed, emulate=True))
     assert model.dof_frictionloss[model.joint("elbow").id] == 0.4
 
 
@@ -279,12 +279,12 @@ def test_what_mujoco_cannot_express_is_refused() -> None:
     with pytest.raises(ModelError, match="'B_0_x' is rigid"):
         mujoco_xml(replace(system, joint_compliances={"B_0_x": ca.SX(0)}))
     with pytest.raises(ModelError, match="has a mass"):
-        mujoco_xml(System.build(floating_clamp("clamp")))
+        mujoco_xml(System.build(floating_joint_mechanism("clamp")))
     beam = flexible_object([Segment("B", 0.5, 0.2, 0.01)])
     tree = SYSTEMS[1].mechanism
     bare = Frame(tree.joint_index("T2_1_y"), Placement.identity())
     with pytest.raises(ModelError, match="more than six"):
-        mujoco_xml(System.build(floating_clamp("clamp"), objects=[(beam, "clamp", None)]))
+        mujoco_xml(System.build(floating_joint_mechanism("clamp"), objects=[(beam, "clamp", None)]))
     tree = replace(tree, frames={**tree.frames, "bare": bare})
     with pytest.raises(ModelError, match="sits on a joint that carries no mass"):
         mujoco_xml(replace(SYSTEMS[1], point_frames=("bare",), mechanism=tree))

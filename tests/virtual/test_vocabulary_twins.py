@@ -25,11 +25,11 @@ from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorOp
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
-from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
-from yid_ocp.virtual.mujoco_replay import replay_in_mujoco
+from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
+from yid_ocp.virtual.mujoco_replay import replay_mismatch_by_channel
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 POSTURE = {"shoulder": 0.4, "elbow": 0.7}
@@ -50,7 +50,7 @@ def arm(mode: str = "driven") -> System:
 def recorded(effects: list[InjectedEffect], seed: int = 1, duration: float = 1.6) -> Recording:
     noise = ArmSensorNoise(position_std=5e-5, velocity_std=1e-3, effort_std=0.0)
     simulation = SimulationOptions(duration, time_step=2.5e-4)
-    experiment = VirtualExperiment(None, POSTURE, simulation, noise, camera=None, seed=seed)
+    experiment = VirtualExperimentSettings(None, POSTURE, simulation, noise, camera=None, seed=seed)
     return run_experiment_with_effects(arm(), {}, effects, experiment)
 
 
@@ -64,7 +64,7 @@ def fitted(kind: str, place: str, recording: Recording, mode: str) -> dict[str, 
     found = solve(problem, GaussNewton(max_iterations=25))
     values = dict(zip(found.unknown_names, found.x, strict=True))
     stds = {name: found.std[name] for name in effect.parameters.names}
-    return {name: (entry.value, entry.std) for name, entry in effect.reported_parameters(values, stds).items()}
+    return {name: (entry.value, entry.std) for name, entry in effect.parameters_as_reported(values, stds).items()}
 
 
 def agrees(found: tuple[float, float], true: float, rel: float = 0.0) -> bool:
@@ -87,7 +87,7 @@ def test_a_payload_is_found_with_its_place(values) -> None:
 def test_a_payload_that_cannot_be_is_refused() -> None:
     system = arm()
     for values, text in (({"mass": 0.01, "mx": 0.05}, "too far"), ({"mass": -0.9, "mz": 0.0}, "more is taken away")):
-        model = compile_mjcf(mujoco_xml(system, {}))
+        model = mujoco_model_from_mjcf(mujoco_xml(system, {}))
         with pytest.raises(ModelError, match=text):
             _InjectedTerms(system, {}, [InjectedEffect("payload", "hand", values)]).edit_model(model)
 
@@ -139,7 +139,7 @@ def test_what_lies_uphill_is_found_by_a_refit_from_where_its_screening_leads(kin
     start = fit_nominal_model(nominal, composed)
     [score] = screen_candidates(composed, (), start.values).candidate_scores
     found = refit_with_effects(composed, composed.candidate_effects, {**start.values, **score.predicted_values})
-    for name, reported in found.reported_parameters(found.effects[0]).items():
+    for name, reported in found.effect_parameters_as_reported(found.effects[0]).items():
         assert reported.value == pytest.approx(values[name], rel=0.01 if kind == "effort_gain" else 0.05), name
     assert found.held_out_loss.chi2_per_sample < 0.01 * start.held_out_loss.chi2_per_sample
 
@@ -165,7 +165,7 @@ def servo_arm() -> System:
 def played(system: System, *effects: InjectedEffect) -> Recording:
     excitation = MultisineOptions(max_joint_speed=2.0, duration=1.0, frequency_band=(0.5, 2.0))
     start = {"initial_joint_angles": SERVO_POSTURE}
-    experiment = VirtualExperiment(
+    experiment = VirtualExperimentSettings(
         motion=random_multisine_motion(system, VALUES, seed=4, excitation=excitation, **start),
         simulation=SimulationOptions(1.0, sample_rate=50.0, time_step=1e-4),
         arm_noise=ArmSensorNoise(position_std=1e-6, velocity_std=1e-6),
@@ -260,7 +260,9 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
 
 
 def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_limit_are_not() -> None:
-    system = moved_by(PositionServoOptions(motor=MotorOptions("dc", "sts3215"), firmware=("derivative", "dead_band")))
+    system = moved_by(
+        PositionServoOptions(motor=MotorOptions("dc", "sts3215"), firmware_terms=("derivative", "dead_band"))
+    )
     values = VALUES | {"pan.servo_derivative": 0.3}
     pan = mujoco.MjModel.from_xml_string(mujoco_xml(system, values)).actuator("pan")
     assert pan.biasprm[1:3] == pytest.approx((-40.0, -0.3))
@@ -276,7 +278,7 @@ def test_an_exported_model_replays_its_commands(servo_arm: System, recording: Re
 
     def error(**changes: float) -> float:
         text = mujoco_xml(servo_arm, nominal | changes, emulate=True, actuators=True)
-        return replay_in_mujoco(text, servo_arm, recording)["joints.position"].rmse
+        return replay_mismatch_by_channel(text, servo_arm, recording)["joints.position"].rmse
 
     assert error() < 1e-3
     assert error(**{"pan.servo_gain": 10.0}) > 5 * error()

@@ -81,16 +81,16 @@ def tracked(system, run, recording, shape):
     """
 
     def make(outliers=0.0, seed=0, late=(), **timing):
-        when = vision.FrameTiming(mean_rate=3.0, latency=0.06, **timing)
-        scene = vision.CameraScene(system, "package:baxter")
-        camera = vision.VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
+        when = vision.CameraTimingModel(mean_rate=3.0, latency=0.06, **timing)
+        scene = vision.ObservedScene(system, "package:baxter")
+        camera = vision.VirtualCameraSetup(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = vision.render_virtual_frames(scene, run.t, run.q, camera)
         options = vision.TrackOptions(
             calibration=vision.CameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames
         )
         made.sequence.stamps[list(late)] += 0.15
         found = vision.track_object(scene, recording, made.sequence, options)
-        were = np.array([shape.points_at(made.true_configuration_at(t)) for t in found.t])
+        were = np.array([shape.points_at_configuration(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
         return SimpleNamespace(made=made, track=found, errors=errors)
 

@@ -18,7 +18,7 @@ from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.point_cloud import ReachableObjectRegion, is_statistical_inlier, voxel_averages
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
 
 FOLDER = Path(__file__).parent / "data"
 VOXEL = 0.011
@@ -30,10 +30,10 @@ def main() -> None:
     motion = random_multisine_motion(system, seed=1, excitation=MultisineOptions(gripper_travel=0.15), **start)
     run = simulate_in_mujoco(system, None, motion, SimulationOptions(1.5, time_step=2.5e-4), **start)
     pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-    camera = vision.VirtualCamera(pose, timing=vision.FrameTiming(mean_rate=2.7), seed=5)
-    made = vision.render_virtual_frames(vision.CameraScene(system, "package:baxter"), run.t, run.q, camera)
+    camera = vision.VirtualCameraSetup(pose, timing=vision.CameraTimingModel(mean_rate=2.7), seed=5)
+    made = vision.render_virtual_frames(vision.ObservedScene(system, "package:baxter"), run.t, run.q, camera)
     tree = system.numeric_mechanism()
-    robot = ArticulatedSurfaces(tree, load_robot_meshes("package:baxter", tree))
+    robot = ArticulatedSurfaces(tree, load_robot_meshes_by_joint("package:baxter", tree))
     region = ReachableObjectRegion(system, vision.CloudFilterOptions())
     pose, clouds = made.sequence.camera_pose, []
     true = [made.true_configuration_at(t) for t in made.capture_times]
@@ -49,7 +49,10 @@ def main() -> None:
     joints = JointGroup(names, run.t[every], np.round(run.q[every, : len(names)], 6), position_std=2e-4)
     write_recording(Recording(joints, description="Joints beside three clouds.", source="test"), FOLDER / "joints.h5")
     shape = ShapeFitter(system)
-    truth = {"points": system.point_frames, "position": [np.round(shape.points_at(q), 5).tolist() for q in true]}
+    truth = {
+        "points": system.point_frames,
+        "position": [np.round(shape.points_at_configuration(q), 5).tolist() for q in true],
+    }
     (FOLDER / "truth.json").write_text(json.dumps(truth) + "\n")
 
 

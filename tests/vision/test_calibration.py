@@ -21,7 +21,7 @@ from yid_ocp.vision.camera_registration import (
     _CalibrationEquations,
     robust_gradient_and_hessian,
 )
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
 
 ARM = """<robot name="arm"><link name="base"><visual><geometry><box size="0.3 0.3 0.2"/></geometry></visual></link>
 <joint name="yaw" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/><axis xyz="0 0 1"/>
@@ -57,7 +57,7 @@ def robot(tmp_path_factory):
     file = tmp_path_factory.mktemp("arm") / "arm.urdf"
     file.write_text(ARM)
     tree = read_urdf(file).with_numeric_values()
-    return ArticulatedSurfaces(tree, load_robot_meshes(file, tree))
+    return ArticulatedSurfaces(tree, load_robot_meshes_by_joint(file, tree))
 
 
 def arm_of(robot, motion=lively):
@@ -68,7 +68,7 @@ def clouds(robot, times, rng, motion=lively, scale=1.0, pose=POSE):
     """What a camera measures of the arm before a wall: noise along the rays, and pixels that fly at edges."""
     found = []
     for t in times:
-        depth, cosine, _ = robot.render_depth_image(LENS, pose, motion(t))
+        depth, cosine, _ = robot.render_depth_incidence_and_part(LENS, pose, motion(t))
         depth = np.where(np.isfinite(depth), depth, 3.2)
         flying = rng.random(depth.shape) < 0.02
         depth = np.where(flying, depth + rng.uniform(-0.3, 0.3, depth.shape), depth)
@@ -244,7 +244,7 @@ def test_frames_stamped_late_do_not_pull(robot):
             arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance
         )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))
-        assert calibration.is_stamp_delay_significant(own, CameraClockOptions()) is expected
+        assert calibration.is_frame_stamp_delay_significant(own, CameraClockOptions()) is expected
 
 
 def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):

@@ -45,7 +45,7 @@ def test_messages_name_the_thing_and_every_remedy_takes_it_away(alone):
     assert thing.text in found.dimension_and_foreign_object_notes
     clouds = [seen([*floor_and_wall(), box(*TABLE)], [9, k]) for k in range(2)]
     empty = FrameSequence.from_clouds([0.0, 1.0], clouds, look_at_pose(EYE, TARGET))
-    mesh = ExtraMesh(box=TABLE[1], xyz=TABLE[0])
+    mesh = ExtraMesh(box_size=TABLE[1], xyz=TABLE[0])
     for how in ({"background_estimation": "frames"}, {"extra": [mesh]}, {"empty": empty}):
         found, error = measured(alone, *table, filters=COARSE, **how)
         assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.02
@@ -55,7 +55,7 @@ def test_messages_name_the_thing_and_every_remedy_takes_it_away(alone):
 def test_an_empty_scene_is_a_background():
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(0, 1, (20000, 2)), 0.003 * rng.standard_normal(20000)])
-    background = BackgroundPoints.from_static_points([wall[::2], wall[1::2]], 0.008, 0.006)
+    background = BackgroundPoints.from_point_clouds([wall[::2], wall[1::2]], 0.008, 0.006)
     asked = np.array([[0.5, 0.5, 0.01], [0.5, 0.5, 0.06], [2.0, 0.5, 0.0]])
     assert background.is_near_background(asked).tolist() == [True, False, False]
     assert background.is_near_background(asked, 0.05).tolist() == [True, True, False]
@@ -69,7 +69,7 @@ def test_what_stands_still_is_a_background_but_for_the_object():
     elsewhere = [np.array([0.0, 1.0 + k, 0.0]) + rng.uniform(-0.05, 0.05, (3000, 3)) for k in range(4)]
     clouds = [np.concatenate([heap, rod, other]) for other in elsewhere]
     shape = TubeLinks(np.array([[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]]), np.array([0.02]), (0,), np.array([0.3]))
-    background = BackgroundPoints.from_static_points(clouds, 0.016, 0.006, [shape] * 4, 0.045)
+    background = BackgroundPoints.from_point_clouds(clouds, 0.016, 0.006, [shape] * 4, 0.045)
     assert background.is_near_background(heap).mean() > 0.95
     assert not background.is_near_background(rod).any()
     assert not background.is_near_background(elsewhere[0]).any()
@@ -103,13 +103,16 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
 
 def test_extra_meshes_hang_on_links(system):
     tree = system.numeric_mechanism()
-    extra = [ExtraMesh(parent_frame="left_gripper", box=(0.1, 0.1, 0.1)), ExtraMesh(sphere=0.2, xyz=(1, 2, 3))]
+    extra = [
+        ExtraMesh(parent_frame="left_gripper", box_size=(0.1, 0.1, 0.1)),
+        ExtraMesh(sphere_radius=0.2, xyz=(1, 2, 3)),
+    ]
     made = extra_meshes_by_joint(extra, tree)
     assert set(made) == {-1, tree.frames["left_gripper"].joint_index}
     assert made[-1][0].vertices.mean(axis=0) == pytest.approx([1, 2, 3], abs=0.01)
     for wrong, error, message in (
-        (ExtraMesh(parent_frame="left_griper", sphere=0.1), ConfigError, "no link 'left_griper'"),
-        (ExtraMesh(box=(1, 1, 1), sphere=0.1), ConfigError, "box and sphere"),
+        (ExtraMesh(parent_frame="left_griper", sphere_radius=0.1), ConfigError, "no link 'left_griper'"),
+        (ExtraMesh(box_size=(1, 1, 1), sphere_radius=0.1), ConfigError, "box_size and sphere_radius"),
         (ExtraMesh(mesh="nowhere.stl"), ModelError, "no mesh"),
     ):
         with pytest.raises(error, match=message):

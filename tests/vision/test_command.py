@@ -79,7 +79,7 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
         (["track.frames_path=nowhere"], "no such folder of frames"),
         (["recordings.estimate=[]"], "no recording with the joint angles"),
         (["track.camera_pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
-        (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_distance_in_radii'"),
+        (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_mean_distance_in_radii'"),
         (["track.options.filters.robot_padding=-1"], "robot_padding = -1"),
     ],
 )
@@ -128,7 +128,7 @@ def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
-    monkeypatch.setattr(FrameTracker, "calibrate_sequence", None)  # it is known
+    monkeypatch.setattr(FrameTracker, "estimate_sequence_calibration", None)  # it is known
     again = carried_out("track", config, "--workers", "2", settings=(PLAIN, UNDRAWN))
     assert again.result["frames"][0]["seconds"] == worked[0].cpu_seconds
     assert not (tmp_path / "run.partial").exists()
@@ -143,7 +143,7 @@ def test_the_examples_run(carried_out, repository, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
     short = ("virtual_frames.duration=1.0", "virtual_frames.frame_rate=4.0", "virtual_frames.dropped_fraction=0.0")
-    coarse = ("options.filters.voxel_size=0.014", "options.calibration.n_frames=3", "keep_frames=true")
+    coarse = ("options.filters.voxel_size=0.014", "options.calibration.n_frames=3", "write_virtual_frames=true")
     settings = [f"track.{setting}" for setting in (*short, *coarse)]
     done = carried_out("track", file, "--quiet", settings=(*settings, PLAIN, UNDRAWN))
     assert done.out.strip() == str(done.folder)

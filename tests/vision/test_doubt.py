@@ -38,7 +38,7 @@ def ratio(found, name):
 def test_right_sizes_are_not_doubted(track):
     found, error = track()
     assert found.dimensions.n_frames == FRAMES
-    assert not found.dimensions.is_model_value_contradicted.any()
+    assert not found.dimensions.contradicted_model_value_mask.any()
     assert not found.dimensions.messages
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.006
     assert np.isfinite(error).mean() > 0.9
@@ -47,7 +47,7 @@ def test_right_sizes_are_not_doubted(track):
 @pytest.mark.parametrize(("factor", "value"), [(1.1, "811 mm"), (0.9, "663 mm")])
 def test_a_wrong_length_is_said_and_its_point_is_not_written(track, factor, value):
     found, error = track({"T3": factor * Y_LENGTHS["T3"]})
-    assert found.dimensions.is_model_value_contradicted.tolist() == [False, False, True, False, False, False]
+    assert found.dimensions.contradicted_model_value_mask.tolist() == [False, False, True, False, False, False]
     assert ratio(found, "T3.length") == pytest.approx(factor, abs=0.02)
     [message] = found.dimensions.messages
     assert "T3.length seems to be wrong" in message
@@ -75,7 +75,7 @@ def test_a_wrong_length_further_up_moves_everything_and_is_found(track):
 def test_radii_wrong_by_a_third_are_said_and_enter_the_standard_deviation(track):
     found, error = track(radii={name: 1.3 * radius for name, radius in Y_RADII.items()})
     sizes = found.dimensions
-    assert sizes.is_model_value_contradicted.tolist() == [False, False, False, True, True, True]
+    assert sizes.contradicted_model_value_mask.tolist() == [False, False, False, True, True, True]
     assert np.exp(sizes.log_ratio[3:]) == pytest.approx(1.3, abs=0.1)
     # the camera's side of a thicker tube is nearer to it: all points are off by that, and say so
     assert np.nanmean((error / found.std) ** 2) < 1.5
@@ -94,7 +94,7 @@ def test_an_end_outside_of_the_filters_box_tells_nothing_of_a_length(track):
     """What was cut off by a filter is no missing end."""
     found, _ = track(filters=CloudFilterOptions(box_lower=(0.0, -0.45, -2.0), box_upper=(2.0, 2.0, 2.0)))
     i = found.dimensions.names.index("T3.length")
-    assert not found.dimensions.is_model_value_contradicted[i]
+    assert not found.dimensions.contradicted_model_value_mask[i]
     assert all(np.isnan(frame.shape_fit.end_offsets[1]) for frame in found.frame_reports if frame.shape_fit is not None)
 
 
@@ -108,6 +108,6 @@ def test_what_sizes_do_to_points():
     told = "the object seems to be other than the model says (a.length 1000 mm where 1051 mm fits)"
     for used, std in (((False, False), [0.05, 0, 0]), ((True, False), [0.01, 0, 0]), ((True, True), [0.01, 0.02, 0])):
         check = TubeDimensionEstimates(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5)
-        assert check.point_std(moves)[0] == pytest.approx(std)
+        assert check.point_std_from_dimensions(moves)[0] == pytest.approx(std)
         # a refusal names what contradicts the frames and has no estimate in its place
         assert check.contradiction_message == ("" if used[0] else told)

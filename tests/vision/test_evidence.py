@@ -7,7 +7,7 @@ from yid_ocp.vision.frames import OcclusionMap
 from yid_ocp.vision.shape_evidence import (
     ProcessedFrameCloud,
     TubeLinks,
-    assess_shape_against_cloud,
+    fit_quality_and_point_classes,
     nearest_surface_residuals,
     surface_depth_residuals,
     tube_like_node_and_point_masks,
@@ -39,7 +39,7 @@ def wall(x, y, z, step=0.006):
 def asked(points, behind=None, removed=None):
     everything = points if behind is None else np.concatenate([points, behind])
     view = OcclusionMap(everything, np.eye(4))
-    return assess_shape_against_cloud(
+    return fit_quality_and_point_classes(
         TUBES, ProcessedFrameCloud(points, np.ones(len(points)), points[::50], CAMERA, view, removed), NEAR
     )
 
@@ -59,10 +59,10 @@ def test_a_gap_is_empty_unless_something_hides_it():
     points = np.concatenate([tube(high=-0.25), tube(low=-0.05)])
     bare = asked(points)
     assert bare.visibly_empty_fraction[0] == pytest.approx(0.6, abs=0.11)
-    assert bare.length_weighted_coverage(np.array([1.0, 0.0])) <= 0.5
+    assert bare.length_weighted_visible_coverage(np.array([1.0, 0.0])) <= 0.5
     before = asked(points, wall((-0.2, 0.0), (-0.05, 0.05), 1.2))
     assert before.visibly_empty_fraction[0] == 0.0
-    assert before.length_weighted_coverage(np.array([1.0, 0.0])) == 1.0
+    assert before.length_weighted_visible_coverage(np.array([1.0, 0.0])) == 1.0
     assert before.covered_fraction[0] <= 0.5
     assert asked(points, removed=lambda places: places[:, 0] < 0.0).visibly_empty_fraction[0] == 0.0
 

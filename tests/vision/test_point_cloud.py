@@ -10,7 +10,7 @@ from yid_ocp.vision.point_cloud import (
     is_statistical_inlier,
     voxel_averages,
 )
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
 
 CAMERA = np.array([2.6, 0.0, 0.45])
 
@@ -42,11 +42,11 @@ def test_outliers_go_and_the_surface_stays(share):
 
 def test_the_robot_goes_with_its_padding(system, run):
     tree = system.numeric_mechanism()
-    meshes = load_robot_meshes("package:baxter", tree)
+    meshes = load_robot_meshes_by_joint("package:baxter", tree)
     robot = ArticulatedSurfaces(tree, meshes)
     wrist = system.mechanism.joint_index("left_w1")
     for q in (run.q[0], run.q[-1]):
-        pose = robot.part_poses_at(q)[robot.part_joints.index(wrist)]
+        pose = robot.part_poses_at_configuration(q)[robot.part_joints.index(wrist)]
         surface = meshes[wrist].transformed(pose).vertices[::20]
         assert robot.is_within_surface_distance(surface, q, 0.01).all()
         assert not robot.is_within_surface_distance(surface + np.array([0.0, 0.0, 3.0]), q, 0.01).any()
@@ -74,7 +74,7 @@ def test_where_the_object_can_be(system, run):
     [
         (CloudFilterOptions, "robot_padding"),
         (SkeletonOptions, "neighbour_radius"),
-        (TrackOptions, "max_distance_in_radii"),
+        (TrackOptions, "max_mean_distance_in_radii"),
         (ShapeFitOptions, "surface_noise_std"),
     ],
 )

@@ -9,7 +9,12 @@ from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import surface_meshes
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, TriangleMesh, load_robot_meshes, tube_meshes_by_joint
+from yid_ocp.vision.surface_meshes import (
+    ArticulatedSurfaces,
+    TriangleMesh,
+    load_robot_meshes_by_joint,
+    tube_meshes_by_joint,
+)
 
 SHAPE = (480, 640)
 
@@ -69,19 +74,19 @@ def test_outliers_are_as_many_as_asked_for():
 
 def test_frame_timing():
     rng = np.random.default_rng(0)
-    when = vision.FrameTiming(10.0, dropped_fraction=1 / 3, latency=0.05, latency_std=0.002)
+    when = vision.CameraTimingModel(10.0, dropped_fraction=1 / 3, latency=0.05, latency_std=0.002)
     taken, stamps = when._sample_times_and_stamps(0.0, 300.0, rng)
     assert len(taken) == pytest.approx(2000, rel=0.05)
     assert np.std(stamps - taken - 0.05) == pytest.approx(0.002, rel=0.1)
     with pytest.raises(ConfigError, match="rate"):
-        vision.FrameTiming(mean_rate=0.0)._sample_times_and_stamps(0.0, 1.0, rng)
+        vision.CameraTimingModel(mean_rate=0.0)._sample_times_and_stamps(0.0, 1.0, rng)
 
 
 def test_virtual_frames_are_the_same_every_time(system, run):
     pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-    camera = vision.VirtualCamera(pose, timing=vision.FrameTiming(mean_rate=2.0))
+    camera = vision.VirtualCameraSetup(pose, timing=vision.CameraTimingModel(mean_rate=2.0))
     one, two = (
-        vision.render_virtual_frames(vision.CameraScene(system), run.t, run.q, replace(camera, seed=seed))
+        vision.render_virtual_frames(vision.ObservedScene(system), run.t, run.q, replace(camera, seed=seed))
         for seed in (3, 4)
     )
     first = one.sequence.load_cloud(1)
@@ -90,13 +95,13 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert not np.array_equal(one.capture_times[:3], two.capture_times[:3])
     # the object's surface is where the points are
     tubes = ArticulatedSurfaces(system.numeric_mechanism(), tube_meshes_by_joint(system))
-    away, _, _ = tubes.moving_surface_distance(
+    away, _, _ = tubes.nearest_moving_surface(
         one.sequence.load_world_cloud(1), one.true_configuration_at(one.capture_times[1]), 0.2
     )
     assert np.median(away) < 0.006
     assert len(away) > 5000
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        vision.render_virtual_frames(vision.CameraScene(system), run.t, run.q, replace(camera, pose=None))
+        vision.render_virtual_frames(vision.ObservedScene(system), run.t, run.q, replace(camera, pose=None))
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +123,7 @@ def test_distances_follow_the_joints(ball):
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         radii = np.linspace(0.05, 0.3, 50)
         points, expected = middle + radii[:, None] * directions, np.abs(radii - 0.1)
-        found = ball.moving_surface_distance(points, q, 0.15)[0]
+        found = ball.nearest_moving_surface(points, q, 0.15)[0]
         assert np.allclose(found[expected < 0.145], expected[expected < 0.145], atol=6e-4)
         assert np.isinf(found[expected > 0.155]).all()
         assert np.array_equal(ball.is_within_surface_distance(points, q, 0.15, moving_only=True), np.isfinite(found))
@@ -131,7 +136,7 @@ def test_closest_points_give_the_way_out(ball):
     q = [0.3, 0.2]
     direction = np.array([0.6, 0.0, 0.8])
     points = centre(ball, q) + np.array([[0.14], [0.08], [0.5]]) * direction
-    distance, normal, part = ball.moving_surface_distance(points, q, 0.2)
+    distance, normal, part = ball.nearest_moving_surface(points, q, 0.2)
     assert np.allclose(distance[:2], [0.04, 0.02], atol=6e-4)
     assert np.allclose(normal[0], direction, atol=0.05)
     assert np.allclose(normal[1], -direction, atol=0.08)  # from the surface to the point, inwards here
@@ -144,7 +149,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
     middle = centre(ball, q)
     eye = middle + np.array([1.2, 0.3, 0.1])
     camera = vision.CameraIntrinsics(41, 31, 60.0, 60.0, 20.0, 15.0)
-    depth, cosine, part = ball.render_depth_image(camera, vision.look_at_pose(eye, middle), q)
+    depth, cosine, part = ball.render_depth_incidence_and_part(camera, vision.look_at_pose(eye, middle), q)
     away = np.linalg.norm([1.2, 0.3, 0.1])
     assert depth[15, 20] == pytest.approx(away - 0.1, abs=1e-3)
     assert cosine[15, 20] == pytest.approx(1.0, abs=0.01)
@@ -152,7 +157,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
     miss = away * np.sqrt(1 - rays[..., 2] ** 2)
     assert np.isfinite(depth[miss < 0.097]).all()
     assert np.isinf(depth[miss > 0.103]).all()
-    behind, _, nobody = ball.render_depth_image(camera, vision.look_at_pose(eye, 2 * eye - middle), q)
+    behind, _, nobody = ball.render_depth_incidence_and_part(camera, vision.look_at_pose(eye, 2 * eye - middle), q)
     assert np.isinf(behind).all()
     assert (nobody == -1).all()
     assert ((part == ball.part_joints.index(1)) == np.isfinite(depth)).all()
@@ -160,10 +165,10 @@ def test_rays_meet_a_ball_where_it_is(ball):
 
 def test_baxters_meshes_are_found_and_move(system):
     tree = system.numeric_mechanism()
-    meshes = load_robot_meshes("package:baxter", tree)
+    meshes = load_robot_meshes_by_joint("package:baxter", tree)
     assert set(meshes) == {-1, *system.driven_coordinate_indices}
     assert 0.1 < meshes[system.mechanism.joint_index("left_w2")].vertices[:, 2].max() < 0.5
-    assert set(load_robot_meshes("package:baxter", tree, "collision")) <= set(meshes)
+    assert set(load_robot_meshes_by_joint("package:baxter", tree, "collision")) <= set(meshes)
 
 
 def test_tubes_have_their_lengths_and_radii(system):
@@ -181,11 +186,11 @@ def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
     with pytest.raises(DataError, match="no object"):
         tube_meshes_by_joint(System.build(tree))
     with pytest.raises(ModelError, match="no URDF file"):
-        load_robot_meshes(tmp_path / "none.urdf", tree)
+        load_robot_meshes_by_joint(tmp_path / "none.urdf", tree)
     bare = tmp_path / "bare.urdf"
     bare.write_text('<robot name="bare"><link name="base"/></robot>')
     with pytest.raises(ModelError, match="no visual meshes"):
-        load_robot_meshes(bare, tree)
+        load_robot_meshes_by_joint(bare, tree)
     with pytest.raises(ModelError, match="is not there"):
         surface_meshes._resolve_mesh_path("package://nobody/mesh.dae", bare)
 

@@ -11,7 +11,7 @@ import numpy as np
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import write_recording
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 
@@ -86,7 +86,7 @@ def record(folder: Path, branches: Sequence[str], links: int = 12, duration: flo
     """`cross.h5`: joint angles, and four points seen at 50 Hz to half a millimetre."""
     run = load_config(configuration(folder, links, branches, mode="driven"))
     camera = PointCamera(point_std=5e-4, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4))
-    experiment = VirtualExperiment(
+    experiment = VirtualExperimentSettings(
         initial_joint_angles={"roll": 0.0, "pitch": 0.0},
         simulation=SimulationOptions(duration, time_step=2e-4),
         arm_noise=ArmSensorNoise(position_std=0.0),

@@ -61,7 +61,7 @@ def test_an_object_of_segments_on_a_robots_hand(built):
         "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
         "    segments:\n"
         "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, "
-        "stiffness_per_curvature: true, clamped_at_base: true}\n"
+        "has_stiffness_per_curvature: true, clamped_at_base: true}\n"
         "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
         "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
     )
@@ -148,7 +148,7 @@ SEGMENTED = (
     "model:\n  object:\n    kind: segments\n    segments:\n"
     "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 2}\n"
     "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, "
-    "stiffness_per_curvature: true, separate_twist_damping: true}\n"
+    "has_stiffness_per_curvature: true, separate_twist_damping: true}\n"
     "parameters:\n  '*.bend': {initial: 5, bounds: [1, 8]}\n  a.twist: {initial: 2}\n  b.damping: {initial: 0.3}\n"
 )
 
@@ -204,19 +204,19 @@ def test_damping_by_joint_says_that_of_the_object_too(built, urdf_folder):
 def test_a_problem_has_the_options_of_its_section(written):
     text = (
         "model: {object: {kind: foam_y}}\nsensors: {points: {std: 0.1}}\n"
-        "problem: {weighting: paper, huber_threshold: 3, start_fit_parameters: [T1.mass], duration: 2}\n"
+        "problem: {weighting: paper, huber_threshold: 3, initial_state_fit_parameters: [T1.mass], duration: 2}\n"
         "parameters: {T1.bend: {prior_std: 2, per_recording: true}}\n"
     )
     run = load_config(written(text))
     options = problem_options(run, build_system(run))
     assert (options.weighting, options.huber_threshold, options.duration) == ("paper", 3.0, 2.0)
-    assert (options.start_fit_parameters, options.local_parameters) == (("T1.mass",), ("T1.bend",))
+    assert (options.initial_state_fit_parameters, options.local_parameters) == (("T1.mass",), ("T1.bend",))
     assert options.prior_stds == {"T1.bend": 2.0}
     assert options.sensors["points"].std == 0.1
-    wrong = load_config(written("model: {object: {kind: foam_y}}\nproblem: {start_fit_parameters: [T1.mas]}\n"))
+    wrong = load_config(written("model: {object: {kind: foam_y}}\nproblem: {initial_state_fit_parameters: [T1.mas]}\n"))
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
         problem_options(wrong, build_system(wrong))
-    assert "line 2: problem.start_fit_parameters" in caught.value.where
+    assert "line 2: problem.initial_state_fit_parameters" in caught.value.where
 
 
 @pytest.mark.parametrize(
@@ -247,8 +247,8 @@ def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repos
 @pytest.mark.parametrize("name", PAPER_ESTIMATES)
 def test_the_papers_configurations_ask_for_its_answers(repository, cli, name):
     file = repository / "configs" / f"{name}.yaml"
-    assert load_config(file).compare.reference_paper_experiment == name
-    refused = cli("compare", file, "--set", "compare.reference_paper_experiment=triple")
+    assert load_config(file).compare.reference_paper_experiment_name == name
+    refused = cli("compare", file, "--set", "compare.reference_paper_experiment_name=triple")
     assert (refused.code, "no experiment 'triple'" in refused.err) == (2, True)
 
 

@@ -26,7 +26,7 @@ model:
     mount: {xyz: [0.1, 0.2, 0.3], rpy: [0.0, 1.5707963267948966, 0.0]}
     segments:
       beam:
-        {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_per_curvature: true,
+        {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, has_stiffness_per_curvature: true,
          clamped_at_base: true, joint_axes: y}
   frames:
     mark: {parent_frame: w_beam, marker_reference_pose: true}
@@ -36,9 +36,9 @@ parameters:
   beam.bend: {free: true, initial: 0.02}
   beam.damping: {free: true, initial: 5.0e-5}
 problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, duration: 0.4}
-output: {write_report: false, discretisation_check: none}
+output: {write_report: false, discretisation_check_mode: none}
 """
-JAW = "model.clamps={jaw: {origin_point: a, z_axis_point: b}}"
+JAW = "model.moving_clamps={jaw: {origin_point_name: a, z_axis_point_name: b}}"
 STRAIGHT = np.array([0.2, 0.2, 0.32])  # the tip's face is at 0.2, 0.2, 0.3
 
 
@@ -78,7 +78,7 @@ def test_every_recording_has_its_own_places_of_markers_in_the_frame_that_carries
         ((), blank(name="elsewhere"), ConfigError, "'mark' is no point"),
         (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "sits on nothing of the object"),
         (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),
-        ((JAW.replace("z_axis_point: b", "z_axis_point: a"),), None, ConfigError, "one point for both ends"),
+        ((JAW.replace("z_axis_point_name: b", "z_axis_point_name: a"),), None, ConfigError, "one point for both ends"),
         ((JAW, "model.object.mount.parent_frame=jaw"), None, ConfigError, "moves"),
     ],
 )

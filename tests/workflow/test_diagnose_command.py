@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import StoredFit
 from yid_ocp.diagnosis.refit import REFIT_SOLVER
@@ -144,7 +144,7 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
-    embedded = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE)
+    embedded = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
     for settings, command in ((changed, "yid-ocp diagnose 'runs/a b/config.yaml'"), (embedded, "yid-ocp diagnose")):
         with atomic_run_folder(settings, tmp_path / "runs" / "a b") as folder:
             folder.record_run_start(settings, "diagnose")
@@ -185,7 +185,7 @@ STATED = {
 PRESCRIBED = {
     "path_cutoff": np.inf,
     "initial_state": "estimated",
-    "weak_prior_std_as_factor": 7.0,
+    "weak_prior_geometric_std": 7.0,
     "huber_threshold": 1.5,
 }
 
@@ -252,8 +252,8 @@ def test_every_row_is_so_many_times_larger_and_the_fit_the_same(problem_of):
 
 def test_no_weak_prior_stays_none_and_encoders_without_noise_need_none(problem_of):
     sensors = {"points": STATED["points"], "joints.effort": SensorOptions(std=0.3)}
-    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_std_as_factor=0.0), SETTINGS)
-    assert shrunk.options.weak_prior_std_as_factor == 0.0
+    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_geometric_std=0.0), SETTINGS)
+    assert shrunk.options.weak_prior_geometric_std == 0.0
     assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)
 
 

@@ -46,7 +46,7 @@ def test_too_few_links_are_told_and_counted(folder, carried_out):
 
 @pytest.mark.parametrize(("setting", "tried"), [("none", set()), ("time_step", {"time_step"})])
 def test_settings_say_what_is_refined(folder, tmp_path, setting, tried):
-    overrides = [f"output.discretisation_check={setting}", "solver.max_iterations=1"]
+    overrides = [f"output.discretisation_check_mode={setting}", "solver.max_iterations=1"]
     result = run_solve(load_config(configuration(folder, 4, ["north"]), overrides), tmp_path / "run").result
     moved = result["discretisation"].get("north.bend", {})
     assert {key for key in ("links", "time_step") if moved.get(key) is not None} == tried

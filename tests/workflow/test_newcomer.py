@@ -19,13 +19,13 @@ from ros_bags import START, Bag
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import load_problem
 
-CURVED = "stiffness_per_curvature: true, clamped_at_base: true"
+CURVED = "has_stiffness_per_curvature: true, clamped_at_base: true"
 
 MODEL = """\
 model:
@@ -71,7 +71,7 @@ class Newcomer:
         excitation = excitation or MultisineOptions(max_joint_speed=1.0, duration=duration, frequency_band=(0.3, 1.5))
         start = {"initial_joint_angles": self.posture, "seed": seed}
         seen = {"point_std": 5e-4, "frame_rate": 50.0, "has_dropouts": False, "hidden_probability": 0.0}
-        experiment = VirtualExperiment(
+        experiment = VirtualExperimentSettings(
             motion=random_multisine_motion(system, None, excitation=excitation, **start),
             simulation=SimulationOptions(duration, time_step=2e-4),
             arm_noise=ArmSensorNoise(position_std=1e-4),
@@ -205,7 +205,7 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
 def test_a_cable_on_a_ur5_and_a_cross_on_a_panda(desk: Path, user: Newcomer, duration: float, numbers: Any) -> None:
     bag = write_mcap(user.simulate(desk, 3, duration), desk)
     assert main(["import", str(bag), "--preview"]) == 0
-    carried_out("run.h5", "import", str(bag), "--sensor-description", "mocap")
+    carried_out("run.h5", "import", str(bag), "--point-sensor-name", "mocap")
     carried_out("run.yaml", "init", user.settings["robot"], "run.h5", *numbers)
     checked = carried_out("checked", "check", "run.yaml")
     assert not checked["warnings"] + checked["doubts"]
@@ -220,7 +220,7 @@ def test_a_rod_on_an_arm_of_servos(desk: Path) -> None:
         (desk / str(seed)).mkdir()
         bag = write_mcap(SERVO.simulate(desk, seed, 3.0, excitation), desk / str(seed))
         carried_out(
-            f"run_{seed}.h5", "import", str(bag), "--command-topic", "/joint_commands", "--sensor-description", "mocap"
+            f"run_{seed}.h5", "import", str(bag), "--command-topic", "/joint_commands", "--point-sensor-name", "mocap"
         )
     carried_out("rod.yaml", "init", "default:servo_arm.urdf", "run_3.h5", "run_4.h5", *ROD_NUMBERS)
     assert load_config("rod.yaml").model.arms.mode == "servo"

@@ -95,15 +95,15 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
     """A pendulum under torques that are 0.3 N m too large, in one recording to estimate on and one held out."""
     t = 0.01 * np.arange(STEPS + 1)
     torque = np.sin(6 * t)[:, None]
-    options = options or ProblemOptions(tracking_filter="proportional", tracking_filter_gains=(9.0,))
+    options = options or ProblemOptions(arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,))
     stated = {"effort_std": white, "effort_bias_std": bias, "position_std": ANGLE, "effort_kind": "command"}
     joints = JointGroup(("shoulder",), t, np.zeros((STEPS + 1, 1)), effort=torque, **stated)
     first = Recording(joints, (), name="first")
-    bare = replace(options, tracking_filter="none", tracking_filter_gains=None)
+    bare = replace(options, arm_tracking_feedback="none", arm_tracking_feedback_gains=None)
     made = EstimationProblem(step, [first], ("elbow.stiffness",), bare)
     episode = made.episodes[0]
     swept = made.predictor.predict_episode(
-        episode, *made.theta_and_initial_state_offset(made.initial_unknowns, 0), False
+        episode, *made.theta_and_initial_state_deviation(made.initial_unknowns, 0), False
     )
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
     recordings = [replace(first, joints=joints, name=name) for name in ("first", "second")]
@@ -146,7 +146,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
 def simulated(problem, seeds):
     episode = problem.episodes[0]
     outcome = problem.predictor.predict_episode(
-        episode, *problem.theta_and_initial_state_offset(problem.initial_unknowns, 0), False
+        episode, *problem.theta_and_initial_state_deviation(problem.initial_unknowns, 0), False
     )
     known = (problem.predictor, episode, outcome, problem.theta)
     return [recording_from_prediction(*known, seed).joints for seed in seeds]
@@ -162,7 +162,7 @@ def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
         assert (group.effort_std, group.effort_bias_std, group.position_std) == (WHITE, OFFSET, ANGLE)
     # settings come before what the recording says
     sensors = {"joints.effort": SensorOptions(std={"shoulder": 0.4}, bias_std=0.7)}
-    options = ProblemOptions(tracking_filter="proportional", tracking_filter_gains=(9.0,), sensors=sensors)
+    options = ProblemOptions(arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,), sensors=sensors)
     [made] = simulated(problem_of(step, options=options), [1])
     assert (made.effort_std, made.effort_bias_std) == (0.4, 0.7)
 

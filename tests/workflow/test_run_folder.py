@@ -217,7 +217,7 @@ def kinds(monkeypatch):
     before = set(EFFECTS)
     monkeypatch.setattr(run_inputs, "_loaded", {})
     yield before
-    EFFECTS.unregister(set(EFFECTS) - before)
+    EFFECTS.unregister_names(set(EFFECTS) - before)
 
 
 def configured(file, *names):

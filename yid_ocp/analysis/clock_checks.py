@@ -25,7 +25,7 @@ from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import SensorMeasurements
 
 # From times on the joints' clock (N,) to places (N, np, 3) [m].
 PositionsAtTimes = Callable[[Array], Array]
@@ -204,7 +204,7 @@ def search_clock_offset_and_drift(
     return float(fine.x[0]), float(fine.x[1]) / span
 
 
-def check_fit_for_drift_and_noise(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
+def drift_and_overstated_noise_issues(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
     """New data-quality issues found in the residuals of a fit: drifting clocks and overstated noise.
 
     A constant offset of a camera's clock looks like damping that the model lacks; to tell the two is a diagnosis's task
@@ -235,11 +235,11 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             at, t = slice(slices[k].start - own.start, slices[k].stop - own.start), times[own]
             span = float(np.min(t[at])), float(np.max(t[at]))
             columns = np.zeros((len(t), 3))  # the first is for what a filter expects, which is no derivative
-            speed = _by_lateness(problem, x, i, samples, result)[samples.used_output_mask]
+            speed = _by_lateness(problem, x, i, samples, result)[samples.positive_weight_mask]
             columns[at, 1:] = _by_clock(t[at], speed, span)
             whitening = problem.whitening_filters[i]
             if whitening is not None:
-                columns = whitening.whiten(columns, None)[0]
+                columns = whitening.whiten_and_estimate_torque_bias(columns, None)[0]
             jacobian = evaluation.jacobian[own] * problem.unknown_scales
             error = _clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
             limit = _offset_tolerance(joints, group)
@@ -248,16 +248,16 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
 
 
 def _by_lateness(
-    problem: EstimationProblem, x: Array, i: int, samples: Measurements, result: EpisodePrediction
+    problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction
 ) -> Array:
     """Whitened prediction less measurement per second that the stamps are late, shape (M, k)."""
-    shared, _ = problem.theta_and_initial_state_offset(x, i)
+    shared, _ = problem.theta_and_initial_state_deviation(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     state = result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameters)))
     steps = np.ones(samples.value.shape[1])
     ahead, behind = (
-        problem.predictor.readings_along_trajectory(samples.shifted_earlier_by(s * steps), state, none, theta)[0]
+        problem.predictor.readings_along_trajectory(samples.shifted_earlier_by_steps(s * steps), state, none, theta)[0]
         for s in (-1.0, 1.0)
     )
     return np.asarray(samples.weight * (ahead - behind) / (2 * problem.step.time_step))
@@ -283,7 +283,7 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
             continue
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
-        usual = float(np.median(np.concatenate([s.std[s.used_output_mask] for s in own])))
+        usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
         leaves = f"the fit leaves {seen * usual:.2g} {unit} of {group}, all slow errors counted"
         words = f"{leaves}; {usual:.2g} {unit} is stated"

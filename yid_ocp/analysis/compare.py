@@ -19,7 +19,7 @@ from yid_ocp.inference.linearized_residual import solve_step_within_unknown_size
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
-    VERDICT_PREDICATES,
+    VERDICT_SENTENCE_TEXTS,
     VERDICT_TABLE_TEXTS,
     ParameterEstimate,
     interval_text,
@@ -150,7 +150,7 @@ def _explanations(
             continue
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
-        said = VERDICT_PREDICATES[reference.verdict]
+        said = VERDICT_SENTENCE_TEXTS[reference.verdict]
         sentences.append(f"{name}{known} {said}: where it ends is the method's choice ({places})")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
     return sentences + [_descent_errors(run, judged, truth, disturbed) for run in descents]
@@ -223,7 +223,7 @@ class ChosenCableMemoryFit:
     message: str = ""
 
 
-def decide_cable_memory(
+def choose_cable_memory_fit(
     problem: EstimationProblem,
     solver: Solver,
     solution: Solution,
@@ -258,7 +258,7 @@ def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProble
     """The problem with the cable's memory parameters fixed at zero."""
     memory = _memory_parameters(problem)
     free = tuple(name for name in problem.free if name not in (*memory, MEMORY_HALVING_SPEED_PARAMETER_NAME))
-    return problem.with_compiled_parameters_free(free).with_parameter_values(dict.fromkeys(memory, 0.0))
+    return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))
 
 
 def _memory_parameters(problem: EstimationProblem) -> list[str]:
@@ -285,7 +285,7 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
             problem, solution.x, evaluation.jacobian[kept], evaluation.residual[kept], 1e-10
         )
         x = np.clip(solution.x + step, *problem.bounds)
-        parts = problem.theta_and_initial_state_offset(x, i)
+        parts = problem.theta_and_initial_state_deviation(x, i)
         found = problem.predictor.predict_episode(problem.episodes[i], *parts, False)
         if isinstance(found, str):
             return np.inf
@@ -357,7 +357,7 @@ def _discrepancy(experiment: str, name: str, entry: ParameterEstimate, truth: fl
     lower, upper = entry.interval or (entry.value - 2 * entry.std, entry.value + 2 * entry.std)
     holds = (lower is None or lower <= value) and (upper is None or value <= upper)
     if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and holds):
-        known = f"in such an experiment it {VERDICT_PREDICATES[entry.verdict]}"
+        known = f"in such an experiment it {VERDICT_SENTENCE_TEXTS[entry.verdict]}"
         if interval is not None:
             return f"hardly informed; {known}, {interval_text(*interval)}, where the value lies"
         return f"not informed; {known}"

@@ -22,7 +22,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
-from yid_ocp.problem.evaluation import Evaluation, ResidualWhitener
+from yid_ocp.problem.evaluation import Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
@@ -135,21 +135,21 @@ def parameter_shifts_in_finer_model(
 class _CoarseWeights:
     """Filter of a coarser rollout, in each of whose steps `ratio` finer ones make a mean torque."""
 
-    coarse: ResidualWhitener
-    input_errors: InputErrorModel
+    coarse: ProcessNoiseWhitener
+    input_error_model: InputErrorModel
     ratio: int
 
-    def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten as the coarser filter; see `ResidualWhitener`."""
+    def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+        """Whiten as the coarser filter; see `ProcessNoiseWhitener`."""
         if push is not None:
             push = np.mean(push.reshape(-1, self.ratio, *push.shape[1:]), axis=1)
-        return self.coarse.whiten(rows, push)
+        return self.coarse.whiten_and_estimate_torque_bias(rows, push)
 
 
 def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> EstimationProblem:
     """The finer problem about the coarse one's input errors, whitened by its filters, over the same whole steps."""
     ratio, episodes = round(coarse.step.time_step / fine.step.time_step), []
-    filters: list[ResidualWhitener | None] = []
+    filters: list[ProcessNoiseWhitener | None] = []
     for own, other, whitening in zip(fine.episodes, coarse.episodes, coarse.whitening_filters, strict=True):
         errors = other.input_errors and other.input_errors.on_finer_steps(ratio)
         episodes.append(replace(truncate_episode(own, ratio * other.grid.steps), input_errors=errors))
@@ -372,13 +372,13 @@ def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> Al
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)
     for i, episode in enumerate(problem.episodes):
-        shared, offset = problem.theta_and_initial_state_offset(x, i)
+        shared, offset = problem.theta_and_initial_state_deviation(x, i)
         theta = predictor.theta_with_episode_values(episode, shared)
-        begin = predictor.initial_state(episode, theta, offset, ())
+        begin = predictor.initial_state_of_episode(episode, theta, offset, ())
         if begin.failure_message:
             continue
-        inputs = predictor.inputs_with_reference_momentum_shift(episode, theta, (), begin.state)
-        feedback = inputs.corrected_feedback(
+        inputs = predictor.inputs_with_effect_momentum_shift(episode, theta, (), begin.state)
+        feedback = inputs.feedback_with_corrected_reference(
             episode.tracking_feedback, system.driven_coordinate_indices, episode.measured_driven_angles
         )
         rollout = simulate(

@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns_by_name, with_nuisance_unknowns
-from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_information
+from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_fisher_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
@@ -70,15 +70,15 @@ class RecordedExperiment:
     @property
     def parameter_values(self) -> dict[str, float]:
         """Values of all model parameters at `x`, by name."""
-        theta, _ = self.problem.theta_and_initial_state_offset(self.x, 0)
+        theta, _ = self.problem.theta_and_initial_state_deviation(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
-    def camera_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def camera_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """The camera's point group (None: defaults are used), frame times since the start [s] and typical std [m]."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_point_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group that the arms measure (None: defaults are used), its sample times [s] and typical std [m]."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
@@ -90,7 +90,7 @@ class RecordedExperiment:
             return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
         return None, times, std
 
-    def existing_sensor_observations(self, episode: Episode) -> list[FrameObservationSchedule]:
+    def existing_point_observation_schedules(self, episode: Episode) -> list[FrameObservationSchedule]:
         """Observation schedules of the points measured in a recording, one for each point."""
         found = []
         for group in _used_point_groups(self.problem, episode):
@@ -165,7 +165,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def add_observable_frames_to_step(step: Step) -> tuple[Step, list[_ObservableFrame]]:
+def step_and_observable_frames(step: Step) -> tuple[Step, list[_ObservableFrame]]:
     """The step with all measurable frames added to its mechanism, and those frames; its equations stay the same."""
     mechanism, seen = step.system.mechanism, observable_frames(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
@@ -178,7 +178,7 @@ class CandidateExperimentSensitivities:
     """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
     Sensitivities of a frame's position at every node, by (episode, group, frame), are by the unknowns, then by the q
-    that stand for the errors of the torques that drive this episode (`point_sensitivities_and_joint_information`).
+    that stand for the errors of the torques that drive this episode (`point_sensitivities_and_fisher_information`).
     """
 
     problem: EstimationProblem  # with nuisances, and every measurable frame observed at every node
@@ -191,7 +191,7 @@ class CandidateExperimentSensitivities:
     feasibility_notes: tuple[str, ...] = ()  # obstacles on a real robot, such as joint limits
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
-    def fisher_information(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
+    def fisher_information_with_prior(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
         """Fisher information (nx, nx) of observations (one list for each recording) plus the prior information."""
         total = self.prior_information.copy()
         nx = len(total)
@@ -227,7 +227,7 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 }
 
 
-class CandidateExperimentBuilder:
+class CandidateExperimentSensitivityBuilder:
     """Builder of experiment variants from sets of mechanical changes; results are cached."""
 
     def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
@@ -235,7 +235,7 @@ class CandidateExperimentBuilder:
         self._progress = progress
         self._layouts: dict[frozenset[str], CandidateExperimentSensitivities | str] = {}
 
-    def build_experiment(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
+    def build_sensitivities(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
         """Sensitivities of the experiment with a set of mechanical changes, or a message why it cannot be built."""
         if mechanics not in self._layouts:
             if mechanics:
@@ -264,9 +264,9 @@ class CandidateExperimentBuilder:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
-        step, seen = add_observable_frames_to_step(step)
+        step, seen = step_and_observable_frames(step)
         wide = with_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
-        plain = replace(wide.options, huber_threshold=math.inf, weak_prior_std_as_factor=0.0, weighting="whitened")
+        plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
         dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}
@@ -281,7 +281,7 @@ class CandidateExperimentBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = point_sensitivities_and_joint_information(
+            points, by_joints[i] = point_sensitivities_and_fisher_information(
                 problem, evaluation, x, i, finest, encoders
             )
             slopes |= {(i, *key): value for key, value in points.items()}
@@ -307,11 +307,11 @@ class CandidateExperimentBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Least standard deviation that each group's points can have in a recording [m]."""
         finest = {}
-        samplings = self.setting.camera_sample_times_and_std, self.setting.arm_point_sample_times_and_std
+        samplings = self.setting.camera_group_times_and_std, self.setting.arm_point_group_times_and_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
-        for view in self.setting.existing_sensor_observations(episode):
+        for view in self.setting.existing_point_observation_schedules(episode):
             finest[view.point_group] = min(finest.get(view.point_group, math.inf), float(view.std.min()))
         return finest
 
@@ -374,12 +374,12 @@ class CandidateExperimentBuilder:
 
     def _welded(self, system: System, others: frozenset[str]) -> System:
         """Grasps as welds that keep the orientation in which the ends lie at the start."""
-        layout = self.build_experiment(others)
+        layout = self.build_sensitivities(others)
         if isinstance(layout, str):
             raise SolverError(layout)
         problem, n = layout.problem, system.n_coordinates
-        theta, offset = problem.theta_and_initial_state_offset(layout.x, 0)
-        start = problem.initial_state(problem.episodes[0], theta, offset)
+        theta, offset = problem.theta_and_initial_state_deviation(layout.x, 0)
+        start = problem.initial_state_of_episode(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise SolverError(start.failure_message)
         q, parameters = ca.SX.sym("q", n), problem.system.parameters
@@ -426,12 +426,10 @@ class CandidateExperimentBuilder:
         for group in _used_point_groups(base, episode):
             poses[group.name], sensors[group.name] = group.pose, group.sensor
         wanted: dict[str, dict[str, None]] = {}
-        for view in setting.existing_sensor_observations(episode):
+        for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
-        camera, arm = (
-            setting.camera_sample_times_and_std(episode)[0],
-            setting.arm_point_sample_times_and_std(episode)[0],
-        )
+        camera = setting.camera_group_times_and_std(episode)[0]
+        arm = setting.arm_point_group_times_and_std(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})

@@ -15,7 +15,7 @@ from yid_ocp.model import forward_kinematics
 from yid_ocp.model.system import MidpointState
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import channel_predictions
-from yid_ocp.problem.recorded_inputs import smoothed_joint_angles
+from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.solvers import GaussNewton, Solution
 
@@ -78,7 +78,7 @@ def cross_validate_friction_law(
     return FrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
 
 
-def left_out_error_mean_and_std_error(
+def motion_kind_mean_and_std_error(
     errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
     """Mean of the recordings' errors over kinds of motion, and its standard error."""
@@ -86,12 +86,12 @@ def left_out_error_mean_and_std_error(
     return float(np.mean(by_kind)), float(np.std(by_kind, ddof=1) / np.sqrt(len(by_kind)))
 
 
-def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
+def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
     """The first friction law of the ladder whose error is within one standard error of the smallest error.
 
     Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
     """
-    sizes = [left_out_error_mean_and_std_error(fit.left_out_errors, kinds) for fit in fits]
+    sizes = [motion_kind_mean_and_std_error(fit.left_out_errors, kinds) for fit in fits]
     least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))
     return next((fit for fit, (mean, _) in zip(fits, sizes, strict=True) if mean <= least + error), fits[0])
 
@@ -126,8 +126,8 @@ def friction_torque_clouds(
         joints = episode.recording.joints
         assert joints is not None
         low_pass = LowPassFilter(problem.options.path_cutoff)
-        path = smoothed_joint_angles(joints, driven, episode.grid, episode.name, low_pass)
-        theta, _ = problem.theta_and_initial_state_offset(solution.x, i)
+        path = smoothed_joint_angles_at_nodes(joints, driven, episode.grid, episode.name, low_pass)
+        theta, _ = problem.theta_and_initial_state_deviation(solution.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, theta)
         inputs = problem.predictor.corrected_inputs(episode, theta, ())
         shift = inputs.driven_angles - episode.measured_driven_angles
@@ -155,7 +155,7 @@ def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: 
     step = problem.step
     n, none = step.sizes["n"], np.zeros((len(torque), 0))
     state = np.hstack([q, np.zeros((len(q), n))])
-    found = step.kernel.linearize(theta, state, none, torque, (), False)
+    found = step.kernel.linearize_step_equations(theta, state, none, torque, (), False)
     return np.asarray((found.residual[1:, :n] + found.p1[:-1]) / step.time_step)
 
 

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.profile import (
     ParameterProfileLikelihood,
-    apply_to_parameters_at_optimum,
     compute_profile_likelihood_interval,
-    mark_unidentifiable_small_estimate,
+    mark_unidentifiable_near_zero_estimate,
+    results_by_parameter_at_optimum,
 )
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
@@ -35,7 +35,7 @@ from yid_ocp.inference.uncertainty import (
     parameter_estimates,
     parameter_unknown_names,
     parameter_verdict,
-    percent_text,
+    percent_number_text,
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
     value_and_uncertainty_text,
@@ -106,13 +106,13 @@ class IdentifiabilityResult(ReprMixin):
     chi2_per_dof: float  # at the point; above one, its root scales standard deviations at a fit
     profiles: Mapping[str, ParameterProfileLikelihood] = field(default_factory=dict)
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         rows = [("parameter", "value", "unit", "")]
         for name, entry in self.parameters.items():
             value = value_and_uncertainty_text(entry.value, finite_or_none(entry.std), None)
             rows.append((name, value, entry.unit, VERDICT_TABLE_TEXTS[entry.verdict]))
         found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
-        return ReprSummary(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
+        return ReprTexts(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
 
     @property
     def unidentifiable_directions(self) -> tuple[_ParameterDirection, ...]:
@@ -206,11 +206,11 @@ def _profiles(
     def one(name: str, best: Array, there: Evaluation) -> tuple[ParameterProfileLikelihood, ParameterEstimate]:
         index, size, entry = problem.unknown_names.index(name), sizes[name.split("[")[0]], judged[name]
         found = compute_profile_likelihood_interval(problem, best, index, float(entry.std), there)
-        said = mark_unidentifiable_small_estimate(problem, best, index, entry, size, there)
+        said = mark_unidentifiable_near_zero_estimate(problem, best, index, entry, size, there)
         return found, with_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    pairs = apply_to_parameters_at_optimum(one, problem, view.x, wanted, progress)
+    pairs = results_by_parameter_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
 
@@ -452,7 +452,7 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
     how = "is seen" if spread <= MAX_IDENTIFIABLE_RELATIVE_STD else "is seen only weakly"
     joint = "a joint change of " if len(parts) > 1 else ""
-    return f"{joint}{_joined([part.name for part in parts])} {how} (± {percent_text(spread)} %)"
+    return f"{joint}{_joined([part.name for part in parts])} {how} (± {percent_number_text(spread)} %)"
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:

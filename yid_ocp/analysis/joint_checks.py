@@ -128,7 +128,7 @@ class RecordedJointsModel:
         return full
 
     def _numbers(self, expression: ca.SX) -> ca.SX:
-        internal = self.system.internal_coordinate_symbols.values()
+        internal = self.system.effect_internal_coordinate_symbols.values()
         symbols = ca.vertcat(self.system.parameters.symbols, *internal)
         return ca.substitute(expression, symbols, ca.SX(ca.DM([*self.theta, *([0.0] * len(internal))])))
 

@@ -274,7 +274,7 @@ def check_point_distances(
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
-def check_object_points_by_rollout(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
+def check_object_points_against_rollout(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
     """Yield issues about points far from the rollout at initial parameters, relative to the object's `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
@@ -316,7 +316,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 def check_cable_point_geometry(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
     """Yield issues about cable points with edge lengths unlike the undeformed shape or positions above the clamps."""
     for group in recording.points:
-        at = {name: group.position[:, group.names.index(name)] for name in cable.vertices if name in group.names}
+        at = {name: group.position[:, group.names.index(name)] for name in cable.vertex_names if name in group.names}
         edges = [edge for edge in cable.edges if edge[0] in at and edge[1] in at]
         if len(edges) < 3:
             continue
@@ -365,7 +365,7 @@ def _upside_down(
     """A cable that rises between its clamps by more than its own shape does: gravity points the other way."""
     pull = float(np.linalg.norm(gravity))
     free = [name for name in cable.free_vertex_names if name in at]
-    ends = [name for name in (cable.points_along_parent_branch[0], cable.points_along_parent_branch[-1]) if name in at]
+    ends = [name for name in (cable.parent_branch_point_names[0], cable.parent_branch_point_names[-1]) if name in at]
     if pull == 0 or len(ends) < 2 or not free:
         return None
     up = -gravity / pull

@@ -26,7 +26,7 @@ from yid_ocp.inference.uncertainty import (
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
+from yid_ocp.progress import NULL_PROGRESS, PartsDoneCounter, Progress
 from yid_ocp.solvers import GaussNewton, Solution
 
 log = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ def solution_with_profile_intervals(
     """The solution with profile-likelihood intervals and consistent verdicts for weakly determined parameters.
 
     There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
-    (`mark_unidentifiable_small_estimate`). Unchanged where the problem is too large for profiles.
+    (`mark_unidentifiable_near_zero_estimate`). Unchanged where the problem is too large for profiles.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
@@ -112,7 +112,7 @@ def solution_with_profile_intervals(
 
     def judged(name: str, best: Array, there: Evaluation) -> ParameterEstimate:
         index, size = problem.unknown_names.index(name), asked[name]
-        entry = mark_unidentifiable_small_estimate(problem, best, index, solution.parameters[name], size, there)
+        entry = mark_unidentifiable_near_zero_estimate(problem, best, index, solution.parameters[name], size, there)
         if entry.verdict != "not_identifiable" and not needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
             entry = with_profile_interval(entry, profile.interval, size)
@@ -120,11 +120,11 @@ def solution_with_profile_intervals(
 
     # of every parameter about one and a half times as long as the solution took
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood", 7.5 * len(asked), 5.2)
-    found = apply_to_parameters_at_optimum(judged, problem, solution.x, tuple(asked), progress)
+    found = results_by_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def apply_to_parameters_at_optimum(
+def results_by_parameter_at_optimum(
     judged: Callable[[str, Array, Evaluation], _Found],
     problem: EstimationProblem,
     x: Array,
@@ -133,7 +133,7 @@ def apply_to_parameters_at_optimum(
 ) -> dict[str, _Found]:
     """Results of `judged(name, unknowns, evaluation)` at the optimum near `x` for each name, computed in parallel."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
-    there, parts = problem.evaluate(best), ParallelProgress(progress, len(names), names[0])
+    there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 
     def one(name: str) -> _Found:
         found = judged(name, best, there)
@@ -143,7 +143,7 @@ def apply_to_parameters_at_optimum(
     return dict(zip(names, map_with_batched_calls(one, names), strict=True))
 
 
-def mark_unidentifiable_small_estimate(
+def mark_unidentifiable_near_zero_estimate(
     problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
 ) -> ParameterEstimate:
     """The estimate, marked `not_identifiable` if it is small and the data do not exclude its typical size (99.9 %).

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
@@ -35,7 +35,7 @@ class CheckedStepLinearisation:
     finite_difference_errors: dict[str, float]  # largest, by matrix, as a fraction of its largest entry
 
 
-def step_size_summary(step: Step) -> dict[str, Any]:
+def step_complexity_summary(step: Step) -> dict[str, Any]:
     """Sizes of a step: vector lengths, number of unknowns, Jacobian nonzeros, and operations of its functions.
 
     `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
@@ -49,7 +49,9 @@ def step_size_summary(step: Step) -> dict[str, Any]:
     return {"sizes": step.sizes, **counts, "functions": found}
 
 
-def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> CheckedStepLinearisation:
+def checked_step_linearisation(
+    step: Step, state: Array, torque: Array, theta: Array, path: Array
+) -> CheckedStepLinearisation:
     """Linearise a step at a state (nx,) (A_k, B_k) and compare it with central finite differences.
 
     The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
@@ -80,12 +82,14 @@ def linearise_step_equations(
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
-    return step.kernel.linearize(theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True)
+    return step.kernel.linearize_step_equations(
+        theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True
+    )
 
 
 def system_with_numeric_parameters(system: System, theta: Array) -> System:
     """The system with numeric parameter values in place of symbols, and internal coordinates at zero."""
-    inner = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
+    inner = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])
 
@@ -167,9 +171,9 @@ class ParameterDetectability:
         return f"{said}, {len(seen)} of which sensors see to first order ({_summarize_rows(seen)}){best}"
 
 
-def parameter_rows_and_sensor_responses(
+def parameter_detectabilities(
     step: Step,
-    symbols: StepSymbols,
+    symbols: NamedStepEquations,
     episode: Episode | None,
     state: Array,
     theta: Array,
@@ -183,7 +187,7 @@ def parameter_rows_and_sensor_responses(
     """
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
-    for row, column in zip(*symbols.jacobian_sparsity_pattern.get_triplet(), strict=True):
+    for row, column in zip(*symbols.full_jacobian_sparsity_pattern.get_triplet(), strict=True):
         if at.start <= column < at.stop:
             entered[column - at.start].append(row)
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
@@ -229,9 +233,9 @@ def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_
     system, n, found = step.system, step.system.n_coordinates, []
     at = {"q": state[:n], "z": state[2 * n :], "theta": theta}
     for samples in episode.measurements:
-        known = np.where(np.isfinite(samples.std) & samples.used_output_mask, samples.std, np.nan)
+        known = np.where(np.isfinite(samples.std) & samples.positive_weight_mask, samples.std, np.nan)
         if np.any(np.isfinite(known)):
-            used = np.any(samples.used_output_mask, axis=0)
+            used = np.any(samples.positive_weight_mask, axis=0)
             std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
             function = sensor_reading_function(system, samples.sensor, system.parameters.names)
             by = {name: np.array(ca.densify(x)) / std[:, None] for name, x in function(**at).items()}
@@ -329,7 +333,7 @@ def _pattern(
     return SparsityPattern(name, title, mask, row_spans, column_spans, row_labels, column_labels)
 
 
-def _blocks(symbols: StepSymbols, *wanted: str, kept: Sequence[int] | None = None) -> list[_Block]:
+def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | None = None) -> list[_Block]:
     """Blocks of a step by name, only the kept entries of the first one."""
     blocks = {block.name: block.labels for block in (*symbols.row_blocks, *symbols.column_blocks)}
     found = [(name, blocks[name]) for name in wanted]
@@ -338,13 +342,13 @@ def _blocks(symbols: StepSymbols, *wanted: str, kept: Sequence[int] | None = Non
     return found
 
 
-def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
+def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
     """Structural sparsity patterns of one step's matrices, by name.
 
     `dR_dy`, residual by unknowns; `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` by the implicit function theorem;
     `dR_dtheta`, all rows by the parameters.
     """
-    whole = _mask(symbols.jacobian_sparsity_pattern)
+    whole = _mask(symbols.full_jacobian_sparsity_pattern)
     system = symbols.equations.system
     free = list(system.unprescribed_coordinate_indices)
     joints = system.mechanism.joint_names
@@ -370,7 +374,7 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
         full[known] = y
         direct = np.hstack([block("p1", column) for column in columns])
         p1 = direct | _times(np.hstack([block("p1", c) for c in ("q1", "z1", "lam")]), full)
-        nz = len(system.internal_coordinate_symbols)
+        nz = len(system.effect_internal_coordinate_symbols)
         return np.vstack([full[:nc], p1, full[nc : nc + nz]])
 
     unknowns = _blocks(symbols, "q1", "z1", "lam", kept=free)
@@ -440,7 +444,11 @@ class _NlpStage(NamedTuple):
 
 
 def nlp_stage_sparsity(
-    symbols: StepSymbols, free: Sequence[str], sensors: Sequence[Sensor], followed: Sequence[int], loose: Sequence[int]
+    symbols: NamedStepEquations,
+    free: Sequence[str],
+    sensors: Sequence[Sensor],
+    followed: Sequence[int],
+    loose: Sequence[int],
 ) -> _NlpStage:
     """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.symbolic_transcription`.
 

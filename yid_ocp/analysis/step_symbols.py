@@ -11,7 +11,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.integrator.discrete import DiscreteEquations
 
@@ -222,7 +222,7 @@ class EquationOrDerivativeFormula:
 
 
 @dataclass(frozen=True, repr=False)
-class StepSymbols(ReprMixin):
+class NamedStepEquations(ReprMixin):
     """Symbolic equations of one time step, with named rows (equations) and columns (variables).
 
     Rows are in the blocks `del` (DEL equations; at a prescribed coordinate what is left is -h times its effort),
@@ -234,17 +234,17 @@ class StepSymbols(ReprMixin):
     row_blocks: tuple[SymbolBlock, ...]
     column_blocks: tuple[SymbolBlock, ...]
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         blocks = (*self.row_blocks, *self.column_blocks)
         rows = [("block", "entries", "meaning"), *((b.name, str(len(b.full_names)), b.meaning) for b in blocks)]
         count = count_with_noun(sum(len(block.full_names) for block in self.row_blocks), "equation")
-        return ReprSummary(f"{count} of a step of {self.equations.system.mechanism.name}", rows)
+        return ReprTexts(f"{count} of a step of {self.equations.system.mechanism.name}", rows)
 
     @staticmethod
-    def from_equations(equations: DiscreteEquations) -> StepSymbols:
+    def from_equations(equations: DiscreteEquations) -> NamedStepEquations:
         """Build the named rows and columns from the discrete equations of a step."""
         e, system = equations, equations.system
-        joints, internal = system.mechanism.joint_names, tuple(system.internal_coordinate_symbols)
+        joints, internal = system.mechanism.joint_names, tuple(system.effect_internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
         k, after = r"_{k,\,#}", r"_{k+1,\,#}"
         rows = (
@@ -264,7 +264,7 @@ class StepSymbols(ReprMixin):
             SymbolBlock("z1", internal, e.z1, "internal coordinates after the step", "z" + after),
             SymbolBlock("lam", closed, e.lam, "multipliers of the grasps", r"\lambda" + k),
         )
-        return StepSymbols(equations, rows, columns)
+        return NamedStepEquations(equations, rows, columns)
 
     @property
     def row_names(self) -> tuple[str, ...]:
@@ -286,7 +286,7 @@ class StepSymbols(ReprMixin):
         return ca.vertcat(*(block.expressions for block in self.column_blocks))
 
     @cached_property
-    def jacobian_sparsity_pattern(self) -> ca.Sparsity:
+    def full_jacobian_sparsity_pattern(self) -> ca.Sparsity:
         """Sparsity of the Jacobian of all rows (equations) with respect to all columns (variables)."""
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
         return found

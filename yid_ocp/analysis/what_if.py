@@ -14,8 +14,8 @@ from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
     MECHANICAL_CHANGE_DESCRIPTIONS,
-    CandidateExperimentBuilder,
     CandidateExperimentSensitivities,
+    CandidateExperimentSensitivityBuilder,
     FrameObservationSchedule,
     RecordedExperiment,
     observable_frames,
@@ -23,7 +23,7 @@ from yid_ocp.analysis.experiment_design import (
 )
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 from yid_ocp.model.system import System
@@ -90,12 +90,12 @@ class ExperimentRanking(ReprMixin):
     greedy_sequence: tuple[ChangedExperimentResult, ...]
     n_evaluated_sets: int
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         shown = (self.unchanged_experiment, *self.single_changes)
         rows = [("change", "parameters found", "gain [nat]")]
         rows += [(entry.description, str(entry.identifiable), f"{entry.gain:.3g}") for entry in shown]
         count = count_with_noun(len(self.single_changes), "change")
-        return ReprSummary(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
+        return ReprTexts(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 
 
 # From sets of changes and a factor on the stated variances to the predicted results, one for each set.
@@ -130,7 +130,7 @@ def what_if(
     considered_changes : collection of str, optional
         Names of changes to consider, all when absent.
     evaluate_changes : callable, optional
-        Evaluates sets of changes by `evaluate_change_sets`, in other processes for example; in this one when absent.
+        Does what `evaluate_experiment_change_sets` does, in other processes for example; in this one when absent.
     """
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
@@ -147,7 +147,7 @@ def what_if(
     return ExperimentRanking(base, tuple(singles), tuple(smallest), tuple(greedy), len(outcomes.known))
 
 
-def evaluate_change_sets(
+def evaluate_experiment_change_sets(
     setting: RecordedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
     """Predicted result of each set of named changes, with stated variances multiplied by `inflation`."""
@@ -214,7 +214,7 @@ class _Outcomes:
         judge: ChangeSetEvaluator | None = None,
     ) -> None:
         self.setting, self.inflation, self.progress = setting, inflation, progress
-        self.builder = CandidateExperimentBuilder(setting, progress)
+        self.builder = CandidateExperimentSensitivityBuilder(setting, progress)
         self.judge = judge or self._judged
         self.known: dict[frozenset[str], ChangedExperimentResult] = {}
 
@@ -222,11 +222,9 @@ class _Outcomes:
     def possible(self) -> list[ExperimentChange]:
         """All single changes that apply to the experiment."""
         setting, episode = self.setting, self.setting.problem.episodes[0]
-        camera, arm = (
-            setting.camera_sample_times_and_std(episode)[0],
-            setting.arm_point_sample_times_and_std(episode)[0],
-        )
-        views = setting.existing_sensor_observations(episode)
+        camera = setting.camera_group_times_and_std(episode)[0]
+        arm = setting.arm_point_group_times_and_std(episode)[0]
+        views = setting.existing_point_observation_schedules(episode)
         groups = ("" if group is None else group.name for group in (camera, arm))
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
         names = self.builder.applicable_mechanical_changes()
@@ -263,11 +261,11 @@ class _Outcomes:
     def _outcome(self, changes: Sequence[ExperimentChange]) -> ChangedExperimentResult:
         names, words = tuple(change.name for change in changes), _words(changes)
         mechanics = frozenset(change.mechanical_change for change in changes if change.mechanical_change)
-        layout = self.builder.build_experiment(mechanics)
+        layout = self.builder.build_sensitivities(mechanics)
         if isinstance(layout, str):
             return ChangedExperimentResult(names, words, {}, {}, 0, -math.inf, layout)
         views = [self._views(episode, changes, layout) for episode in self.setting.problem.episodes]
-        std, gain = _relative_stds_and_gain(layout, layout.fisher_information(views) / self.inflation)
+        std, gain = _relative_stds_and_gain(layout, layout.fisher_information_with_prior(views) / self.inflation)
         verdicts = {name: parameter_verdict(1.0, value) for name, value in std.items()}
         count = sum(said == "identifiable" for said in verdicts.values())
         return ChangedExperimentResult(names, words, std, verdicts, count, gain, "; ".join(layout.feasibility_notes))
@@ -276,8 +274,8 @@ class _Outcomes:
         self, episode: Episode, changes: Sequence[ExperimentChange], layout: CandidateExperimentSensitivities
     ) -> list[FrameObservationSchedule]:
         setting = self.setting
-        camera, times, std = setting.camera_sample_times_and_std(episode)
-        arm, arm_times, arm_std = setting.arm_point_sample_times_and_std(episode)
+        camera, times, std = setting.camera_group_times_and_std(episode)
+        arm, arm_times, arm_std = setting.arm_point_group_times_and_std(episode)
         looking, feeling = CAMERA_GROUP if camera is None else camera.name, ARM_GROUP if arm is None else arm.name
         rate = next((change.camera_rate for change in changes if change.camera_rate is not None), None)
         if rate is not None:
@@ -290,7 +288,7 @@ class _Outcomes:
         held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
         views = [
             look(view.frame) if view.point_group == looking and rate is not None else view
-            for view in setting.existing_sensor_observations(episode)
+            for view in setting.existing_point_observation_schedules(episode)
             if view.point_group != looking or view.frame not in held - before
         ]
         views += [look(change.camera_frame) for change in changes if change.camera_frame]

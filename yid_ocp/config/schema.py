@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from yid_ocp import options
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.errors import ConfigError, unknown_name_details
+from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class SectionVariants:
             what = f"the key '{self.selector_key}' is missing"
             return ConfigError(what, where=where, allowed=", ".join(self.classes))
         what = f"there is no {self.variant_noun} '{word}'"
-        return ConfigError(what, where=where, **unknown_name_details(str(word), self.classes))
+        return ConfigError(what, where=where, **unknown_name_error_arguments(str(word), self.classes))
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
@@ -72,7 +72,7 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
 
 def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
     """The error for an unknown key, with the nearest allowed key and the sections that have this key."""
-    said = unknown_name_details(name, known)
+    said = unknown_name_error_arguments(name, known)
     homes = list(dict.fromkeys(_sections_with_key(RunSettings, name)))
     hints = [said["hint"]] if said["hint"] else []
     hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []

@@ -16,7 +16,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
-from yid_ocp.data.recording import RecordedOrNominalTimes
+from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError
@@ -59,11 +59,11 @@ class FrameSettings(MountSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClampSettings:
+class MeasuredClampSettings:
     """A massless clamp frame whose prescribed motion follows two recorded points."""
 
-    origin_point: Annotated[str, OptionInfo("point at which the clamp's origin sits")]
-    z_axis_point: Annotated[str, OptionInfo("point to which its z axis looks, never along the world's x axis")]
+    origin_point_name: Annotated[str, OptionInfo("point at which the clamp's origin sits")]
+    z_axis_point_name: Annotated[str, OptionInfo("point to which its z axis looks, never along the world's x axis")]
     roll_convention: Annotated[
         Literal["level", "transported"],
         OptionInfo("what two points do not tell: x axis across the world's y, or no turn about z from the start on"),
@@ -126,7 +126,7 @@ class JointActuationSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrictionSettings:
+class FrictionLawSettings:
     """Friction law of the robot's joints; the amount of friction is estimated."""
 
     law: Annotated[
@@ -150,8 +150,8 @@ class ModelSettings:
             "null for an object held by the world or by clamps"
         ),
     ] = None
-    clamps: Annotated[
-        Mapping[str, ClampSettings],
+    moving_clamps: Annotated[
+        Mapping[str, MeasuredClampSettings],
         OptionInfo("what moves an object without a robot, by name; a cable has its own at both ends"),
     ] = field(default_factory=dict)
     arms: Annotated[JointActuationSettings, OptionInfo("the robot's joints")] = JointActuationSettings()
@@ -179,7 +179,7 @@ class ModelSettings:
         ),
     ] = 0.05
     friction: Annotated[
-        FrictionSettings | None, OptionInfo("ordinary friction of the joints, its amplitudes and damping free")
+        FrictionLawSettings | None, OptionInfo("ordinary friction of the joints, its amplitudes and damping free")
     ] = None
     gravity: Annotated[_Vector3, OptionInfo("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
     points: Annotated[_Names | None, OptionInfo("frames that sensors may see, such as T1:40%; the segments' tips")] = (
@@ -193,7 +193,7 @@ class ModelSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordingSettings:
+class RecordingsSettings:
     """Recordings for estimation, for held-out prediction and for reference."""
 
     estimate: Annotated[_Recordings, OptionInfo("to estimate on")] = ()
@@ -254,8 +254,8 @@ class ImportSettings:
         _Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent")
     ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
-    clock: Annotated[RecordedOrNominalTimes | None, OptionInfo("of a table: whether its times were measured")] = None
-    sensor_description: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
+    clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
+    point_sensor_name: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
     frame: Annotated[str | None, OptionInfo("frame of reference of the points, of a table or C3D file")] = None
 
 
@@ -329,7 +329,7 @@ class CompareSettings:
     methods: Annotated[
         Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
     ] = field(default_factory=_compared)
-    reference_paper_experiment: Annotated[
+    reference_paper_experiment_name: Annotated[
         str | None, OptionInfo("experiment of the source paper whose answer stands beside")
     ] = None
 
@@ -343,7 +343,7 @@ class VirtualFramesSettings:
     max_gripper_travel: Annotated[
         float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
     ] = 0.11
-    grasp_start_offsets: Annotated[
+    gripper_start_offsets: Annotated[
         Mapping[str, _Vector3], OptionInfo("by grasp: where it starts beside the end of the undeformed object", "m")
     ] = field(default_factory=dict)
     camera_position: Annotated[_Vector3, OptionInfo("where the camera stands", "m")] = (2.6, 0.0, 0.45)
@@ -373,7 +373,7 @@ class TrackSettings:
         OptionInfo("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
     ] = None
     length_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("of the clouds, instead of the folder's")] = None
-    background_frames: Annotated[
+    background_frames_path: Annotated[
         _FilePath | None,
         OptionInfo(
             "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
@@ -382,7 +382,7 @@ class TrackSettings:
     virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("what is filmed without frames")] = (
         VirtualFramesSettings()
     )
-    keep_frames: Annotated[
+    write_virtual_frames: Annotated[
         bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")
     ] = False
     n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("frames of which every stage is drawn")] = 2
@@ -412,7 +412,7 @@ class OutputSettings:
         _FilePath | None, OptionInfo("in which run folders are made; `runs` in the working folder")
     ] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
-    discretisation_check: Annotated[
+    discretisation_check_mode: Annotated[
         Literal["none", "time_step", "both"] | None,
         OptionInfo(
             "what `solve` refines to see how far estimates move: the time step, the links as well; both for an object "
@@ -430,7 +430,7 @@ class RunSettings:
         tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are run")
     ] = ()
     model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = ModelSettings()
-    recordings: Annotated[RecordingSettings, OptionInfo("the data")] = RecordingSettings()
+    recordings: Annotated[RecordingsSettings, OptionInfo("the data")] = RecordingsSettings()
     import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()
     sensors: Annotated[
         Mapping[str, SensorOptions],

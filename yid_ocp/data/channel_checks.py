@@ -32,7 +32,7 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
     """Group, channel, times and values (N,) or (N, 3) of what was measured."""
     joints = recording.joints
     if joints is not None:
-        for quantity, values in joints.channels.items():
+        for quantity, values in joints.values_by_channel.items():
             for j, name in enumerate(joints.names if quantity in wanted else ()):
                 yield "joints", f"{quantity}.{name}", joints.t, values[:, j]
     for group in recording.points if "points" in wanted else ():

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_for_group_name
 
-RecordedOrNominalTimes = Literal["recorded", "nominal"]
+ClockKind = Literal["recorded", "nominal"]
 
 JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position": "rad",
@@ -91,7 +91,7 @@ class JointGroup(ReprMixin):
     position_resolution: float | Array | None = None
     proportional_gain: float | Array | None = None
     effort_kind: EffortSamplingKind | None = None
-    clock: RecordedOrNominalTimes = "recorded"
+    clock: ClockKind = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -101,7 +101,7 @@ class JointGroup(ReprMixin):
                 object.__setattr__(self, name, _constant(getattr(self, name), f"joints, attribute {name}"))
 
     @property
-    def channels(self) -> dict[str, Array]:
+    def values_by_channel(self) -> dict[str, Array]:
         """Arrays (N, nj) of the recorded channels by name, such as `position`; units as in `JOINT_CHANNEL_UNITS`."""
         return {name: getattr(self, name) for name in JOINT_CHANNEL_UNITS if getattr(self, name) is not None}
 
@@ -110,13 +110,13 @@ class JointGroup(ReprMixin):
         """`effort_kind`, or `sample` (as robot drivers publish) if the recording does not state it."""
         return self.effort_kind or "sample"
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         count = count_with_noun(len(self.names), "joint")
         rows = [("joint",), *((name,) for name in self.names)]
-        return ReprSummary(f"{count}, {_sampled(self.t)}: {', '.join(self.channels)}", rows)
+        return ReprTexts(f"{count}, {_sampled(self.t)}: {', '.join(self.values_by_channel)}", rows)
 
     def _rows(self, rows: BoolArray) -> JointGroup:
-        changes: dict[str, Any] = {name: value[rows] for name, value in self.channels.items()}
+        changes: dict[str, Any] = {name: value[rows] for name, value in self.values_by_channel.items()}
         return replace(self, t=self.t[rows], **changes)
 
 
@@ -149,7 +149,7 @@ class PointGroup(ReprMixin):
     sensor: str = "unknown"
     frame: str = "world"
     pose: Array | None = None
-    clock: RecordedOrNominalTimes = "recorded"
+    clock: ClockKind = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -158,11 +158,11 @@ class PointGroup(ReprMixin):
             object.__setattr__(self, "std", np.full(self.position.shape, float(self.std)))
             _freeze_arrays(self, ("std",))
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         seen = np.isfinite(self.position).all(axis=2).sum(axis=0)
         rows = [("point", "seen"), *((name, str(count)) for name, count in zip(self.names, seen, strict=True))]
         count = count_with_noun(len(self.names), "point")
-        return ReprSummary(f"{self.name}, {count}, {_sampled(self.t)}, in {self.frame}", rows)
+        return ReprTexts(f"{self.name}, {count}, {_sampled(self.t)}, in {self.frame}", rows)
 
     def _rows(self, rows: BoolArray) -> PointGroup:
         std = None if self.std is None else self.std[rows]
@@ -171,7 +171,7 @@ class PointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorChannelGroup(ReprMixin):
-    """Samples of a further sensor, such as a wrist or current sensor, on one clock; channels as in `ChannelKind`.
+    """Samples of a further sensor, such as a current sensor, on one clock; channels as in `ChannelSpecification`.
 
     Arrays are copied, made float64 and read-only.
 
@@ -195,7 +195,7 @@ class SensorChannelGroup(ReprMixin):
     t: Array
     values_by_quantity: Mapping[str, Array]
     stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
-    clock: RecordedOrNominalTimes = "recorded"
+    clock: ClockKind = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -205,9 +205,9 @@ class SensorChannelGroup(ReprMixin):
         object.__setattr__(self, "values_by_quantity", values)
         object.__setattr__(self, "stds_by_attribute", stds)
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         quantities = ", ".join(self.values_by_quantity)
-        return ReprSummary(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
+        return ReprTexts(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
 
     def _rows(self, rows: BoolArray) -> SensorChannelGroup:
         values = {key: value[rows] for key, value in self.values_by_quantity.items()}
@@ -216,7 +216,7 @@ class SensorChannelGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(ReprMixin):
-    """One recording of a robot or a virtual experiment, in SI units; unchecked until `validate_recording`.
+    """One recording of a robot or a virtual experiment, in SI units; unchecked until `validated_recording`.
 
     Attributes
     ----------
@@ -250,15 +250,17 @@ class Recording(ReprMixin):
         if self.marker_reference_pose is not None:
             object.__setattr__(self, "marker_reference_pose", read_only_array(self.marker_reference_pose, "straight"))
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         names = {"joint": self.joint_names, "point": self.point_names}
         counts = " and ".join(count_with_noun(len(own), noun) for noun, own in names.items())
         rows = [("group", "names", "samples", "channels")]
         for g in self.all_groups:
-            channels = g.channels if isinstance(g, JointGroup) else getattr(g, "values_by_quantity", ("position",))
+            channels = (
+                g.values_by_channel if isinstance(g, JointGroup) else getattr(g, "values_by_quantity", ("position",))
+            )
             rows.append((g.name, ", ".join(g.names), _sampled(g.t), ", ".join(channels)))
         span = f", {self.duration:.4g} s" if self.all_groups else ""
-        return ReprSummary(f"'{self.name}', {counts}{span}", rows)
+        return ReprTexts(f"'{self.name}', {counts}{span}", rows)
 
     @property
     def joint_and_point_groups(self) -> tuple[JointGroup | PointGroup, ...]:
@@ -316,7 +318,7 @@ class Recording(ReprMixin):
         return replace(self, joints=joints, points=points, channel_groups=channels, marker_reference_pose=straight)
 
 
-def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
+def validated_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
     """Check shapes, clocks, names, values and units of a recording, and return it unchanged.
 
     `allow_nan_effort` says whether `effort` and `external_effort` may hold NaN, `where` what errors call the recording,
@@ -390,7 +392,7 @@ def _freeze_arrays(group: JointGroup | PointGroup | SensorChannelGroup, names: I
 
 def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> None:
     _check_names_and_clock(joints, where)
-    for channel, value in joints.channels.items():
+    for channel, value in joints.values_by_channel.items():
         place = f"{where}/{channel}"
         _check_shape(value, (len(joints.t), len(joints.names)), place, "(N, nj)")
         is_effort = channel in ("effort", "external_effort")
@@ -513,7 +515,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         require_data(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
         require_data(count == 1, what, place, "every name once", "rename all but one")
-    clocks, place = get_args(RecordedOrNominalTimes), f"{where}, attribute clock"
+    clocks, place = get_args(ClockKind), f"{where}, attribute clock"
     require_data(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))

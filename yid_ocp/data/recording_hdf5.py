@@ -33,9 +33,9 @@ from yid_ocp.data.recording import (
     SensorChannelGroup,
     read_only_array,
     require_data,
-    validate_recording,
+    validated_recording,
 )
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.sensors import CHANNEL_KINDS
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 
@@ -56,7 +56,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     ------
     DataError
         If the file is missing, not HDF5 or damaged, of another format, has a group, dataset, attribute or unit that
-        the format does not know, lacks one that it needs, or fails `validate_recording`.
+        the format does not know, lacks one that it needs, or fails `validated_recording`.
     """
     path = Path(path)
     digest = files.file_sha256(path)
@@ -65,15 +65,15 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     require_data(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
     with open_hdf5_after_read_check(path) as file:
         recording = _from_file(file, path, digest)
-    return validate_recording(recording, allow_nan_effort=allow_nan_effort, where=str(path))
+    return validated_recording(recording, allow_nan_effort=allow_nan_effort, where=str(path))
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Check a recording and write it atomically as a `yid-recording/1` file; efforts may hold NaN.
 
-    Errors as `validate_recording`, and `OutputError` where the file cannot be written; an older one is left as it was.
+    Errors as `validated_recording`, and `OutputError` where the file cannot be written; an older one is left as it was.
     """
-    validate_recording(recording, allow_nan_effort=True)
+    validated_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:
         file.attrs.update(format=_RECORDING_FORMAT, description=recording.description, source=recording.source)
         if recording.notes:
@@ -165,7 +165,7 @@ def _read_group(
     ):
         for name in sorted(found - set(known)):
             what = f"the format has no {noun} '{name}' here"
-            raise DataError(what, where=where, **unknown_name_details(name, known))
+            raise DataError(what, where=where, **unknown_name_error_arguments(name, known))
         for name in sorted(wanted - found):
             raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
     both = "std" in group and "std" in group.attrs

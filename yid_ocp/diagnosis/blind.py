@@ -16,7 +16,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateChoice, make_candidate_effects
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import AllCandidatesLinearization, linearize_candidates
 from yid_ocp.diagnosis.select import held_out_gap_closure
@@ -25,10 +25,10 @@ from yid_ocp.effects.base import EffectBase, segment_elastic_joints
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import (
     INJECTABLE_EFFECT_KINDS,
-    OUT_OF_LIBRARY_EFFECTS,
+    OUT_OF_LIBRARY_FORCE_BUILDERS,
     InjectedEffect,
     run_experiment_with_effects,
 )
@@ -45,7 +45,7 @@ BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
     "finer_chain": 0.06,
 }
 """Fraction of the cases in every category."""
-ENSEMBLE_PURPOSES = ("report", "calibration")
+ALLOWED_ENSEMBLE_PURPOSES = ("report", "calibration")
 """Purposes of an ensemble; the same seed draws different cases for each."""
 _MIN_CASES_PER_EXPERIMENT = 3  # cases below which an experiment is not worth its compiled step
 
@@ -65,7 +65,7 @@ def plan_blind_cases(
     seed: int,
     weights: Mapping[str, float],
     chains: frozenset[str] = frozenset(),
-    purpose: str = ENSEMBLE_PURPOSES[0],
+    purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
     """Return `count` planned blind cases, distributed over experiments by `weights` and ordered by the seed.
 
@@ -92,7 +92,7 @@ def plan_blind_cases(
         name = max(able or kept, key=lambda entry: kept[entry] * (i + 1) - given[entry])
         given[name] += 1
         cases.append((name, *(slot if able else ("single", _DETECTABLE_MULTIPLES[1]))))
-    order = np.random.default_rng([seed, ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
+    order = np.random.default_rng([seed, ALLOWED_ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
     return [PlannedBlindCase(number, *cases[int(place)]) for number, place in enumerate(order)]
 
 
@@ -176,14 +176,14 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
 
 
 @dataclass(frozen=True)
-class SyntheticRecordingConditions:
+class SyntheticMeasurementConditions:
     """Settings of an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
 
     estimation_count: int = 1  # to estimate on; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     simulation: SimulationOptions = field(default_factory=SimulationOptions)  # duration of each, and the engine's step
     has_camera: bool = False  # whether a camera sees the object
-    purpose: str = ENSEMBLE_PURPOSES[0]  # of `ENSEMBLE_PURPOSES`
+    purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0]  # of `ALLOWED_ENSEMBLE_PURPOSES`
 
 
 _Detectable = tuple[EffectBase, Mapping[str, float], Array]
@@ -209,11 +209,11 @@ class BlindCaseGenerator:
         problem: EstimationProblem,
         seed: int,
         finer: Callable[[int], System] | None = None,
-        candidates: CandidateChoice = "all",
+        candidates: CandidateNamesOrAll = "all",
         limits: Thresholds = DEFAULT_THRESHOLDS,
         *,
         simulated_system: System | None = None,
-        conditions: SyntheticRecordingConditions | None = None,
+        conditions: SyntheticMeasurementConditions | None = None,
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
@@ -226,21 +226,21 @@ class BlindCaseGenerator:
         recording = problem.episodes[0].recording
         self.initial_configuration = first_recorded_driven_joint_positions(self.simulated_system, recording)
         seen = any(group.pose is not None for group in recording.points)
-        self.conditions = replace(conditions or SyntheticRecordingConditions(), has_camera=seen)
+        self.conditions = replace(conditions or SyntheticMeasurementConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
             what, where = "none of the candidates can be done in MuJoCo", "diagnosis.candidates"
             raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_EFFECT_KINDS))
 
     def _rng(self, *path: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
+        return np.random.default_rng([self.seed, ALLOWED_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
     def _draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
         """True values of the free parameters, log-uniform about their start."""
         start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
         return {name: float(start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1)) for name in self.problem.free}
 
-    def simulate_recording(
+    def simulate_noisy_recording(
         self,
         truth: Mapping[str, float],
         injected: Sequence[InjectedEffect],
@@ -259,7 +259,9 @@ class BlindCaseGenerator:
         """The candidates' signatures on clean recordings."""
         rng = self._rng(0)
         names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
-        *clean, other = [self.simulate_recording(self._draw_true_parameters(rng), (), rng, name) for name in names]
+        *clean, other = [
+            self.simulate_noisy_recording(self._draw_true_parameters(rng), (), rng, name) for name in names
+        ]
         problem = self._nominal_problem(clean)
         effects = make_candidate_effects(problem.system, clean, self._candidates)
         composed = AllCandidatesProblem.from_problem(problem, effects, [other])
@@ -307,7 +309,7 @@ class BlindCaseGenerator:
             links = 2 if wanted.category == "finer_chain" else 1
             try:
                 *estimate, held_out = (
-                    self.simulate_recording(truth, injected, rng, f"{name}_{purpose}", links)
+                    self.simulate_noisy_recording(truth, injected, rng, f"{name}_{purpose}", links)
                     for purpose in (*purposes, "held_out")
                 )
             except ModelError:
@@ -364,7 +366,7 @@ class BlindCaseGenerator:
         reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
         times = min(wanted * self._limits.detectable_amplitude_z / seen, float(reach))
         values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
-        reported = {name: told.value for name, told in effect.reported_parameters(values).items()}
+        reported = {name: told.value for name, told in effect.parameters_as_reported(values).items()}
         relative_size = times * seen / self._limits.detectable_amplitude_z
         return InjectedEffect(effect.kind, effect.location, reported), relative_size
 
@@ -375,7 +377,9 @@ class BlindCaseGenerator:
             "segment": tuple(segment.name for segment in system.segment_layouts),
             "grasp": tuple(grasp.name for grasp in system.grasps),
         }
-        kind = str(rng.choice([kind for kind in OUT_OF_LIBRARY_EFFECTS if places[_OUT_OF_LIBRARY_SIZES[kind][0]]]))
+        kind = str(
+            rng.choice([kind for kind in OUT_OF_LIBRARY_FORCE_BUILDERS if places[_OUT_OF_LIBRARY_SIZES[kind][0]]])
+        )
         place, low, high, part_of = _OUT_OF_LIBRARY_SIZES[kind]
         location = str(rng.choice(places[place]))
         size = float(rng.uniform(low, high))
@@ -403,14 +407,14 @@ def simulate_random_motion(
     values: Mapping[str, float],
     injected: Sequence[InjectedEffect],
     rng: np.random.Generator,
-    conditions: SyntheticRecordingConditions,
+    conditions: SyntheticMeasurementConditions,
 ) -> Recording:
     """Simulate a random motion, planned with the nominal system at `truth`, with the `simulated` system at `values`."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
     seed = int(rng.integers(2**31))
     motion = random_multisine_motion(nominal, truth, seed=seed, initial_joint_angles=posture, excitation=excitation)
-    experiment = VirtualExperiment(
+    experiment = VirtualExperimentSettings(
         motion=motion,
         initial_joint_angles=posture,
         simulation=conditions.simulation,
@@ -454,7 +458,7 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
 def diagnose_blind_case(
     ensemble: BlindCaseGenerator,
     case: BlindCase,
-    candidates: CandidateChoice = "all",
+    candidates: CandidateNamesOrAll = "all",
     thresholds: Thresholds | None = None,
 ) -> DiagnosisResult:
     """Diagnose a blind case from its recordings and exclusions, without its label."""
@@ -463,7 +467,7 @@ def diagnose_blind_case(
 
 
 def true_effects_gap_closure(
-    ensemble: BlindCaseGenerator, case: BlindCase, label: CaseGroundTruth, candidates: CandidateChoice = "all"
+    ensemble: BlindCaseGenerator, case: BlindCase, label: CaseGroundTruth, candidates: CandidateNamesOrAll = "all"
 ) -> float:
     """Return the fraction of the held-out gap that a refit of the true effects closes; NaN if the refit fails."""
     problem = ensemble._nominal_problem(case.estimation_recordings)

@@ -246,10 +246,10 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
     return replace(
         limits,
         significance_level=sure,
-        candidate_gap_significance_level=sure,
+        candidate_score_significance_level=sure,
         unexplained_p_factor=1.0,
-        min_excess_chi2=-1.0,
-        min_channel_excess_chi2=-1.0,
+        min_excess_chi2_per_dof=-1.0,
+        min_channel_excess_chi2_per_dof=-1.0,
         min_log_bayes_factor=1e-9,
         max_unknown_groups=1,
         min_gap_closed=-math.inf,
@@ -267,7 +267,7 @@ def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
 
 def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
     """That of the worst channel, if any candidate is significant."""
-    is_sure = said["candidate"] < limits.candidate_gap_significance_level
+    is_sure = said["candidate"] < limits.candidate_score_significance_level
     return (said["largest_channel"] or 1.0) - 1 if is_sure else -math.inf
 
 
@@ -277,7 +277,7 @@ def _of(name: str) -> _Statistic:
 
 def _rivals(said: _Statistics, limits: Thresholds, truth: str) -> Mapping[str, _Statistics]:
     """Effects refitted alone that leave little but noise, if the true one does: likelihood tells only these apart."""
-    most, behind = 1 + limits.min_excess_chi2, said["behind"].items()
+    most, behind = 1 + limits.min_excess_chi2_per_dof, said["behind"].items()
     found = {label: own for label, own in behind if own["left"] is not None and own["left"] < most}
     return found if truth in found else {}
 
@@ -311,9 +311,9 @@ class _CalibrationRule:
 
 
 _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
-    "gap": _CalibrationRule("min_excess_chi2", _excess, "clean", "most", 0.1),
-    "candidate": _CalibrationRule("candidate_gap_significance_level", _of("candidate"), "clean", "least", 1e-4),
-    "channel": _CalibrationRule("min_channel_excess_chi2", _along, "clean", "most", 0.02),
+    "gap": _CalibrationRule("min_excess_chi2_per_dof", _excess, "clean", "most", 0.1),
+    "candidate": _CalibrationRule("candidate_score_significance_level", _of("candidate"), "clean", "least", 1e-4),
+    "channel": _CalibrationRule("min_channel_excess_chi2_per_dof", _along, "clean", "most", 0.02),
     "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
     "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),

@@ -15,7 +15,7 @@ import threadpoolctl
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
+from yid_ocp.diagnosis.baseline import BaselineRunData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import (
     DiagnosisResult,
     NominalParameterChange,
@@ -26,17 +26,17 @@ from yid_ocp.diagnosis.diagnosis_result import (
 )
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
-    KEPT_ROLLOUT_FRACTIONS,
+    KEPT_HELD_OUT_FRACTIONS,
     AllCandidatesProblem,
-    CandidateChoice,
+    CandidateNamesOrAll,
     TruncatedHeldOutRecording,
     exclude_candidates,
     make_candidate_effects,
 )
 from yid_ocp.diagnosis.localise import (
     GapLocation,
-    gap_locations_by_effect_closure,
     gap_locations_by_smoother_evidence,
+    gap_locations_from_effect_closures,
     main_gap_locations,
     merge_time_intervals,
 )
@@ -52,12 +52,12 @@ from yid_ocp.diagnosis.screening import ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, SelectedEffect, held_out_gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import (
-    check_parameter_transfer,
+    check_effect_amplitude_transfer,
     decide_verdict,
-    explained_fraction_of_smoother_chi2,
     find_unknown_verdict_reason,
-    fit_with_disagreement_in_std,
+    fraction_of_smoother_chi2_decrease,
     has_significant_gap,
+    inflate_std_by_disagreement,
     is_barely_significant_and_unexplained,
 )
 from yid_ocp.errors import DataError, SolverError
@@ -68,7 +68,7 @@ from yid_ocp.inference.null_test import (
     run_null_test,
     whiten_with_extra_errors,
 )
-from yid_ocp.inference.smoother import SmootherResult, select_and_smooth_unknowns
+from yid_ocp.inference.smoother import SmoothedUnknownsResult, select_and_smooth_unknowns
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
 from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
 from yid_ocp.parallel import map_with_batched_calls
@@ -85,13 +85,13 @@ _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each wit
 
 def diagnose(
     problem: EstimationProblem,
-    candidates: CandidateChoice = "all",
+    candidates: CandidateNamesOrAll = "all",
     held_out: Sequence[Recording] = (),
     *,
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
     known_fits: NominalSolutionAndRefitStore | None = None,
-    baseline: RunEstimates | Sequence[RunEstimates] | BaselineData = (),
+    baseline: RunEstimates | Sequence[RunEstimates] | BaselineRunData = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: whether it exists, where, its cause, and how far it closes.
@@ -106,9 +106,9 @@ def diagnose(
         Never touched by a fit; the problem's own where absent. Where there are none, alternate blocks are held out.
     progress : Progress, optional
         The package's log when absent.
-    baseline : RunEstimates or sequence of RunEstimates, or BaselineData, optional
+    baseline : RunEstimates or sequence of RunEstimates, or BaselineRunData, optional
         What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
-        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is. A `BaselineData`
+        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is. A `BaselineRunData`
         may have reference recordings too, made without what is looked for; the effects found are taken out for them.
 
     Raises
@@ -119,13 +119,11 @@ def diagnose(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        clock, told, known = (
-            {"": time.perf_counter()},
-            progress or LoggingProgress(log),
-            known_fits or NominalSolutionAndRefitStore(),
-        )
+        clock = {"": time.perf_counter()}
+        told = progress or LoggingProgress(log)
+        known = known_fits or NominalSolutionAndRefitStore()
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
-        earlier = runs if isinstance(runs, BaselineData) else BaselineData.from_runs(runs, ())
+        earlier = runs if isinstance(runs, BaselineRunData) else BaselineRunData.from_runs(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = with_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, told)
@@ -144,7 +142,7 @@ class _Examined:
     truncated: tuple[TruncatedHeldOutRecording, ...]
     whole: EstimationProblem  # with all samples
     events: EventSet
-    smoothed: SmootherResult | None  # about the fit, on all recordings, where it was asked
+    smoothed: SmoothedUnknownsResult | None  # about the fit, on all recordings, where it was asked
     before: NullTestResult
     held: NullTestResult
     screened: ScreeningResult
@@ -167,7 +165,7 @@ def _examined(
     found = _tested(search, nominal, cuts, whole, events, smoothed)
     clock["screening"] = time.perf_counter()
     poor = found.has_gap and found.has_enough_samples and found.before.chi2_per_dof < limits.restart_chi2
-    if poor and not search.skip_if_late("the nominal model from other starts"):
+    if poor and not search.note_skip_past_deadline("the nominal model from other starts"):
         other = _better_nominal_fit(found.search, nominal)
         if other is not None:
             # what the smoother says is about another fit
@@ -177,10 +175,10 @@ def _examined(
     return found
 
 
-def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) -> DiagnosisResult:
+def _diagnosed(seen: _Examined, earlier: BaselineRunData, clock: dict[str, float]) -> DiagnosisResult:
     search, nominal, before, held, screened = seen.search, seen.nominal, seen.before, seen.held, seen.screened
     limits, enough, scores = search.thresholds, seen.has_enough_samples, screened.candidate_scores
-    changed = earlier.has_changed_parameters(nominal, limits)
+    changed = earlier.fit_differs_significantly(nominal, limits)
     moved = changed and not seen.has_gap
     gap, smoothed, trusted = seen.has_gap or moved, None, None
     if gap and enough:
@@ -199,14 +197,14 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         places = [place.location for place in main_gap_locations(where)]
         fits, added = select_effects(search, nominal, screened, places, changed)
     clock["refits"] = time.perf_counter()
-    carried = check_parameter_transfer(search, added[-1].refitted_model) if added else ()
+    carried = check_effect_amplitude_transfer(search, added[-1].refitted_model) if added else ()
     if carried:
-        last = fit_with_disagreement_in_std(added[-1].refitted_model, carried)
+        last = inflate_std_by_disagreement(added[-1].refitted_model, carried)
         added = (*added[:-1], replace(added[-1], refitted_model=last))
     clock["carry_over"] = time.perf_counter()
     last = added[-1].refitted_model if added else nominal
     total = held_out_gap_closure(nominal.held_out_loss, last.held_out_loss, limits) if added else UNDEFINED_GAP_CLOSURE
-    explained = explained_fraction_of_smoother_chi2(nominal, added, trusted)
+    explained = fraction_of_smoother_chi2_decrease(nominal, added, trusted)
     same = all(entry.is_consistent for entry in carried)
     reason = find_unknown_verdict_reason(added, total, limits, explained, same)
     # what parameters explain by moving is no gap
@@ -246,7 +244,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
-        counterfactual=earlier.counterfactual_prediction_errors(nominal, final, search.progress),
+        counterfactual=earlier.errors_with_and_without_effects(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         search_seconds=clock["refits"] - clock[""],
     )
@@ -262,7 +260,7 @@ def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> Es
 
 def _happened(
     whole: EstimationProblem, fit: RefittedModel, limits: Thresholds
-) -> tuple[EventSet, SmootherResult | None]:
+) -> tuple[EventSet, SmoothedUnknownsResult | None]:
     """Events about a fit in all that was recorded, none where that cannot be predicted, and what the smoother says."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
@@ -295,14 +293,14 @@ def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     rows = [evaluation.residual[judged.residual_rows.data]]
     for i, (episode, result) in enumerate(judged.predict_held_out(x)):
         if not isinstance(result, str):
-            rows.append(judged.whitened_held_out_residual(i, episode, result).residual)
+            rows.append(judged.whitened_held_out_prediction_residual(i, episode, result).residual)
     counted = np.concatenate(rows)
     return float(counted @ counted) - np.count_nonzero(counted)
 
 
 def _without_events(
     search: RefitContext, nominal: RefittedModel, whole: EstimationProblem
-) -> tuple[RefitContext, RefittedModel, EventSet, SmootherResult | None]:
+) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
     """All that follows without what events explain, the nominal model fitted to that, and what happened about it."""
     first, (events, smoothed) = search.problem, _happened(whole, nominal, search.thresholds)
     for round_ in range(_MAX_EVENT_ROUNDS):
@@ -328,11 +326,11 @@ def _tested(
     cuts: tuple[TruncatedHeldOutRecording, ...],
     whole: EstimationProblem,
     events: EventSet,
-    smoothed: SmootherResult | None,
+    smoothed: SmoothedUnknownsResult | None,
 ) -> _Examined:
     """Null tests and screening at a nominal fit, at which the weights of all hypotheses are frozen."""
     angles, limits = _largest_joint_angles(nominal), search.thresholds
-    effects = tuple(effect.with_prior_ranges_for_angles(angles) for effect in search.problem.candidate_effects)
+    effects = tuple(effect.with_prior_ranges_scaled_to_angles(angles) for effect in search.problem.candidate_effects)
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
     before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
@@ -348,11 +346,11 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
     """The nominal model beside held-out recordings as far as it can follow them, fitted again where they were cut."""
     found = before
-    for margin in KEPT_ROLLOUT_FRACTIONS:
+    for margin in KEPT_HELD_OUT_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
-        composed, cuts = composed.truncate_held_out_recordings(nominal.values, margin)
+        composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, margin)
         for cut in cuts:
             search.progress.begin_stage(held_out_truncation_message(cut))
         names = {cut.recording for cut in cuts}
@@ -402,7 +400,7 @@ def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> Ref
 
 def _composed(
     problem: EstimationProblem,
-    candidates: CandidateChoice,
+    candidates: CandidateNamesOrAll,
     leave_out: Sequence[str],
     held_out: Sequence[Recording],
     progress: Progress,
@@ -442,7 +440,7 @@ def _after(
         place, part = entry.effect.location, entry.cumulative_closure.fraction
         closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
         most = max(part, most)
-    return remaining, gap_locations_by_effect_closure(where, closed, rest, windows), rest
+    return remaining, gap_locations_from_effect_closures(where, closed, rest, windows), rest
 
 
 def _changes(before: RefittedModel, after: RefittedModel) -> tuple[NominalParameterChange, ...]:
@@ -510,7 +508,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
         if isinstance(result, str):
             what = f"the held-out recording cannot be predicted: {result}"
             raise DataError(what, where=episode.name, hint="hold out a recording that the nominal model can follow")
-        rows = problem.whitened_held_out_residual(i, episode, result)
+        rows = problem.whitened_held_out_prediction_residual(i, episode, result)
         assert rows.jacobian is not None
         residuals.append(rows.residual)
         slopes.append(rows.jacobian[:, :shared])
@@ -519,7 +517,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
     return _null_test(problem.with_episodes(problem.held_out, ()), residual, 0, limits)
 
 
-def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmootherResult:
+def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnknownsResult:
     """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns."""
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.has_process_noise:

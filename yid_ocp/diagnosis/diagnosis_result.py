@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualPredictionErrors
+from yid_ocp.diagnosis.baseline import BaselineRunComparison, ErrorsWithAndWithoutEffects
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, ForceOrFaultEvent
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
@@ -23,23 +23,23 @@ from yid_ocp.diagnosis.select import (
     SelectedEffect,
     held_out_gap_closure,
     held_out_improvement,
+    largest_relative_rmse_reduction,
     penalized_chi2_difference,
-    relative_rmse_reduction,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
-    ParameterTransferCheck,
+    EffectAmplitudeTransferCheck,
     UnknownVerdictReason,
-    effect_count_with_each_kind_once,
     failed_transfer_checks,
-    required_fraction_of_smoother_chi2,
+    independent_assumption_count,
+    required_fraction_of_smoother_chi2_decrease,
 )
-from yid_ocp.display import ReprMixin, ReprSummary
+from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
-from yid_ocp.files import attributes_to_json, to_json_types
+from yid_ocp.files import object_attributes_to_json_dict, to_json_types
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
-from yid_ocp.inference.smoother import SmootherResult
+from yid_ocp.inference.smoother import SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 
 _FORMAT = "yid-diagnosis/2"
@@ -67,7 +67,7 @@ class DiagnosisResult(ReprMixin):
     detectability: tuple[DetectableAmplitudes, ...]
     confusability: ConfusabilityMatrix
     candidate_scores: tuple[CandidateScore, ...]  # first pass, best first
-    smoother_result: SmootherResult | None  # about the nominal model; None where there is no gap to locate
+    smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None where there is no gap to locate
     gap_locations: tuple[GapLocation, ...]
     nominal_model: RefittedModel
     single_effect_models: tuple[RefittedModel, ...]  # of the first round, best first
@@ -82,18 +82,18 @@ class DiagnosisResult(ReprMixin):
     message: str  # why the data are insufficient; empty if they suffice
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]
-    baseline_comparison: BaselineComparison | None = None
-    counterfactual: CounterfactualPredictionErrors | None = None
+    baseline_comparison: BaselineRunComparison | None = None
+    counterfactual: ErrorsWithAndWithoutEffects | None = None
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     unknown_reason: UnknownVerdictReason = ""
     explained_fraction: float = 1.0  # what the effects explain over what the smoother explains
-    transfer_checks: tuple[ParameterTransferCheck, ...] = ()
+    transfer_checks: tuple[EffectAmplitudeTransferCheck, ...] = ()
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
     untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
     search_seconds: float = 0.0  # from the start to the end of the search for effects
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction
         said = f"{100 * closed:.3g} % of the held-out gap closed" if effects and math.isfinite(closed) else ""
         rows = [("candidate", "parameters", "closure alone", "p")]
@@ -102,7 +102,7 @@ class DiagnosisResult(ReprMixin):
             known = ", ".join(f"{name} = {own['value']:.3g} {own['unit']}" for name, own in values.items())
             alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
             rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
-        return ReprSummary(", ".join(filter(None, (self.verdict.replace("_", " "), effects, said))), rows)
+        return ReprTexts(", ".join(filter(None, (self.verdict.replace("_", " "), effects, said))), rows)
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
@@ -132,30 +132,32 @@ class DiagnosisResult(ReprMixin):
                 "after": _state(self.final_model, self.remaining_test),
                 **_closure(closed),
                 "held_out": list(self.held_out_names),
-                "cut": [attributes_to_json(c, cuts) for c in self.truncated_recordings],
+                "cut": [object_attributes_to_json_dict(c, cuts) for c in self.truncated_recordings],
             },
-            "where": [attributes_to_json(p, _PLACE) for p in self.gap_locations],
+            "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.gap_locations],
             "which": _ranked_candidates(self),
-            "effects": [attributes_to_json(e, _EFFECT) for e in accepted],
+            "effects": [object_attributes_to_json_dict(e, _EFFECT) for e in accepted],
             "remaining": {
                 "p_value": self.remaining_test.p_value,
-                "where": [attributes_to_json(p, _PLACE) for p in self.remaining_gap_locations],
+                "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.remaining_gap_locations],
             },
             "reason": self.unknown_reason,
             "rejected_candidates": _rejected_candidates(self),
-            "carried_over": [attributes_to_json(c, carried) for c in self.transfer_checks],
-            "confusable": [[attributes_to_json(e, _EFFECT) for e in own] for own in rivals if accepted],
+            "carried_over": [object_attributes_to_json_dict(c, carried) for c in self.transfer_checks],
+            "confusable": [[object_attributes_to_json_dict(e, _EFFECT) for e in own] for own in rivals if accepted],
             "events": [event.to_dict() for event in self.events.disturbances],
-            "not_judged": [attributes_to_json(f, "recording joint from=start_time") for f in self.events.overspeeds],
+            "not_judged": [
+                object_attributes_to_json_dict(f, "recording joint from=start_time") for f in self.events.overspeeds
+            ],
             "next_experiment": self.next_experiment,
-            "side": None if smoothed is None else smoothed.gap_origin,
+            "side": None if smoothed is None else smoothed.plant_or_sensor_origin,
             "evidence": {} if smoothed is None else dict(smoothed.log_evidence),
             "explainable": None if smoothed is None else smoothed.explainable_gap_fraction,
-            "statistics": decision_statistics_to_dict(self),
+            "statistics": diagnosis_decision_statistics(self),
             "summary": self.summary,
             "message": self.message,
             "held_out_in_blocks": self.is_split_in_blocks,
-            "absorption": {a.name: attributes_to_json(a, changes) for a in self.nominal_changes},
+            "absorption": {a.name: object_attributes_to_json_dict(a, changes) for a in self.nominal_changes},
             "steps": [
                 {
                     "added": entry.effect.label,
@@ -167,7 +169,8 @@ class DiagnosisResult(ReprMixin):
             ],
             "unseen": [v.effect.label for v in self.detectability if not v.is_detectable],
             "noise": {
-                f.channel: attributes_to_json(f, "std=noise_std unit samples=n_samples") for f in self.noise_floor
+                f.channel: object_attributes_to_json_dict(f, "std=noise_std unit samples=n_samples")
+                for f in self.noise_floor
             },
             "stopped": {"after": self.search_seconds, "next": list(self.untried)} if self.untried else None,
             "baseline": None if since is None else _baseline_to_json(since),
@@ -176,7 +179,7 @@ class DiagnosisResult(ReprMixin):
         }
 
 
-def decision_statistics_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
+def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics that are compared with `Thresholds` as a JSON-compatible dictionary, for calibration.
 
     `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the worst
@@ -194,7 +197,7 @@ def decision_statistics_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     apart, alone = [distance / std for distance, std in differences if std > 0], finding.single_effect_models
     of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "fall", "explained"))
     if added:
-        fall = relative_rmse_reduction(before.held_out_loss, added[-1].refitted_model.held_out_loss)
+        fall = largest_relative_rmse_reduction(before.held_out_loss, added[-1].refitted_model.held_out_loss)
         own = (finding.gap_closure.fraction, finding.gap_closure.ci_low, fall, finding.explained_fraction)
         of_effects = dict(zip(of_effects, own, strict=True))
     found = {
@@ -204,7 +207,7 @@ def decision_statistics_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
         "candidate": min(1.0, bonferroni_min_p_value(finding.candidate_scores)),
         "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
         **of_effects,
-        "assumptions": effect_count_with_each_kind_once(added),
+        "assumptions": independent_assumption_count(added),
         "carried": max(apart, default=None),
         "behind": {fit.effects[-1].label: _behind(fit, alone[0]) for fit in alone},
     }
@@ -223,7 +226,7 @@ def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
-    theta, _ = problem.theta_and_initial_state_offset(problem.vector(fit.values), 0)
+    theta, _ = problem.theta_and_initial_state_deviation(problem.vector(fit.values), 0)
     found = {}
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
@@ -239,12 +242,15 @@ _EFFECT = "kind location"
 _PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
 
 
-def _baseline_to_json(found: BaselineComparison) -> dict[str, Any]:
+def _baseline_to_json(found: BaselineRunComparison) -> dict[str, Any]:
     runs = "runs=baseline_runs explains=is_baseline_explained effects=baseline_effects chi2=between_runs_chi2"
     shift = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
-    parameters = {e.name: attributes_to_json(e, f"{shift} p_value changed=has_changed") for e in found.parameter_shifts}
+    parameters = {
+        e.name: object_attributes_to_json_dict(e, f"{shift} p_value changed=has_changed")
+        for e in found.parameter_shifts
+    }
     changed = [entry.name for entry in found.changed_parameters]
-    known = attributes_to_json(found, f"{runs} p_value=between_runs_p_value")
+    known = object_attributes_to_json_dict(found, f"{runs} p_value=between_runs_p_value")
     return {**known, "parameters": parameters, "changed": changed}
 
 
@@ -265,7 +271,7 @@ def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
         own = [check for check in failed if check.effect_label == entry.effect.label] or failed
         reason = "; ".join(check.both_estimates_text for check in own)
         closed = to_json_types(entry.cumulative_closure.fraction)
-        listed.append({**attributes_to_json(entry.effect, _EFFECT), "closure": closed, "reason": reason})
+        listed.append({**object_attributes_to_json_dict(entry.effect, _EFFECT), "closure": closed, "reason": reason})
     return listed
 
 
@@ -290,11 +296,11 @@ def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
             continue
         score, own = scores.get(effect.label), alone.get(effect.label)
         step = {} if score is None else score.predicted_values
-        reported = effect.reported_parameters(step) if fit is None else fit.reported_parameters(effect)
+        reported = effect.parameters_as_reported(step) if fit is None else fit.effect_parameters_as_reported(effect)
         before = finding.nominal_model.held_out_loss
         listed[effect.label] = {
-            **attributes_to_json(effect, _EFFECT),
-            "parameters": {name: attributes_to_json(r, "value std unit") for name, r in reported.items()},
+            **object_attributes_to_json_dict(effect, _EFFECT),
+            "parameters": {name: object_attributes_to_json_dict(r, "value std unit") for name, r in reported.items()},
             "score": 0.0 if score is None else score.lm_statistic,
             "p_value": 1.0 if score is None else score.p_value,
             **_closure(None if own is None else held_out_gap_closure(before, own.held_out_loss)),
@@ -436,7 +442,11 @@ def _places(finding: DiagnosisResult) -> str:
     where = main_gap_locations(finding.gap_locations)
     shares = [(" or ".join([p.location, *p.indistinguishable_from]), round(100 * p.gap_share)) for p in where]
     named = " and ".join(f"{place} ({percent} %)" for place, percent in shares if percent)
-    side = "" if finding.smoother_result is None else _GAP_ORIGIN_PHRASES.get(finding.smoother_result.gap_origin, "")
+    side = (
+        ""
+        if finding.smoother_result is None
+        else _GAP_ORIGIN_PHRASES.get(finding.smoother_result.plant_or_sensor_origin, "")
+    )
     silent = "These data do not tell where it lies." if shares else ""
     return f"It lies in {named}{side}." if named else silent
 
@@ -445,7 +455,7 @@ def _nameless(finding: DiagnosisResult) -> str:
     """Why no effect is named, with the numbers that say so."""
     added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
     apart = [entry.both_estimates_text for entry in failed_transfer_checks(finding.transfer_checks)]
-    count = effect_count_with_each_kind_once(added)
+    count = independent_assumption_count(added)
     return _UNKNOWN_REASON_TEXTS[reason if reason != "none" or tried else "nothing"].format(
         best=tried[0].effects[0].label if tried else "",
         names=" and ".join(entry.effect.label for entry in added),
@@ -456,7 +466,7 @@ def _nameless(finding: DiagnosisResult) -> str:
         least=100 * finding.thresholds.min_gap_closed,
         explained=100 * finding.explained_fraction,
         asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
-        enough=100 * required_fraction_of_smoother_chi2(added, finding.thresholds),
+        enough=100 * required_fraction_of_smoother_chi2_decrease(added, finding.thresholds),
         apart="; ".join(apart[:2]),
         no="No effect tried so far" if finding.untried else "No known effect",
     )
@@ -496,7 +506,7 @@ def _effects(finding: DiagnosisResult) -> list[str]:
 
 def _figures(effect: EffectBase, fit: RefittedModel) -> str:
     text = []
-    for name, r in fit.reported_parameters(effect).items():
+    for name, r in fit.effect_parameters_as_reported(effect).items():
         known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
         text.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
     return ", ".join(text)
@@ -513,7 +523,7 @@ def _out_of_range(effect: EffectBase, fit: RefittedModel) -> list[str]:
     return found
 
 
-def _since(found: BaselineComparison, effects: bool) -> list[str]:
+def _since(found: BaselineRunComparison, effects: bool) -> list[str]:
     """What has moved since the baseline, and what a baseline that explained little is worth."""
     several, p_value = len(found.baseline_runs), found.between_runs_p_value
     moved = [
@@ -540,7 +550,7 @@ _COUNTERFACTUAL_TEXTS = (
 """Beginning, how the recordings were made, and what the prediction is compared with: effects removed, and added."""
 
 
-def _counterfactual(found: CounterfactualPredictionErrors) -> list[str]:
+def _counterfactual(found: ErrorsWithAndWithoutEffects) -> list[str]:
     """Whether taking the effects away predicts the world without them, and adding them the world with them."""
     text = []
     both = (found.effects_removed, found.effects_added)

@@ -19,7 +19,7 @@ import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import mask_out_samples
-from yid_ocp.diagnosis.localise import generalised_force_unit, is_significantly_nonzero
+from yid_ocp.diagnosis.localise import generalised_force_unit, smoothed_unknown_significance_mask
 from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
     DetectedForcePulse,
@@ -29,16 +29,16 @@ from yid_ocp.diagnosis.pulse_detection import (
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.files import attributes_to_json
+from yid_ocp.files import object_attributes_to_json_dict
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
-from yid_ocp.inference.smoother import SmootherResult, force_log_likelihood_coefficients
+from yid_ocp.inference.smoother import SmoothedUnknownsResult, force_log_likelihood_coefficients
 from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces, sensor_bias_location
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import Measurements, subtract_estimated_biases
+from yid_ocp.problem.measurements import SensorMeasurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.signal_filters import effort_filter_from_path_cutoff
+from yid_ocp.problem.signal_filters import effort_filter_with_path_cutoff
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 from yid_ocp.sensors.joints import quantization_step
 
@@ -81,7 +81,7 @@ class ForceOrFaultEvent:
     def to_dict(self) -> dict[str, Any]:
         """The event as a dictionary, which is an entry of `events` in result.json."""
         names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
-        return attributes_to_json(self, f"{names} std=impulse_std")
+        return object_attributes_to_json_dict(self, f"{names} std=impulse_std")
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def find_force_and_fault_events(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    smoothed: SmootherResult | None,
+    smoothed: SmoothedUnknownsResult | None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> EventSet:
     """Find significant events in all recordings of a problem, at a false-discovery rate over all time windows.
@@ -140,8 +140,8 @@ def find_force_and_fault_events(
     Jacobian where there is `smoothed`. Forces that move the model are sought where the smoother found some.
     """
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
-    told = [(e, result, problem.theta_and_initial_state_offset(x, i)[0]) for i, (e, result) in enumerate(fitted)]
-    shared = problem.theta_and_initial_state_offset(x, 0)[0]
+    told = [(e, result, problem.theta_and_initial_state_deviation(x, i)[0]) for i, (e, result) in enumerate(fitted)]
+    shared = problem.theta_and_initial_state_deviation(x, 0)[0]
     told += [(e, found, shared) for e, found in problem.predict_held_out(x) if not isinstance(found, str)]
     runs = [(e, result, problem.predictor.theta_with_episode_values(e, theta)) for e, result, theta in told]
     ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
@@ -183,9 +183,9 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
 
 def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
-    until = ends._end_of(history.recording) - effort_filter_from_path_cutoff(history.filter_cutoff).settling_time
+    until = ends._end_of(history.recording) - effort_filter_with_path_cutoff(history.filter_cutoff).settling_time
     keep = np.flatnonzero(history.t <= until)
-    return None if len(keep) < 10 else history.subset_at_times(keep)
+    return None if len(keep) < 10 else history.subset_at_indices(keep)
 
 
 def _allowed(
@@ -212,8 +212,8 @@ def _read_forces(
             continue
         error, held = _allowed(torques, run, samples.node, limits)
         unit_effort = samples.sensor.effort_per_unit_reading
-        weight = np.where(samples.used_output_mask, samples.weight, 0.0) / unit_effort
-        value = np.where(samples.used_output_mask, predicted - samples.value, 0.0) * unit_effort
+        weight = np.where(samples.positive_weight_mask, samples.weight, 0.0) / unit_effort
+        value = np.where(samples.positive_weight_mask, predicted - samples.value, 0.0) * unit_effort
         times = times_since_recording_start(episode, samples)
         # what lies closer together than an interval counts together
         bins = np.unique(np.floor((times - times[0]) / _FORCE_INTERVAL + 1e-6), return_inverse=True)[1]
@@ -233,7 +233,7 @@ def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
     overlap = math.ceil(2 * limits.max_event_duration / whole.time_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
     for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
-        yield whole.subset_at_times(np.arange(begin, min(begin + length, len(whole.t))))
+        yield whole.subset_at_indices(np.arange(begin, min(begin + length, len(whole.t))))
 
 
 def _driving_forces(
@@ -241,7 +241,7 @@ def _driving_forces(
     x: Array,
     evaluation: Evaluation,
     runs: Sequence[_RecordingRollout],
-    smoothed: SmootherResult,
+    smoothed: SmoothedUnknownsResult,
     torques: InverseDynamicsModel,
     limits: Thresholds,
 ) -> list[ForceEstimate]:
@@ -270,11 +270,11 @@ def _driving_forces(
     return found
 
 
-def _short(smoothed: SmootherResult, recording: int, limits: Thresholds) -> list[str]:
+def _short(smoothed: SmoothedUnknownsResult, recording: int, limits: Thresholds) -> list[str]:
     """Unknown forces that are surely there, but for a small part of the time only."""
     trace, names = smoothed.smoothed_unknowns[recording], []
     for i, source in enumerate(trace.unknown_groups):
-        sure = is_significantly_nonzero(trace, [i], limits.location_z)
+        sure = smoothed_unknown_significance_mask(trace, [i], limits.location_z)
         is_force = source.kind == "force" and not source.is_confounded_with_bias and smoothed.group_variance[source]
         if is_force and 0 < np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
             names.append(trace.unknown_names[i])
@@ -316,18 +316,18 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         if sensor.effort_joints or samples.node.ndim > 1:
             continue
         t = times_since_recording_start(episode, samples)
-        for column, channel in enumerate(samples.output_channel_names):
+        for column, channel in enumerate(samples.channel_name_per_output):
             location = channel.rpartition(".")[2]
             if sensor.outputs_per_channel > 1:
-                location = sensor_bias_location(problem.system, sensor, sensor.output_frames[column])
-            seen, about = samples.used_output_mask[:, column], (location, sensor.output_names[column], sensor.unit)
+                location = sensor_bias_location(problem.system, sensor, sensor.output_frame_names[column])
+            seen, about = samples.positive_weight_mask[:, column], (location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
             yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)
     joints = episode.recording.joints
     if joints is None:
         return
     for quantity in ("position", "effort"):
-        values, unit = joints.channels.get(quantity), CHANNEL_KINDS[f"joints.{quantity}"].unit
+        values, unit = joints.values_by_channel.get(quantity), CHANNEL_KINDS[f"joints.{quantity}"].unit
         for column, joint in enumerate(joints.names):
             floor = _floor(problem, episode, joint, quantity)
             if values is not None and floor is not None:
@@ -431,20 +431,20 @@ def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -
 
 
 def _counting(
-    episode: Episode, samples: Measurements, own: Sequence[ForceOrFaultEvent], end: float, cutoff: float
-) -> Measurements:
+    episode: Episode, samples: SensorMeasurements, own: Sequence[ForceOrFaultEvent], end: float, cutoff: float
+) -> SensorMeasurements:
     """Samples without those that an event spoils."""
     hidden, is_effort = np.zeros(samples.value.shape, bool), bool(samples.sensor.effort_joints)
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(end) and is_effort:
-        hidden |= t > end - effort_filter_from_path_cutoff(cutoff).settling_time
+        hidden |= t > end - effort_filter_with_path_cutoff(cutoff).settling_time
     smear = 1 / cutoff if is_effort else 0.0
     for event in own:
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)
-        for column, channel in enumerate(samples.output_channel_names):
+        for column, channel in enumerate(samples.channel_name_per_output):
             name = channel.rpartition(".")[2] if is_effort else samples.sensor.output_names[column]
             # a wrong angle is smeared over what all joints need
             if event.channel == name or (is_effort and event.kind == "sample"):
                 hidden[:, column] |= inside[:, column]
-    return mask_out_samples(samples, hidden) if np.any(hidden & samples.used_output_mask) else samples
+    return mask_out_samples(samples, hidden) if np.any(hidden & samples.positive_weight_mask) else samples

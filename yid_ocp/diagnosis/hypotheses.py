@@ -16,27 +16,27 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_whitened_at,
-    problem_with_relinearized_held_out,
+    problem_with_relinearized_held_out_whitening,
     problem_with_whitened_held_out,
 )
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, truncate_episode
-from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.recorded_inputs import recorded_sensor_kinds
+from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 
-CandidateChoice = Literal["all"] | Sequence[str]
+CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
 _BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
 _MIN_PREDICTED_DURATION = 1.0  # shortest beginning of a held-out recording that is worth predicting [s]
-KEPT_ROLLOUT_FRACTIONS = (0.9, 0.5, 0.0)
+KEPT_HELD_OUT_FRACTIONS = (0.9, 0.5, 0.0)
 """Parts of what a model can be rolled out on that are kept, one after the other while it still fails: near its end a
 model is lost already, and a fit on less of the recording may fail earlier."""
 
 
 def make_candidate_effects(
-    system: System, recordings: Sequence[Recording], choice: CandidateChoice
+    system: System, recordings: Sequence[Recording], choice: CandidateNamesOrAll
 ) -> list[EffectBase]:
     """Return the candidate effects for a system, without the effects that its nominal model already has.
 
@@ -44,7 +44,7 @@ def make_candidate_effects(
     no such kind, one that has no place here, an effect of the nominal model, an empty list; `ModelError`: no such
     location.
     """
-    where, sensors = "diagnosis.candidates", recorded_sensor_kinds(recordings)
+    where, sensors = "diagnosis.candidates", recorded_signal_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
     if choice == "all":
@@ -150,7 +150,7 @@ class AllCandidatesProblem:
         x = self.problem.vector(values)
         return replace(self, problem=problem_with_whitened_held_out(problem_whitened_at(self.problem, x, rounds=2), x))
 
-    def truncate_held_out_recordings(
+    def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], margin: float
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
         """Truncate held-out recordings where the rollout fails; return the new problem and the truncated recordings.
@@ -175,24 +175,30 @@ class AllCandidatesProblem:
         cut = problem.with_episodes(problem.episodes, kept) if kept else _in_blocks(problem)
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
-    def with_free_effects(self, effects: Sequence[EffectBase]) -> EstimationProblem:
+    def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the estimation problem with the nominal parameters and the parameters of `effects` free."""
         own = (name for effect in effects for name in effect.parameters.names)
-        return self.problem.with_compiled_parameters_free((*self.nominal_free_parameters, *own))
+        return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameters, *own))
 
-    def relinearized_with_effects(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
+    def with_effects_and_relinearized_filters(
+        self, effects: Sequence[EffectBase], at: Mapping[str, float]
+    ) -> EstimationProblem:
         """Return the problem with `effects` free; filters are relinearised about the torque offsets at the values `at`.
 
-        Filters of held-out recordings are left as they are: see `with_held_out_relinearized`.
+        Filters of held-out recordings are left as they are: see `with_relinearized_held_out_filters`.
         """
-        own = self.with_free_effects(effects)
+        own = self.with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
-    def with_held_out_relinearized(
+    def with_relinearized_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return `own` of `relinearized_with_effects` with held-out filters relinearised at the fitted values."""
-        return problem_with_relinearized_held_out(own, *_beside(own, effects, at)) if own.has_process_noise else own
+        """`own` of `with_effects_and_relinearized_filters`, held-out filters relinearised at the fitted values."""
+        return (
+            problem_with_relinearized_held_out_whitening(own, *_beside(own, effects, at))
+            if own.has_process_noise
+            else own
+        )
 
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
@@ -238,6 +244,6 @@ def _masked(episode: Episode, parity: int) -> Episode:
     return replace(episode, measurements=tuple(samples))
 
 
-def mask_out_samples(samples: Measurements, hidden: BoolArray) -> Measurements:
+def mask_out_samples(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
     """Return measurements in which the samples of the mask `hidden` (M, k) do not count."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

@@ -9,7 +9,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
-from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
+from yid_ocp.inference.smoother import SmoothedUnknowns, SmoothedUnknownsResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.system import System
 
@@ -38,7 +38,7 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 
 
 def gap_locations_by_smoother_evidence(
-    smoothed: SmootherResult, location_z: float = DEFAULT_THRESHOLDS.location_z
+    smoothed: SmoothedUnknownsResult, location_z: float = DEFAULT_THRESHOLDS.location_z
 ) -> tuple[GapLocation, ...]:
     """Return all locations with their share of the log evidence, largest first; at equal shares observable ones first.
 
@@ -61,19 +61,19 @@ def gap_locations_by_smoother_evidence(
     return _by_share(found)
 
 
-def is_significantly_nonzero(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
+def smoothed_unknown_significance_mask(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
     """Mask (J, columns) of the unknowns that are more than `limit` standard deviations from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > limit * std)
 
 
 def _windows(
-    smoothed: SmootherResult, sources: Sequence[SmoothedUnknownGroup], limit: float
+    smoothed: SmoothedUnknownsResult, sources: Sequence[SmoothedUnknownGroup], limit: float
 ) -> tuple[tuple[float, float], ...]:
     spans: list[tuple[float, float]] = []
     for trace in smoothed.smoothed_unknowns:
         own = [i for i, source in enumerate(trace.unknown_groups) if source in sources]
-        sure = np.flatnonzero(np.any(is_significantly_nonzero(trace, own, limit), axis=1))
+        sure = np.flatnonzero(np.any(smoothed_unknown_significance_mask(trace, own, limit), axis=1))
         spans += [(float(trace.interval_edges[j]), float(trace.interval_edges[j + 1])) for j in sure]
     return merge_time_intervals(spans)
 
@@ -89,7 +89,7 @@ def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[fl
     return tuple(joined)
 
 
-def gap_locations_by_effect_closure(
+def gap_locations_from_effect_closures(
     before: Sequence[GapLocation],
     closed: Mapping[str, float],
     rest: Sequence[GapLocation],
@@ -117,8 +117,10 @@ def gap_locations_by_effect_closure(
     return _by_share(found)
 
 
-def smoothed_unknown_z_scores(
-    smoothed: SmootherResult, recording: int = 0, informed_fraction: float = DEFAULT_THRESHOLDS.informed_fraction
+def z_scores_of_smoothed_unknowns(
+    smoothed: SmoothedUnknownsResult,
+    recording: int = 0,
+    informed_fraction: float = DEFAULT_THRESHOLDS.informed_fraction,
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Return interval edges (J + 1,) [s], unknowns' names, and z scores (J, nd): posterior mean over posterior std.
 

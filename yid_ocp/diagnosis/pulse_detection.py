@@ -26,11 +26,11 @@ import scipy.sparse
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.integrator.step import Step, applied_joint_torque
+from yid_ocp.integrator.step import Step, applied_driven_joint_torques
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState, System
-from yid_ocp.problem.signal_filters import effort_filter_from_path_cutoff
+from yid_ocp.problem.signal_filters import effort_filter_with_path_cutoff
 
 _STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m/s]
 
@@ -66,7 +66,7 @@ class InverseDynamicsModel:
         function = self._function.map(len(nodes))
         squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
         applied = np.zeros((len(nodes), n))
-        torque = applied_joint_torque(self._step, theta, rollout)
+        torque = applied_driven_joint_torques(self._step, theta, rollout)
         driven, prescribed = system.driven_coordinate_indices, system.prescribed_coordinate_indices
         for indices, effort in ((driven, torque), (prescribed, rollout.effort)):
             if indices:
@@ -77,7 +77,7 @@ class InverseDynamicsModel:
 
 def _function(system: System, time_step: float) -> ca.Function:
     """(q, v, a, z, theta) to the sum of squares of all terms, the torque needed, and what friction may hold."""
-    n, names = system.n_coordinates, tuple(system.internal_coordinate_symbols)
+    n, names = system.n_coordinates, tuple(system.effect_internal_coordinate_symbols)
     q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
     kinematics = forward_kinematics(system.mechanism, q)
     moving = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
@@ -102,7 +102,7 @@ def _function(system: System, time_step: float) -> ca.Function:
     faster, slower = (ca.substitute(viscous, v, v + sign * _STANDSTILL_SPEED) for sign in (1, -1))
     outputs = [ca.densify(x) for x in (squares, needed, (faster - slower) / 2)]
     if names:
-        symbols = ca.vertcat(*system.internal_coordinate_symbols.values())
+        symbols = ca.vertcat(*system.effect_internal_coordinate_symbols.values())
         outputs = [ca.substitute(x, symbols, z) for x in outputs]
     return ca.Function("torque_terms", [q, v, a, z, system.parameters.symbols], outputs)
 
@@ -144,7 +144,7 @@ class ForceEstimate:
         """Median time between neighbouring points [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def subset_at_times(self, keep: IntArray) -> ForceEstimate:
+    def subset_at_indices(self, keep: IntArray) -> ForceEstimate:
         """Return the estimate restricted to the time points with the indices `keep`."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
@@ -222,7 +222,7 @@ class _Filter:
         delay = np.asarray(0.1 / cutoff * np.arange(-length, length + 1), float)
         impulse = np.zeros((len(delay), 1))
         impulse[length] = 1.0
-        weight = effort_filter_from_path_cutoff(cutoff)(delay, impulse)[:, 0]
+        weight = effort_filter_with_path_cutoff(cutoff)(delay, impulse)[:, 0]
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:

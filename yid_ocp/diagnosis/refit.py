@@ -17,20 +17,20 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.effects import EffectBase, ReportedParameter
+from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, std_from_covariance
 from yid_ocp.inference.whitening import (
-    max_torque_bias_change_between_filters,
     problem_relinearized_at_torque_bias,
     problem_whitened_by_sensor_noise,
+    torque_bias_change_in_stds,
 )
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
-from yid_ocp.progress import ParallelProgress, Progress
+from yid_ocp.progress import PartsDoneCounter, Progress
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
@@ -92,9 +92,9 @@ class RefittedModel(StoredFit):
         """Number of parameters of all effects in the model."""
         return sum(len(effect.parameters) for effect in self.effects)
 
-    def reported_parameters(self, effect: EffectBase) -> dict[str, ReportedParameter]:
+    def effect_parameters_as_reported(self, effect: EffectBase) -> dict[str, ReportedParameterValue]:
         """Return an effect's fitted parameters in reported units with standard deviations, by name."""
-        return effect.reported_parameters(self.values, self.std)
+        return effect.parameters_as_reported(self.values, self.std)
 
 
 class RefitStore(Protocol):
@@ -127,7 +127,7 @@ class RefitContext:
     skipped: list[str] = field(default_factory=list)  # what was not tried, of all copies of this context
     left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
 
-    def skip_if_late(self, *what: str) -> bool:
+    def note_skip_past_deadline(self, *what: str) -> bool:
         """Whether the deadline for refits has passed; if so, `what` is noted as skipped."""
         is_late = time.perf_counter() >= self.deadline
         self.skipped.extend(what if is_late else ())
@@ -182,7 +182,7 @@ def refit_with_effects(
         return None
     x, finish = best.outcome.x, best.finish
     values = best.problem.named_values(x)
-    own = problem.with_held_out_relinearized(best.problem, effects, values)
+    own = problem.with_relinearized_held_out_filters(best.problem, effects, values)
     covariance = _refit_covariance(own, finish, limits)
     std = _mark_uninformative_std(effects, own.named_values(std_from_covariance(covariance, x)))
     held = _mark_uninformative_std(effects, _conditional_amplitude_std(own.unknown_names, effects, covariance))
@@ -197,18 +197,18 @@ def load_stored_refit(
 ) -> RefittedModel | None:
     """Return a refit restored from the store by one evaluation; None if the store does not have it."""
     known = None if store is None else store.get(name or join_effect_labels(effects))
-    unknowns = {*problem.with_free_effects(effects).unknown_names}
+    unknowns = {*problem.with_nominal_and_effects_free(effects).unknown_names}
     amplitudes = {amplitude for effect in effects for amplitude in effect.amplitude_names}
     if known is None or not (
         set(known.values) == set(known.std) == unknowns and set(known.amplitude_std) == amplitudes
     ):
         return None
-    own = problem.relinearized_with_effects(effects, known.values)
+    own = problem.with_effects_and_relinearized_filters(effects, known.values)
     x = own.vector(known.values)
     finish = own.evaluate(x)
     if not finish.ok:
         return None
-    own = problem.with_held_out_relinearized(own, effects, known.values)
+    own = problem.with_relinearized_held_out_filters(own, effects, known.values)
     return _model(known, effects, own, finish, x, True)
 
 
@@ -232,7 +232,7 @@ def _half_done(
     limits: Thresholds,
 ) -> bool:
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
-    own, count = problem.with_free_effects(effects), len(finish.residual)
+    own, count = problem.with_nominal_and_effects_free(effects), len(finish.residual)
     x = own.vector({**start, **neutral_effect_parameter_values(effects)})
     before = own.evaluate(x, False, finish.equilibrium_guesses)
     if 2 * finish.cost < limits.restart_chi2 * count or not before.ok:
@@ -257,7 +257,7 @@ def _attempt(
 ) -> _Attempt | None:
     """One run from one start; None where the model cannot be rolled out."""
     neutral = neutral_effect_parameter_values(effects)
-    own = problem.relinearized_with_effects(effects, start)
+    own = problem.with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
         outcome = REFIT_SOLVER.minimize_cost(own, own.vector({**start, **drawn}), None)
@@ -268,7 +268,7 @@ def _attempt(
     if found is None or not effects:
         return found
     filters = problem.problem.whitening_filters, found.problem.whitening_filters
-    if max_torque_bias_change_between_filters(*filters) < _RELINEARIZE_Z:
+    if torque_bias_change_in_stds(*filters) < _RELINEARIZE_Z:
         return found
     # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
     outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _relinearizing(found.problem))
@@ -290,7 +290,9 @@ def _relinearizing(problem: EstimationProblem) -> Callable[..., Evaluation]:
 
 def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt | None:
     """Where a run ended, about the torques that are seen there."""
-    placed = problem.relinearized_with_effects(effects, problem.with_free_effects(effects).named_values(outcome.x))
+    placed = problem.with_effects_and_relinearized_filters(
+        effects, problem.with_nominal_and_effects_free(effects).named_values(outcome.x)
+    )
     finish = placed.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses)
     return _Attempt(placed, outcome, finish) if finish.ok else None
 
@@ -344,7 +346,7 @@ def refit_with_each_effect(
     # one effect is often enough; where it is not, pairs, more effects and others in their places follow
     ahead = 11.0 if noun == "pairs" else {0: 8.0, 1: 14.0}.get(len(base), 9.0)
     search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}", 2 + 0.5 * len(tried), ahead)
-    parts = ParallelProgress(search.progress, len(tried), join_effect_labels(tried[0][0]))
+    parts = PartsDoneCounter(search.progress, len(tried), join_effect_labels(tried[0][0]))
 
     def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefittedModel | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
@@ -361,7 +363,7 @@ def refit_with_each_effect(
 
     fits: list[RefittedModel | None] = []
     rest, begun = list(tried), time.perf_counter()
-    while rest and not search.skip_if_late(*(join_effect_labels(effects) for effects, _ in rest)):
+    while rest and not search.note_skip_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
         # a batch costs less than its refits one by one; within a limit, so many as will end before it, best first
         count, now = len(rest), time.perf_counter()
         if search.deadline < math.inf:
@@ -386,7 +388,7 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
         number = int(episode.grid.steps * episode.grid.time_step / length) + 1
         blocks = []
         for samples in episode.measurements:
-            used, block = samples.used_output_mask, times_since_recording_start(episode, samples) / length
+            used, block = samples.positive_weight_mask, times_since_recording_start(episode, samples) / length
             block = np.minimum(block.astype(int), number - 1).reshape(len(block), -1)
             blocks.append(np.broadcast_to(block, used.shape)[used])
         of_row = np.concatenate(blocks)
@@ -394,7 +396,7 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
         if isinstance(result, str):
             total = np.full(number, np.inf)
         else:
-            rows = problem.whitened_held_out_residual(i, episode, result).residual
+            rows = problem.whitened_held_out_prediction_residual(i, episode, result).residual
             total = np.bincount(of_row, weights=rows**2, minlength=number)
         squares.append(total[count > 0])
         counts.append(count[count > 0])

@@ -27,7 +27,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.null_test import ResidualChannelIndices, chi2_p_value, residual_channel_indices
+from yid_ocp.inference.null_test import ResidualChannel, chi2_p_value, residual_channel_indices
 
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
@@ -92,13 +92,14 @@ def linearize_candidates(
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis, warm = np.zeros(0), np.zeros((0, 0)), None
-    placed, series = problem.relinearized_with_effects(base, values), residual_channel_indices(problem.problem)
+    placed = problem.with_effects_and_relinearized_filters(base, values)
+    series = residual_channel_indices(problem.problem)
     signatures: list[_EffectSignature] = []
     for k in range(max(map(len, grids.values()), default=0)):
         chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         amplitudes = [name for effect in chosen for name in effect.amplitude_names]
-        trial = placed.with_compiled_parameters_free((*problem.nominal_free_parameters, *own, *amplitudes))
+        trial = placed.with_free_parameters_without_recompiling((*problem.nominal_free_parameters, *own, *amplitudes))
         trial = trial.with_parameter_values(shape)
         evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
@@ -153,7 +154,7 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannelIndices]) -> Array:
+def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannel]) -> Array:
     """X' Omega X under the noise's known autocorrelation."""
     import scipy.signal  # slow to import
 
@@ -171,7 +172,7 @@ def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannelIndice
     return (total + total.T) / 2
 
 
-def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannelIndices]) -> Array:
+def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannel]) -> Array:
     """Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
@@ -186,7 +187,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 
 def score_candidates(
     point: AllCandidatesLinearization,
-    series: Sequence[ResidualChannelIndices],
+    series: Sequence[ResidualChannel],
     visible: Sequence[DetectableAmplitudes],
 ) -> tuple[CandidateScore, ...]:
     """Return the score test of every detectable candidate, largest predicted decrease of r'r first."""
@@ -224,7 +225,7 @@ def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> t
     return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
 
 
-def _score(signature: _EffectSignature, residual: Array, series: Sequence[ResidualChannelIndices]) -> CandidateScore:
+def _score(signature: _EffectSignature, residual: Array, series: Sequence[ResidualChannel]) -> CandidateScore:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = -(x.T @ residual)
     lower, upper = _room(effect)

@@ -81,7 +81,7 @@ def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) ->
 
 def _noise_is_left(limits: Thresholds, *losses: HeldOutLoss) -> bool:
     """Whether all of some models leave little but noise."""
-    return max(loss.chi2_per_sample for loss in losses) < 1 + limits.min_excess_chi2
+    return max(loss.chi2_per_sample for loss in losses) < 1 + limits.min_excess_chi2_per_dof
 
 
 def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
@@ -152,10 +152,10 @@ def _likely(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
 
 
 def _is_shape_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
-    """Whether a shape is outside its prior range by `max_shape_out_of_range_factor` or `prior_range_margin` widths."""
+    """Whether a shape exceeds its prior range by `max_shape_out_of_range_factor` or the margin in widths."""
     for name in effect.shape_parameter_names:
         low, high = effect.prior_ranges[name]
-        room, factor = limits.prior_range_margin * (high - low), limits.max_shape_out_of_range_factor
+        room, factor = limits.prior_range_margin_in_widths * (high - low), limits.max_shape_out_of_range_factor
         near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
         unsure = limits.min_z * fit.std.get(name, 0.0)
         if not near - unsure <= fit.values[name] <= far + unsure:
@@ -164,10 +164,10 @@ def _is_shape_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thre
 
 
 def _is_amplitude_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
-    """Whether an amplitude lies outside its prior range by more than `prior_range_margin` widths of that range."""
+    """Whether an amplitude lies more than `prior_range_margin_in_widths` outside its prior range."""
     for name in effect.amplitude_names:
         low, high = effect.prior_ranges[name]
-        room = limits.prior_range_margin * (high - low)
+        room = limits.prior_range_margin_in_widths * (high - low)
         if not low - room <= fit.values[name] <= high + room:
             return True
     return False
@@ -182,10 +182,10 @@ def _is_significant(effect: EffectBase, fit: RefittedModel, limits: Thresholds) 
 def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
     """Whether the held-out error, of all channels or of any one, is reduced by the fraction `min_rmse_reduction`."""
     sure = _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample)
-    return sure or relative_rmse_reduction(before, after) >= limits.min_rmse_reduction
+    return sure or largest_relative_rmse_reduction(before, after) >= limits.min_rmse_reduction
 
 
-def relative_rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
+def largest_relative_rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
     """Return the relative reduction of the held-out RMSE, of all channels or the best channel, whichever is larger."""
     channels = [name for name in before.channel_rmse if name in after.channel_rmse]
     pairs = [(np.sqrt(before.chi2_per_sample), np.sqrt(after.chi2_per_sample))]
@@ -259,20 +259,20 @@ def select_effects(
     while len(added) < limits.max_effects:
         base = tuple(entry.effect for entry in added)
         if added:
-            if search.skip_if_late(f"what is left beside {join_effect_labels(base)}"):
+            if search.note_skip_past_deadline(f"what is left beside {join_effect_labels(base)}"):
                 break
             ahead = 3.5 if _little_is_left(current, limits) else 20.0
             search.progress.begin_stage(f"scoring what is left beside {', '.join(e.label for e in base)}", 1.0, ahead)
             screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)
-            if _little_is_left(current, limits) and p_value >= limits.candidate_gap_significance_level:
+            if _little_is_left(current, limits) and p_value >= limits.candidate_score_significance_level:
                 break
             if len(base) == 1 and _futile([nominal, current, *first], alone, screened, limits):
                 break
         shortlist = _refit_shortlist(screened, limits, base, places)
         fits = refit_with_each_effect(search, base, shortlist, current.values)
-        if moved and not base and not search.skip_if_late("candidates from the earlier run's parameters"):
+        if moved and not base and not search.note_skip_past_deadline("candidates from the earlier run's parameters"):
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
             pairs = _pairs_to_refit(alone, limits, base[0])
@@ -374,7 +374,7 @@ def _reconsidered(
     while len(kept) > 1:
         others = [_labels(kept) - {entry.effect.label} for entry in kept]
         position = next((i for i, own in enumerate(others) if own not in tried), None)
-        if position is None or search.skip_if_late("each effect without the others' company"):
+        if position is None or search.note_skip_past_deadline("each effect without the others' company"):
             break
         tried.add(others[position])
         revised = _revised(search, nominal, kept, kept[position])

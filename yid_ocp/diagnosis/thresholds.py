@@ -27,13 +27,13 @@ class Thresholds(SmootherThresholds):
     significance_level: Annotated[float, Gt(0), Lt(1), OptionInfo("significance below which a gap counts as one")] = (
         DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level
     )
-    min_excess_chi2: Annotated[float, Ge(0), OptionInfo("chi2/n - 1 below which a gap is not worth a name")] = (
-        DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2
+    min_excess_chi2_per_dof: Annotated[float, Ge(0), OptionInfo("chi2/n - 1 below which a gap is not worth a name")] = (
+        DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof
     )
-    min_channel_excess_chi2: Annotated[
+    min_channel_excess_chi2_per_dof: Annotated[
         float, Ge(0), OptionInfo("the same of the worst channel, where a candidate mends it")
     ] = 0.02
-    candidate_gap_significance_level: Annotated[
+    candidate_score_significance_level: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance from which a candidate alone shows a gap")
     ] = 1e-4
     unexplained_p_factor: Annotated[
@@ -76,7 +76,9 @@ class Thresholds(SmootherThresholds):
     max_shape_out_of_range_factor: Annotated[
         float, Ge(1), OptionInfo("factor by which a shape parameter may leave its range")
     ] = 2.0
-    prior_range_margin: Annotated[float, Ge(0), OptionInfo("widths of its range by which a value may leave it")] = 1.0
+    prior_range_margin_in_widths: Annotated[
+        float, Ge(0), OptionInfo("widths of its range by which a value may leave it")
+    ] = 1.0
     transfer_rtol: Annotated[
         float, Ge(0), OptionInfo("part of an effect by which it may differ on held-out recordings")
     ] = 0.3
@@ -105,7 +107,7 @@ class Thresholds(SmootherThresholds):
     @property
     def null_test_limits(self) -> ExcessResidualCriteria:
         """Significance level and smallest excess of the null test, in the form that `solve` uses as well."""
-        return ExcessResidualCriteria(self.significance_level, self.min_excess_chi2)
+        return ExcessResidualCriteria(self.significance_level, self.min_excess_chi2_per_dof)
 
 
 DEFAULT_THRESHOLDS = Thresholds()

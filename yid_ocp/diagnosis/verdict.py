@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
-from yid_ocp.inference.smoother import SmootherResult
+from yid_ocp.inference.smoother import SmoothedUnknownsResult
 
 UnknownVerdictReason = Literal["", "none", "unsure", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""
@@ -27,7 +27,7 @@ _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
 
 @dataclass(frozen=True)
-class ParameterTransferCheck:
+class EffectAmplitudeTransferCheck:
     """Comparison of one effect parameter's estimates from the estimation recordings and from the held-out ones."""
 
     effect_label: str
@@ -53,7 +53,9 @@ class ParameterTransferCheck:
         return abs(self.estimation_value - self.held_out_value), spread
 
 
-def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[ParameterTransferCheck, ...]:
+def check_effect_amplitude_transfer(
+    search: RefitContext, fit: RefittedModel
+) -> tuple[EffectAmplitudeTransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
 
     Empty if one recording is split, or if the model cannot be fitted there, which is no evidence against it.
@@ -77,7 +79,7 @@ def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[
 
 def _compare(
     effect: EffectBase, first: RefittedModel, second: RefittedModel, limits: Thresholds
-) -> list[ParameterTransferCheck]:
+) -> list[EffectAmplitudeTransferCheck]:
     """The amplitudes of one effect in two fits."""
     neutral, found = effect.neutral_values, []
     width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
@@ -85,7 +87,7 @@ def _compare(
     for name in effect.amplitude_names:
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
-        entry = ParameterTransferCheck(*what, *own, True)
+        entry = EffectAmplitudeTransferCheck(*what, *own, True)
         apart, spread = entry.estimate_difference_and_std
         # what has no standard deviation says nothing against it
         sure = math.isfinite(spread) and apart > limits.transfer_z_max * spread
@@ -93,7 +95,7 @@ def _compare(
     return found
 
 
-def fit_with_disagreement_in_std(fit: RefittedModel, entries: Sequence[ParameterTransferCheck]) -> RefittedModel:
+def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[EffectAmplitudeTransferCheck]) -> RefittedModel:
     """Return the fit with standard deviations increased for amplitudes that disagree between the recordings.
 
     Where two fits differ by more than `_DISAGREEMENT_Z` standard deviations of both together, each is known to the
@@ -107,7 +109,7 @@ def fit_with_disagreement_in_std(fit: RefittedModel, entries: Sequence[Parameter
     return replace(fit, std=std)
 
 
-def failed_transfer_checks(entries: Sequence[ParameterTransferCheck]) -> tuple[ParameterTransferCheck, ...]:
+def failed_transfer_checks(entries: Sequence[EffectAmplitudeTransferCheck]) -> tuple[EffectAmplitudeTransferCheck, ...]:
     """Return the checks whose two estimates disagree."""
     return tuple(entry for entry in entries if not entry.is_consistent)
 
@@ -128,15 +130,15 @@ def has_significant_gap(
     if residuals_exceed_noise((before, held_out), limits.null_test_limits):
         return True
     stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
-    if stated and min(stated) * len(ranked) < limits.candidate_gap_significance_level:
+    if stated and min(stated) * len(ranked) < limits.candidate_score_significance_level:
         return True
     best = bonferroni_min_p_value(ranked)
     largest = max((*before.channel_chi2.values(), *held_out.channel_chi2.values()), default=1.0)
-    return best < limits.candidate_gap_significance_level and largest > 1 + limits.min_channel_excess_chi2
+    return best < limits.candidate_score_significance_level and largest > 1 + limits.min_channel_excess_chi2_per_dof
 
 
 def is_barely_significant_and_unexplained(
-    smoothed: SmootherResult | None,
+    smoothed: SmoothedUnknownsResult | None,
     ranked: Sequence[CandidateScore],
     before: NullTestResult,
     held_out: NullTestResult,
@@ -148,7 +150,8 @@ def is_barely_significant_and_unexplained(
     """
     best = bonferroni_min_p_value(ranked)
     barely = min(before.p_value, held_out.p_value) > limits.unexplained_p_factor * limits.significance_level
-    return barely and best >= limits.significance_level and (smoothed is None or smoothed.gap_origin == "none")
+    has_no_place = smoothed is None or smoothed.plant_or_sensor_origin == "none"
+    return barely and best >= limits.significance_level and has_no_place
 
 
 def decide_verdict(
@@ -168,17 +171,17 @@ def decide_verdict(
     return "confusable" if len(added[0].equivalent_effects) > 1 else "effect"
 
 
-def effect_count_with_each_kind_once(added: Sequence[SelectedEffect]) -> int:
+def independent_assumption_count(added: Sequence[SelectedEffect]) -> int:
     """Number of independent assumptions in effects: one for each kind, but one for each local effect."""
     return len({entry.effect.label if entry.effect.is_local else entry.effect.kind for entry in added})
 
 
-def required_fraction_of_smoother_chi2(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
+def required_fraction_of_smoother_chi2_decrease(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
     """Return the fraction of the chi2 explained by the smoother that the effects are required to explain.
 
     Each further assumption has to explain that part of what could be left.
     """
-    return 1.0 - (1.0 - limits.min_explained_fraction) ** effect_count_with_each_kind_once(added)
+    return 1.0 - (1.0 - limits.min_explained_fraction) ** independent_assumption_count(added)
 
 
 def find_unknown_verdict_reason(
@@ -186,22 +189,22 @@ def find_unknown_verdict_reason(
 ) -> UnknownVerdictReason:
     """Return the code of the reason why no effect is accepted for a gap; empty if one is accepted.
 
-    Effects have to explain the part `required_fraction_of_smoother_chi2` of what the smoother explains where the model
-    was fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
+    Effects have to explain `required_fraction_of_smoother_chi2_decrease` of what the smoother explains where the
+    model was fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
     `min_explained_fraction`.
     """
     if not added:
         return "none"
     if not (total.ci_low > limits.min_gap_closed or total.is_decisive):
         return "unsure"
-    elsewhere = effect_count_with_each_kind_once(added) == 1 and total.ci_low >= limits.min_explained_fraction
-    if explained < required_fraction_of_smoother_chi2(added, limits) and not elsewhere:
+    elsewhere = independent_assumption_count(added) == 1 and total.ci_low >= limits.min_explained_fraction
+    if explained < required_fraction_of_smoother_chi2_decrease(added, limits) and not elsewhere:
         return "little"
     return "" if carried else "stand_in"
 
 
-def explained_fraction_of_smoother_chi2(
-    nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
+def fraction_of_smoother_chi2_decrease(
+    nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmoothedUnknownsResult | None
 ) -> float:
     """Return the effects' decrease of r'r divided by the smoother's, each less degrees of freedom; 1 if undefined."""
     if smoothed is None or not added:

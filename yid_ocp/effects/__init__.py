@@ -13,8 +13,8 @@ from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS as EFFECTS
 from yid_ocp.effects.base import EffectBase as EffectBase
 from yid_ocp.effects.base import ParameterDefinition as ParameterDefinition
-from yid_ocp.effects.base import ReportedParameter as ReportedParameter
-from yid_ocp.errors import ModelError, unknown_name_details
+from yid_ocp.effects.base import ReportedParameterValue as ReportedParameterValue
+from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 
 # kinds of recorded signals on which candidates depend; `nominal_clock` is a sample index times a nominal period
@@ -35,7 +35,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     places = EFFECTS[kind].possible_locations(system)
     if location not in places:
         said = {"allowed": "nothing in this system", "hint": "leave it out"}
-        said = unknown_name_details(location, places) if places else said
+        said = unknown_name_error_arguments(location, places) if places else said
         raise ModelError(f"{kind} does not fit '{location}'", where=f"{kind}@{location}", **said)
     return base.build_effect(kind, location, system, values or {})
 
@@ -54,7 +54,7 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
     """
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
     for name in sorted(name for name in present - known if ":" not in name):
-        raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_details(name, sorted(known)))
+        raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_error_arguments(name, sorted(known)))
     unseen = set() if "joints.effort" in present else set(system.prescribed)
     found = []
     for kind in EFFECTS:

@@ -172,7 +172,7 @@ class _DistortedEffort(_DistortedReading):
 
 
 @EFFECTS.register("effort_gain")
-class EffortGain(_DistortedEffort):
+class _EffortGain(_DistortedEffort):
     """Scale error of a joint's effort: measured effort = scale x true effort; a negative scale is a flipped sign.
 
     Kept inside as 1/scale, by which a recorded torque is multiplied, so that a driven joint's may go through zero.
@@ -316,7 +316,7 @@ class SupplyVoltage(_ServoChange):
 
 
 @EFFECTS.register("back_emf")
-class BackEmf(_ServoChange):
+class _BackEmf(_ServoChange):
     """Scale factor on a direct-current motor's back-EMF damping kt^2/R, its braking torque per speed."""
 
     equation = "torque = clip(gain (u - q)) - scale damping v"

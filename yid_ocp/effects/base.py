@@ -69,7 +69,7 @@ class ParameterDefinition:
 
 
 @dataclass(frozen=True)
-class ReportedParameter:
+class ReportedParameterValue:
     """An effect's parameter as reported to users: value, standard deviation and unit."""
 
     value: float
@@ -146,9 +146,9 @@ class EffectBase(Effect):
         """Expected range (low, high) of every parameter, by parameter name, in the parameter's unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
-    def reported_parameters(
+    def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
-    ) -> dict[str, ReportedParameter]:
+    ) -> dict[str, ReportedParameterValue]:
         """The parameters as reported to users, by reported name; for example, a compliance is reported as a stiffness.
 
         Values and standard deviations are nominal and NaN where absent; that of C^(-1/p) is C^(-1/p) std(C)/(p C).
@@ -162,10 +162,10 @@ class EffectBase(Effect):
                 power, internal = definition.reciprocal_power, value
                 value = math.inf if not value else 1 / value if power == 1 else value ** (-1 / power)
                 std = abs(value * std / (power * internal)) if internal else math.nan
-            result[name] = ReportedParameter(value, std, unit)
+            result[name] = ReportedParameterValue(value, std, unit)
         return result
 
-    def with_prior_ranges_for_angles(self, largest: Mapping[str, float]) -> EffectBase:
+    def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> EffectBase:
         """The effect with prior ranges adapted to the largest joint angle of each segment in the data [rad]."""
         return self
 
@@ -343,7 +343,7 @@ def segment_elastic_joints(system: System, segment: str) -> tuple[ElasticJoint, 
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
-def effort_scaled_parameter_definition(
+def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
     """Definition of an arm joint's parameter: neutral at zero, with bound and range that grow with the effort limit."""

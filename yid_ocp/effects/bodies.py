@@ -11,11 +11,11 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.effects import base
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, ReportedParameter
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, ReportedParameterValue
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Inertia, merge_bodies
 from yid_ocp.model.rotations import symbolic_rotation_from_rpy
-from yid_ocp.model.system import ForceWithDerivatives, MidpointState, StepTerms, System
+from yid_ocp.model.system import ForceWithDerivativeFactors, MidpointState, StepTerms, System
 
 _MAX_PAYLOAD_DISTANCE = 0.5  # of a payload's mass from its frame [m]
 _MAX_COM_SHIFT = 0.05  # of a link's centre of mass without added mass [m]
@@ -79,7 +79,7 @@ def _joints_with_mass(system: System) -> tuple[str, ...]:
 
 
 @EFFECTS.register("link_mass")
-class LinkMass(_ScaledBodies):
+class _LinkMass(_ScaledBodies):
     """Scale factor on mass and inertia of the link that an arm joint moves."""
 
     equation = "mass and inertia of the child link times scale"
@@ -172,9 +172,9 @@ class Payload(EffectBase):
 
     def reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
-    ) -> dict[str, ReportedParameter]:
+    ) -> dict[str, ReportedParameterValue]:
         """Reported mass and acting first moments; moments beyond the position limit have no standard deviation."""
-        found = super().reported_parameters(values, stds)
+        found = super().parameters_as_reported(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
         kept = float(_kept(ca.SX(mass), ca.SX(ca.DM(moments)), own))
@@ -261,7 +261,9 @@ class RotorInertia(EffectBase):
     required_excitation = "how hard it accelerates"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.effort_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"),
+        base.effort_limit_scaled_parameter_definition(
+            "armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"
+        ),
     )
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -361,11 +363,11 @@ def _velocities(kinematics: Kinematics, v: ca.SX) -> list[ca.SX]:
 
 def _on_bodies(
     kinematics: Kinematics, velocity: list[ca.SX], wrenches: dict[int, ca.SX], slopes: dict[int, ca.SX]
-) -> ForceWithDerivatives:
+) -> ForceWithDerivativeFactors:
     """Generalized force of wrenches that depend only on their body's motion, with its derivatives.
 
     With W_j and K_j the sum of wrenches, and of their slopes by the bodies' spatial velocity, over all that joint j
-    moves, S_j its screw and D_j = V_parent(j) x S_j, F_j = S_j . W_j, and the columns of `ForceWithDerivatives` are
+    moves, S_j its screw and D_j = V_parent(j) x S_j, F_j = S_j . W_j, the columns of `ForceWithDerivativeFactors` are
     A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because turning a joint i above turns a body and its wrench together,
     up to the velocity D_i that the turn adds.
 
@@ -387,4 +389,4 @@ def _on_bodies(
         along[j] = slopes[j] @ screws[j]
         added = motion_cross_motion_product(velocity[parent], screws[j]) if parent >= 0 else zero
         turned[j] = slopes[j] @ added + motion_cross_force_product(screws[j], wrenches[j])
-    return ForceWithDerivatives(ca.densify(force), ca.horzcat(*along), ca.horzcat(*turned))
+    return ForceWithDerivativeFactors(ca.densify(force), ca.horzcat(*along), ca.horzcat(*turned))

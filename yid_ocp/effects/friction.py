@@ -19,7 +19,7 @@ _ABS_SMOOTHING_ANGLE = 1e-7  # turned in a step, below which |d| in Dahl's law i
 _SERIES_MAX_ANGLE_RATIO = 1e-2  # of step angle to yield angle, below which the exponential loses digits to a series
 
 FrictionLawName = Literal["viscous", "coulomb", "stribeck", "presliding", "load", "load_stribeck"]
-FRICTION_LAW_EFFECT_KINDS: Mapping[FrictionLawName, tuple[str, ...]] = {
+EFFECT_KINDS_BY_FRICTION_LAW: Mapping[FrictionLawName, tuple[str, ...]] = {
     "viscous": (),
     "coulomb": ("joint_coulomb",),
     "stribeck": ("joint_coulomb", "joint_stribeck"),
@@ -52,7 +52,9 @@ class JointViscous(_JointFriction):
     """Viscous friction F = -b v of an arm joint, in addition to the model's damping."""
 
     equation = "F = -b v"
-    declared_parameters = (base.effort_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
+    declared_parameters = (
+        base.effort_limit_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),
+    )
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["b"] * v
@@ -63,7 +65,9 @@ class JointCoulomb(_JointFriction):
     """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s = `_SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    declared_parameters = (base.effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
+    declared_parameters = (
+        base.effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),
+    )
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["tau_c"] * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
@@ -75,7 +79,7 @@ class JointStribeck(_JointFriction):
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
-        base.effort_scaled_parameter_definition(
+        base.effort_limit_scaled_parameter_definition(
             "tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"
         ),
         ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
@@ -138,7 +142,7 @@ class JointPresliding(EffectBase):
     required_excitation = "how fast it moves"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
+        base.effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
         ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
     )
 
@@ -184,7 +188,7 @@ class JointSpring(EffectBase):
     required_excitation = "how far it bends"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.effort_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
+        base.effort_limit_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 

@@ -142,7 +142,7 @@ class CubicStiffness(_SegmentEffect):
     """Springs that stiffen (k3 > 0) or soften (k3 < 0) with angle: V += 1/4 k3 q^4 on every joint of a segment.
 
     k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
-    `with_prior_ranges_for_angles` is given the one in the data.
+    `with_prior_ranges_scaled_to_angles` is given the one in the data.
     """
 
     equation = "V += 1/4 k3 q^4"
@@ -154,7 +154,7 @@ class CubicStiffness(_SegmentEffect):
         ),
     )
 
-    def with_prior_ranges_for_angles(self, largest: Mapping[str, float]) -> CubicStiffness:
+    def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> CubicStiffness:
         """The effect with the prior range of k3 scaled to the segment's largest joint angle in the data."""
         if self.location not in largest:
             return self

@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.analysis.step_symbols import (
-    StepSymbols,
+    NamedStepEquations,
     SymbolBlock,
     count_operations,
     escape_latex,
@@ -49,7 +49,7 @@ _FORCE_AND_CONSTRAINT_TERMS = {
 """LaTeX of force and constraint terms in the balance and in p1, by `force_split` and `constraint_force`."""
 
 
-def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
+def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, ...]:
     """The CasADi functions that `export_step_functions` writes.
 
     `rows` (del, internal, constraint, p1) and `rows_by_theta` of `_ARGUMENT_NAMES`, `rows_by_unknowns` (by q1, z1, lam)
@@ -70,7 +70,7 @@ def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
     rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
     places = [kinematics.frame_position(name) for name in system.point_frames]
     mechanics = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
-    internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
+    internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
     still = [ca.substitute(x, internal, ca.SX.zeros(internal.numel())) for x in (*places, *mechanics)]
     if places:
         outputs = [name.replace(":", "_").replace("%", "") for name in system.point_frames]
@@ -81,7 +81,7 @@ def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
 
 
 def export_step_functions(
-    symbols: StepSymbols, folder: str | os.PathLike[str], theta: Array, time_step: float
+    symbols: NamedStepEquations, folder: str | os.PathLike[str], theta: Array, time_step: float
 ) -> tuple[Path, ...]:
     """Write a step's CasADi functions as `NAME.casadi` files and as `equations.c`, with `names.json`.
 
@@ -108,7 +108,9 @@ def export_step_functions(
     return (*written, source, listed)
 
 
-def write_equation_sheet(path: Path, symbols: StepSymbols, theta: Array, free: Sequence[str], time_step: float) -> None:
+def write_equation_sheet(
+    path: Path, symbols: NamedStepEquations, theta: Array, free: Sequence[str], time_step: float
+) -> None:
     """Write the LaTeX document of a step's equations; `OutputError` if the file cannot be written.
 
     Values `theta` are filled in for all parameters but the `free` ones, which stay symbols; a table lists their values.
@@ -126,7 +128,7 @@ def write_equation_sheet(path: Path, symbols: StepSymbols, theta: Array, free: S
     write_text(path, _LATEX_PREAMBLE + "\n".join(lines) + "\n\\end{document}\n")
 
 
-def _rules(symbols: StepSymbols, time_step: float) -> list[str]:
+def _rules(symbols: NamedStepEquations, time_step: float) -> list[str]:
     e = symbols.equations
     held = e.lam.numel() > 0
     force = _FORCE_AND_CONSTRAINT_TERMS[e.force_split]
@@ -175,7 +177,7 @@ def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
     ]
 
 
-def _rows(symbols: StepSymbols, block: SymbolBlock, values: dict[str, float], free: Sequence[str]) -> list[str]:
+def _rows(symbols: NamedStepEquations, block: SymbolBlock, values: dict[str, float], free: Sequence[str]) -> list[str]:
     """Every row of a block: whole where it is short, else with the bodies' part, or all of it, as a letter."""
     e, system = symbols.equations, symbols.equations.system
     fixed = [p for p in system.parameters if p.name not in free]
@@ -209,7 +211,7 @@ def _rows(symbols: StepSymbols, block: SymbolBlock, values: dict[str, float], fr
             lines.append(formula(letter, "", whole))
         elif rest is not None:
             pulled = "" if not e.lam.numel() else rf" - G_{{{name}}}"
-            lost = "" if e.closed_form_force is None else r" + \text{drag}"
+            lost = "" if e.force_with_derivatives is None else r" + \text{drag}"
             lines.append(formula(letter, rf"B_{{{name}}}{pulled}{lost} ", ca.substitute(rest[i], old, new)))
         else:
             lines.append(rf"${letter}$: {count} operations, in \texttt{{rows.casadi}} and \texttt{{equations.c}}")

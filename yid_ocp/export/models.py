@@ -23,8 +23,8 @@ from yid_ocp.virtual.mjcf import (
     ParameterEvaluator,
     effect_joint_terms_and_changed_aspects,
     format_xml_numbers,
-    joint_dynamics_terms,
     model_aspects_depending_on_symbols,
+    system_joint_dynamics_terms,
 )
 
 EXPORT_MANIFEST_FORMAT = "yid-export/1"
@@ -79,7 +79,7 @@ def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[
     """The tree in numbers, its bodies without weights of their own, and what its joints have."""
     tree = system.numeric_mechanism(values)
     joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
-    return replace(tree, joints=joints), joint_dynamics_terms(system, ParameterEvaluator(system, values))
+    return replace(tree, joints=joints), system_joint_dynamics_terms(system, ParameterEvaluator(system, values))
 
 
 def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
@@ -125,17 +125,17 @@ def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
 
 
 @dataclass(frozen=True)
-class FormatSupport:
+class FeatureExportSupport:
     """Whether an export format can express a parameter or effect: by which element, or the reason why not."""
 
     status: _SupportStatus
     how: str
 
 
-def _worst(parts: Sequence[FormatSupport]) -> FormatSupport:
+def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
     """The worst status of several parts that belong together, with the explanations of those that have it."""
     status = max((part.status for part in parts), key=get_args(_SupportStatus).index)
-    return FormatSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
+    return FeatureExportSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
 
 
 # what each format calls the aspects that it has; others it has not
@@ -173,24 +173,26 @@ _SDF = {
     "sprung_joint": "spring_stiffness and damping of axes",
     "gravity": "gravity of the world",
 }
-_SUPPORT_BY_FORMAT: Mapping[str, Mapping[str, FormatSupport]] = {
+_SUPPORT_BY_FORMAT: Mapping[str, Mapping[str, FeatureExportSupport]] = {
     name: {
-        aspect: FormatSupport("not representable", f"{name.upper()} has nothing for {words}")
+        aspect: FeatureExportSupport("not representable", f"{name.upper()} has nothing for {words}")
         if aspect not in table
-        else FormatSupport("emulated" if aspect in MUJOCO_APPROXIMATED_ASPECTS else "native", table[aspect])
+        else FeatureExportSupport("emulated" if aspect in MUJOCO_APPROXIMATED_ASPECTS else "native", table[aspect])
         for aspect, words in MODEL_ASPECT_DESCRIPTIONS.items()
     }
     for name, table in (("mjcf", _MJCF), ("urdf", _URDF), ("sdf", _SDF))
 }
 
-_READING = FormatSupport("not representable", f"{MODEL_ASPECT_DESCRIPTIONS['reading']}: correct the readings instead")
-_NEUTRAL = FormatSupport("native", "neutral: it changes nothing and is left out")
-_UNUSED = FormatSupport("native", "it enters nothing in this model")
+_READING = FeatureExportSupport(
+    "not representable", f"{MODEL_ASPECT_DESCRIPTIONS['reading']}: correct the readings instead"
+)
+_NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
+_UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 
-def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FormatSupport]:
+def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
     """Support of an export format (`mjcf`, `urdf`, `sdf`) for each effect of a system, by effect label."""
-    value, found = ParameterEvaluator(system, values), dict[str, FormatSupport]()
+    value, found = ParameterEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
@@ -205,8 +207,8 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
 
 
 def format_support_by_parameter(
-    system: System, effects: Mapping[str, FormatSupport], form: str
-) -> dict[str, FormatSupport]:
+    system: System, effects: Mapping[str, FeatureExportSupport], form: str
+) -> dict[str, FeatureExportSupport]:
     """Support of an export format for each parameter, by name; a parameter of an effect has its effect's support."""
     found = {}
     for entry in system.parameters:

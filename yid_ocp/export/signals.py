@@ -91,7 +91,7 @@ def ros_signals_from_recording(recording: Recording) -> list[RosTopicTimeSeries]
                 ("/joint_commands", "{}_command", ("position", "velocity")),
                 ("/external_efforts", "external_{}", ("effort",)),
             ):
-                channels = {name: group.channels.get(form.format(name)) for name in names}
+                channels = {name: group.values_by_channel.get(form.format(name)) for name in names}
                 values = {name: known for name, known in channels.items() if known is not None}
                 found += [RosTopicTimeSeries(topic, "joints", group.t, values, group.names)] if values else []
         else:
@@ -126,7 +126,7 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
         yield stamp, types[_MESSAGE_TYPES[signal.kind]](header, *content(int(i)))
 
 
-def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
     """Write one table per group, `<group>.csv`, with the columns that `read_csv` knows and all digits.
 
     Standard deviations, the kind of effort, sensor, frame, pose and clock are not in the tables; a point not seen is an
@@ -136,8 +136,9 @@ def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Pa
     written = []
     for group in recording.joint_and_point_groups:
         if isinstance(group, JointGroup):
-            stem, columns = "joints", [f"{channel}_{name}" for channel in group.channels for name in group.names]
-            table = np.column_stack([group.t, *group.channels.values()])
+            stem = "joints"
+            columns = [f"{channel}_{name}" for channel in group.values_by_channel for name in group.names]
+            table = np.column_stack([group.t, *group.values_by_channel.values()])
         else:
             stem, columns = group.name, [f"{name}_{axis}" for name in group.names for axis in "xyz"]
             table = np.column_stack([group.t, group.position.reshape(len(group.t), -1)])

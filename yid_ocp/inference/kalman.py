@@ -22,7 +22,7 @@ import scipy.linalg.lapack
 from numpy.typing import NDArray
 
 from yid_ocp.arrays import Array
-from yid_ocp.integrator.compiler import compiled_shared_library
+from yid_ocp.integrator.compiler import compile_and_load_library
 from yid_ocp.integrator.step_model import out_of_memory_error
 
 
@@ -53,7 +53,7 @@ class FilterStateTransition:
 
 
 @dataclass(frozen=True)
-class KalmanStep:
+class KalmanStepMatrices:
     """One step of a linear Kalman filter with fixed gains: a measurement update, then a state transition.
 
     A state x = (s, p) of s and parameters p is measured by y = H x + e with noise e of unit covariance, and goes on by
@@ -66,12 +66,12 @@ class KalmanStep:
     projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
     transition: FilterStateTransition
 
-    def update_and_propagate(self, mean: Array, measured: Array) -> tuple[Array, Array]:
+    def innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
         """Normalized innovations (r, c) of the measurements (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
-    def smooth_backward(self, white: Array, costate: Array) -> tuple[Array, Array]:
+    def smoothed_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
         """Smoothed measurement noise (r, c), and the costate (nx, c) before the step, from the costate after it.
 
         The smoothed state is the filter's prediction + P costate.
@@ -89,9 +89,9 @@ class KalmanStep:
         return (found + found.T) / 2
 
 
-def kalman_step_and_covariance(
+def kalman_matrices_and_next_covariance(
     covariance: Array, observation: Array, transition: FilterStateTransition
-) -> tuple[KalmanStep, Array, float]:
+) -> tuple[KalmanStepMatrices, Array, float]:
     """A filter step with fixed gains, the state covariance after it without process noise, and log det S.
 
     `covariance` is P (nx, nx) before the measurement by H (r, nx). The determinant is infinite, and S counts by its
@@ -107,16 +107,16 @@ def kalman_step_and_covariance(
         log_determinant = math.inf if failed else 2 * float(np.sum(np.log(np.diag(factor))))
     projected = whitening @ cross
     later = transition.propagate_state(transition.propagate_state(covariance - projected.T @ projected).T)
-    return KalmanStep(observation, whitening, projected, transition), later, log_determinant
+    return KalmanStepMatrices(observation, whitening, projected, transition), later, log_determinant
 
 
 @cache
 def _library() -> ctypes.CDLL | None:
     source = resources.files("yid_ocp.inference").joinpath("kalman.c").read_text(encoding="utf-8")
-    return compiled_shared_library(source, level="-O2")
+    return compile_and_load_library(source, level="-O2")
 
 
-def kalman_steps_and_covariance(
+def kalman_matrices_and_final_covariance(
     covariance: Array,
     observation: Array,
     row_start: Sequence[int],
@@ -124,20 +124,20 @@ def kalman_steps_and_covariance(
     noises: int,
     decay: Array,
     variance: Array,
-) -> tuple[list[KalmanStep], Array]:
+) -> tuple[list[KalmanStepMatrices], Array]:
     """Successive filter steps with fixed gains, and the state covariance after the last; in compiled code if possible.
 
     `moves` (k, ns, ns + m + c) are the state rows of k steps' transitions and, beside them, what c unit `noises` add to
     the states; `decay` (k, nx - ns) is that of the parameters, `variance` (k, nx - ns) that of their process noise.
     Rows of the observation (r, nx) stand in the order of the steps, those of step j from `row_start[j]` to the next.
     """
-    na, ns, library, steps = len(covariance), moves.shape[1], _library(), list[KalmanStep]()
+    na, ns, library, steps = len(covariance), moves.shape[1], _library(), list[KalmanStepMatrices]()
     spans, known = [slice(*ends) for ends in pairwise(row_start)], moves.shape[2] - noises
     transitions = [FilterStateTransition(move[:, :known], own) for move, own in zip(moves, decay, strict=True)]
     if library is None:
         parameters = np.arange(ns, na)
         for k, (span, transition) in enumerate(zip(spans, transitions, strict=True)):
-            step, covariance, _ = kalman_step_and_covariance(covariance, observation[span], transition)
+            step, covariance, _ = kalman_matrices_and_next_covariance(covariance, observation[span], transition)
             steps.append(step)
             covariance[parameters, parameters] += variance[k]
             covariance[:ns, :ns] += moves[k, :, known:] @ moves[k, :, known:].T
@@ -151,5 +151,5 @@ def kalman_steps_and_covariance(
         raise out_of_memory_error("the work on one step of a filter", 4 * covariance.nbytes)
     for span, root, transition in zip(spans, np.split(white, np.cumsum(squares)[:-1]), transitions, strict=True):
         own = observation[span]
-        steps.append(KalmanStep(own, root.reshape(len(own), len(own)), projected[span], transition))
+        steps.append(KalmanStepMatrices(own, root.reshape(len(own), len(own)), projected[span], transition))
     return steps, covariance

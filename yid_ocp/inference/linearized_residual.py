@@ -17,7 +17,7 @@ from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions, TimeGridStateValues
 
 
@@ -32,9 +32,9 @@ class NominalTrajectory:
     model_functions: ModelFunctions
     theta: Array
     rollout: Rollout
-    measurements: Sequence[Measurements]
+    measurements: Sequence[SensorMeasurements]
     tracking_feedback: TrackingFeedback | None
-    node_values: TimeGridStateValues
+    state_values_at_nodes: TimeGridStateValues
     initial_state_by_angles: Array
     initial_state_by_torque: Array
 
@@ -43,12 +43,14 @@ def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
     """Nominal trajectory of an episode, made from the episode's prediction at the parameters `theta`."""
-    own, rest, sizes = predictor.theta_with_episode_values(episode, theta), result.equilibrium, predictor.step.sizes
+    own = predictor.theta_with_episode_values(episode, theta)
+    rest = result.equilibrium
+    sizes = predictor.integrator_step.sizes
     by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
     if rest is not None:
         by_angles, by_torque = rest.state_by_known_coordinates[:, : sizes["nu"]], rest.state_by_torque
     samples = [predictor.delay_corrected_measurements(samples, own) for samples in episode.measurements]
-    about = samples, episode.tracking_feedback, predictor.node_values(result.rollout)
+    about = samples, episode.tracking_feedback, predictor.state_values_at_nodes(result.rollout)
     return NominalTrajectory(predictor.model_functions, own, result.rollout, *about, by_angles, by_torque)
 
 
@@ -78,7 +80,7 @@ class ResidualDerivativesAtNodes:
         parts: list[tuple[Array, ...]] = []
         functions = [course.model_functions.compiled_sensor_function(s.sensor) for s in course.measurements]
         pairs = zip(functions, course.measurements, strict=True)
-        readings = [function(course.node_values.at(s.evaluation_nodes), theta) for function, s in pairs]
+        readings = [function(course.state_values_at_nodes.at(s.evaluation_nodes), theta) for function, s in pairs]
         n_forces, width = (step.sizes["m"], 4) if any(read.needs_neighbours for read in readings) else (0, 2)
         for samples, read in zip(course.measurements, readings, strict=True):
             used = samples.evaluation_nodes
@@ -99,7 +101,7 @@ class ResidualDerivativesAtNodes:
             efforts[:, :, : len(fixed)] = read.by_load[:, :, fixed]
             if read.by_lam.shape[2]:
                 efforts[:, :, len(fixed) :] = read.by_lam
-            sample, column = np.nonzero(samples.used_output_mask)
+            sample, column = np.nonzero(samples.positive_weight_mask)
             at = (sample, column) if samples.node.ndim > 1 else (sample,)
             node, fraction, weight = samples.node[at], samples.fraction[at], samples.weight[sample, column]
             place = np.searchsorted(used, node)
@@ -141,7 +143,7 @@ class ResidualDerivativesAtNodes:
                 found[used] += np.einsum("rx,rxd->rd", by_effort[used], effort[local])
         return found
 
-    def residual_rows_by_node(self, last: int) -> list[IntArray]:
+    def residual_rows_by_first_node(self, last: int) -> list[IntArray]:
         """Indices of the residuals whose first node is node k, one array for each k from 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))

@@ -16,8 +16,8 @@ import scipy.special
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_from_path_cutoff
+from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_with_path_cutoff
 from yid_ocp.sensors.mounted import MountedSensor
 
 RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
@@ -27,12 +27,12 @@ RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual 
 class ExcessResidualCriteria:
     """Significance level and smallest excess chi2 at which a residual counts as exceeding its noise.
 
-    It does where it is significant at the level and chi2/n - 1 is at least `min_excess_chi2`; of the stated standard
+    It does where it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`; of the stated standard
     deviations `noise_fraction_of_std` is noise, the rest represents model error.
     """
 
     significance_level: float = 0.01
-    min_excess_chi2: float = 0.1
+    min_excess_chi2_per_dof: float = 0.1
     noise_fraction_of_std: float = 1.0
 
 
@@ -40,7 +40,7 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
 @dataclass(frozen=True)
-class ResidualChannelIndices:
+class ResidualChannel:
     """Sample times of one scalar sensor output of a recording, and the samples' indices in the residual vector."""
 
     recording: str
@@ -90,7 +90,7 @@ def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedCha
     units: dict[str, str] = {}
     for episode in problem.episodes:
         for samples in episode.measurements:
-            for column, channel in enumerate(samples.output_channel_names):
+            for column, channel in enumerate(samples.channel_name_per_output):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
                 units[channel] = samples.sensor.unit
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
@@ -110,7 +110,7 @@ def chi2_p_value(chi2: float, degrees: float) -> float:
 
 
 def run_null_test(
-    series: Sequence[ResidualChannelIndices],
+    series: Sequence[ResidualChannel],
     residual: Array,
     parameters: int,
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
@@ -150,7 +150,7 @@ def residuals_exceed_noise(
 ) -> bool:
     """Whether residuals of one model, fitted or held out, exceed noise significantly and by a relevant amount."""
     significant = min_bonferroni_p_value(tests) < limits.significance_level
-    return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2
+    return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2_per_dof
 
 
 def min_bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
@@ -159,11 +159,11 @@ def min_bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
 
 
 def _windows(
-    series: Sequence[ResidualChannelIndices], residual: Array, level: float, length: float
+    series: Sequence[ResidualChannel], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
     raw: list[tuple[str, str, float, float]] = []
     p_values: list[float] = []
-    merged: dict[tuple[str, str], list[ResidualChannelIndices]] = {}
+    merged: dict[tuple[str, str], list[ResidualChannel]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
     for (recording, channel), own in merged.items():
@@ -194,31 +194,31 @@ def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: floa
     return real.tolist()
 
 
-def times_since_recording_start(episode: Episode, samples: Measurements) -> Array:
+def times_since_recording_start(episode: Episode, samples: SensorMeasurements) -> Array:
     """Sample times since the start of the recording, shape (M,) [s]."""
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChannelIndices, ...]:
+def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
     """Sample times and residual indices of each scalar sensor output of each recording of a problem."""
-    series: list[ResidualChannelIndices] = []
+    series: list[ResidualChannel] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):
             t = times_since_recording_start(episode, samples)
-            place = np.full(samples.used_output_mask.shape, -1)
-            place[samples.used_output_mask] = np.arange(rows.start, rows.stop)
+            place = np.full(samples.positive_weight_mask.shape, -1)
+            place[samples.positive_weight_mask] = np.arange(rows.start, rows.stop)
             autocorrelation = np.ones(1)
             is_smoothed = isinstance(samples.sensor, MountedSensor) and problem.system.prescribed
             if samples.sensor.effort_joints or is_smoothed:
                 cutoff, step = problem.options.path_cutoff, episode.grid.time_step
-                low_pass = LowPassFilter(cutoff) if is_smoothed else effort_filter_from_path_cutoff(cutoff)
+                low_pass = LowPassFilter(cutoff) if is_smoothed else effort_filter_with_path_cutoff(cutoff)
                 stride = low_pass.decorrelation_stride(step)
                 autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
-            for column, channel in enumerate(samples.output_channel_names):
-                seen = samples.used_output_mask[:, column]
+            for column, channel in enumerate(samples.channel_name_per_output):
+                seen = samples.positive_weight_mask[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
-                    series.append(ResidualChannelIndices(*text, t[seen], place[seen, column], autocorrelation))
+                    series.append(ResidualChannel(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
 
 

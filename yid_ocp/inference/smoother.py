@@ -25,7 +25,7 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.inference.kalman import FilterStateTransition, KalmanStep, kalman_step_and_covariance
+from yid_ocp.inference.kalman import FilterStateTransition, KalmanStepMatrices, kalman_matrices_and_next_covariance
 from yid_ocp.inference.smoother_model import (
     DEFAULT_SMOOTHER_THRESHOLDS,
     LinearResidualModel,
@@ -60,7 +60,7 @@ class SmoothedUnknowns:
 
 
 @dataclass(frozen=True)
-class SmootherResult:
+class SmoothedUnknownsResult:
     """Result of the weak-constraint smoother: smoothed unknowns, and the evidence for every group of unknowns."""
 
     smoothed_unknowns: tuple[SmoothedUnknowns, ...]
@@ -85,7 +85,7 @@ class SmootherResult:
         return float(np.clip(1 - rest / gap, 0.0, 1.0)) if gap > 0 else 0.0
 
     @property
-    def gap_origin(self) -> str:
+    def plant_or_sensor_origin(self) -> str:
         """Origin of the gap: "none", "plant", "sensor", "both", or "either" if plant and sensor are confounded."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
@@ -100,7 +100,7 @@ class SmootherResult:
 class _Update(NamedTuple):
     """One interval of the filter, as its backward pass needs it: prediction `mean`, covariance `p` and innovations."""
 
-    step: KalmanStep
+    step: KalmanStepMatrices
     mean: Array
     p: Array
     white: Array
@@ -145,10 +145,10 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
         transition = FilterStateTransition(move, np.full(nd, model.interval_correlation))
-        step, later, own = kalman_step_and_covariance(p, design, transition)
+        step, later, own = kalman_matrices_and_next_covariance(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, begin, products, math.inf, ())
-        white, after = step.update_and_propagate(mean, interval.negative_residual_jacobian)
+        white, after = step.innovations_and_next_mean(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
         if keep:
@@ -171,7 +171,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
         update = updates[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        noise, r = update.step.smooth_backward(update.white, r)
+        noise, r = update.step.smoothed_noise_and_costate(update.white, r)
         left.append(noise)
         n = update.step.costate_covariance_before_step(n)
         smoothed[j] = (update.mean + update.p @ r)[ns:]
@@ -327,7 +327,7 @@ def select_and_smooth_unknowns(
     x: Array,
     evaluation: Evaluation,
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
-) -> SmootherResult:
+) -> SmoothedUnknownsResult:
     """Choose the groups of unknowns with the largest evidence at a whitened problem's fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
@@ -353,7 +353,7 @@ def select_and_smooth_unknowns(
         detectable = {source: math.sqrt(limits.detectable_chi2 / score) for source, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
         least = limits.min_log_bayes_factor
-        return SmootherResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
+        return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
 
 
 def force_log_likelihood_coefficients(

@@ -31,9 +31,9 @@ from yid_ocp.inference.linearized_residual import (
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import (
-    applied_joint_torque,
+    applied_driven_joint_torques,
     moving_observable_state_mask,
-    step_maps,
+    rollout_step_derivatives,
 )
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -137,9 +137,9 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
         if sensor.effort_joints:
             continue  # at a prescribed joint a bias and a force are the same
         for column, name in enumerate(sensor.output_names):
-            if not np.any(samples.used_output_mask[:, column]):
+            if not np.any(samples.positive_weight_mask[:, column]):
                 continue
-            frame = sensor.output_frames[column]
+            frame = sensor.output_frame_names[column]
             biased.append((k, column))
             names.append(name)
             sources.append(SmoothedUnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
@@ -192,7 +192,7 @@ def _loads(course: _LinearizedEpisode) -> Array:
         values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.nominal.theta)).ravel()
         for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-    torque = applied_joint_torque(course.problem.step, course.nominal.theta, rollout)
+    torque = applied_driven_joint_torques(course.problem.step, course.nominal.theta, rollout)
     for indices, force in (
         (system.driven_coordinate_indices, torque),
         (system.prescribed_coordinate_indices, rollout.effort),
@@ -279,7 +279,7 @@ def recording_models_with_unknown_forces(
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        theta, _ = problem.theta_and_initial_state_offset(x, i)
+        theta, _ = problem.theta_and_initial_state_deviation(x, i)
         nominal = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
         blocks = [samples.residual_and_jacobian(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
@@ -329,7 +329,7 @@ def _steps(
         # before; this step's stands for it)
         followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
         inputs = feedback.gain @ followed
-    found = step_maps(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span)
+    found = rollout_step_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span)
     for k, pair in enumerate((pair for some in found for pair in zip(*some, strict=True)), span.start):
         state, own = (np.hstack([one[:, moving], one[:, nx : nx + width] + one[:, nx + width :]]) for one in pair)
         loaded = slice(len(moving), len(moving) + forces)
@@ -408,8 +408,8 @@ def _loose_start(course: _LinearizedEpisode) -> Array:
     options, joints = problem.options, course.system.mechanism.joint_names
     inertia = mass_matrix_diagonal_at_zero(problem.step, course.nominal.theta, tuple(joints[i] for i in free))
     loose = np.zeros(problem.step.sizes["nx"])
-    loose[free] = options.start_configuration_std
-    loose[course.system.n_coordinates + free] = options.start_velocity_std * np.abs(inertia)
+    loose[free] = options.initial_configuration_std
+    loose[course.system.n_coordinates + free] = options.initial_velocity_std * np.abs(inertia)
     return loose
 
 
@@ -439,7 +439,7 @@ def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Arr
     reference, found = unknowns.reference[unknowns.driving :], []
     group, output = np.array(unknowns.biased, int).reshape(-1, 2).T
     for k, samples in enumerate(course.episode.measurements):
-        sample, column = np.nonzero(samples.used_output_mask)
+        sample, column = np.nonzero(samples.positive_weight_mask)
         own = reference * ((group == k) & (output == column[:, None]))
         found.append(samples.decorrelate(samples.weight[sample, column][:, None] * own))
     return np.concatenate(found)

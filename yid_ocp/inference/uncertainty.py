@@ -91,12 +91,12 @@ def assess_goodness_of_fit(
         parts = [np.zeros(0)]
         for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True):
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
-                parts.append(((predicted - samples.value) / samples.std)[samples.used_output_mask])
+                parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
         residual = np.concatenate(parts)
     series = residual_channel_indices(problem)
     found = run_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
-    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_serious_data_issues)
+    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.all_data_issues_are_warnings)
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
@@ -327,7 +327,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     def kind(name: str) -> str:
         return name.rpartition(".")[2]
 
-    (theta, _), entries = problem.theta_and_initial_state_offset(x, 0), list(problem.system.parameters)
+    (theta, _), entries = problem.theta_and_initial_state_deviation(x, 0), list(problem.system.parameters)
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
     scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
@@ -360,7 +360,7 @@ def parameter_estimates(
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
-    sizes, theta = typical_parameter_magnitudes(problem, x), problem.theta_and_initial_state_offset(x, 0)[0]
+    sizes, theta = typical_parameter_magnitudes(problem, x), problem.theta_and_initial_state_deviation(x, 0)[0]
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}
     free = {name: problem.unknown_names.index(name) for name in parameter_unknown_names(problem)}
@@ -391,13 +391,13 @@ def parameter_estimates(
     return result
 
 
-def estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+def all_estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
     """Copies of estimates with the verdict not_trusted, except for fixed and not_identifiable parameters."""
     doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}
 
 
-VERDICT_PREDICATES: Mapping[str, str] = {
+VERDICT_SENTENCE_TEXTS: Mapping[str, str] = {
     "fixed": "is fixed",
     "identifiable": "is found",
     "weak": "is weakly determined",
@@ -406,7 +406,7 @@ VERDICT_PREDICATES: Mapping[str, str] = {
     "not_trusted": "is not to be trusted",
 }
 """Sentence predicate for a parameter of each verdict."""
-VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VERDICT_PREDICATES.items()}
+VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VERDICT_SENTENCE_TEXTS.items()}
 
 
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
@@ -432,7 +432,7 @@ def finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def percent_text(part: float) -> str:
+def percent_number_text(part: float) -> str:
     """Format a fraction as a percentage with two digits, without exponents below 10000 %."""
     return f"{100 * part:.2g}" if 100 * part < 99.5 else f"{100 * part:.0f}" if part < 100 else f"{100 * part:.2g}"
 

@@ -41,22 +41,22 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.kalman import (
     FilterStateTransition,
-    KalmanStep,
-    kalman_step_and_covariance,
-    kalman_steps_and_covariance,
+    KalmanStepMatrices,
+    kalman_matrices_and_final_covariance,
+    kalman_matrices_and_next_covariance,
 )
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
     ResidualDerivativesAtNodes,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import moving_observable_state_mask, step_maps
+from yid_ocp.integrator.step import moving_observable_state_mask, rollout_step_derivatives
 from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
-from yid_ocp.problem.evaluation import ResidualWhitener
+from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
 
 _MIN_TORQUE_GAIN = 0.1  # acting over recorded torque at which errors of one are converted into those of the other
@@ -68,7 +68,7 @@ class _FilterStep(NamedTuple):
     """One step of a frozen filter of (d, w, b)."""
 
     rows: IntArray  # of the residual
-    kalman: KalmanStep
+    kalman: KalmanStepMatrices
     by_torque: Array  # their slopes by a known torque, shape (r, nu)
 
     @property
@@ -90,12 +90,12 @@ class WhiteningFilter:
     """Kalman filter, linearized along one rollout, that whitens the residual of a recording."""
 
     filter_steps: tuple[_FilterStep, ...]  # one for every node
-    input_errors: InputErrorModel  # with the values of b and w about which it is linearised
+    input_error_model: InputErrorModel  # with the values of b and w about which it is linearised
     initial_covariance: Array  # of (d, w, b) before all measurements, shape (na, na)
     state_mask: BoolArray  # states that d is made up of, shape (nx,)
     torque_bias_std: Array  # of b after all measurements, shape (nu,) [N m]
 
-    def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+    def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Normalized innovations (r, c) of residual columns, and torque biases (nu, c) [N m] estimated from all rows.
 
         Rows (r, c) are a residual in units of the sensors' noise, then columns of its derivative; `push` (N, nu, c) is
@@ -104,13 +104,13 @@ class WhiteningFilter:
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for k, step in enumerate(self.filter_steps):
             result[step.rows], mean = self._updated(k, mean, rows[step.rows], push)
-        bias = mean[-len(self.input_errors.torque_bias) :]
-        bias[:, 0] += self.input_errors.torque_bias
+        bias = mean[-len(self.input_error_model.torque_bias) :]
+        bias[:, 0] += self.input_error_model.torque_bias
         return result, bias
 
-    def smooth(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
-        """Smoothed torque and state errors given all measurements; arguments as in `whiten` (Bryson, Frazier 1963)."""
-        errors, last = self.input_errors, len(self.filter_steps) - 1
+    def smooth_input_errors(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
+        """Smoothed torque and state errors given all measurements (Bryson, Frazier 1963); arguments as in whitening."""
+        errors, last = self.input_error_model, len(self.filter_steps) - 1
         nu, ns = len(errors.torque_bias), int(np.count_nonzero(self.state_mask))
         torque = slice(ns, ns + nu)
         column, noise = rows[:, None], np.zeros((len(rows), 1))
@@ -123,7 +123,7 @@ class WhiteningFilter:
             step = self.filter_steps[k]
             if not step.holds_noise:
                 white[k + 1] = errors.torque_std**2 * costate[torque, 0]
-            noise[step.rows], costate = step.kalman.smooth_backward(noise[step.rows], costate)
+            noise[step.rows], costate = step.kalman.smoothed_noise_and_costate(noise[step.rows], costate)
         mean = self._expected(1) + self.initial_covariance @ costate
         white[0] = errors.torque_noise[0] + mean[torque, 0]
         error = np.zeros((last + 1, len(self.state_mask)))
@@ -138,21 +138,23 @@ class WhiteningFilter:
 
     def _expected(self, columns: int) -> Array:
         """Mean of (d, w, b) before all measurements; no derivative in further columns, shape (na, columns)."""
-        known = np.concatenate([self.input_errors.torque_noise[0], self.input_errors.torque_bias])
+        known = np.concatenate([self.input_error_model.torque_noise[0], self.input_error_model.torque_bias])
         mean = np.zeros((len(self.initial_covariance), columns))
         mean[len(mean) - len(known) :, 0] = -known
         return mean
 
     def _updated(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
         """Innovations of step k, and the mean of another w after it."""
-        step, nu = self.filter_steps[k], len(self.input_errors.torque_bias)
+        step, nu = self.filter_steps[k], len(self.input_error_model.torque_bias)
         known = None if push is None or k >= len(push) else push[k]
-        white, later = step.kalman.update_and_propagate(mean, own if known is None else own - step.by_torque @ known)
+        white, later = step.kalman.innovations_and_next_mean(
+            mean, own if known is None else own - step.by_torque @ known
+        )
         if known is not None:
             move = step.kalman.transition.state_rows
             later[: len(move)] += move[:, len(move) : len(move) + nu] @ known
         if not step.holds_noise:
-            later[len(later) - 2 * nu : len(later) - nu, 0] -= self.input_errors.torque_noise[k + 1]
+            later[len(later) - 2 * nu : len(later) - nu, 0] -= self.input_error_model.torque_noise[k + 1]
         return white, later
 
 
@@ -162,7 +164,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course)
     live = moving_observable_state_mask(step, course.theta, course.rollout, seen=slopes.visible_state_mask)
     kept = np.flatnonzero(live)
-    rows_of_node, slopes = slopes.residual_rows_by_node(count), slopes.select_states(kept)
+    rows_of_node, slopes = slopes.residual_rows_by_first_node(count), slopes.select_states(kept)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
@@ -172,7 +174,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
     transition = FilterStateTransition(np.eye(len(kept), len(kept) + nu), np.ones(2 * nu))
-    kalman, covariance, _ = kalman_step_and_covariance(covariance, observe, transition)
+    kalman, covariance, _ = kalman_matrices_and_next_covariance(covariance, observe, transition)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
     return WhiteningFilter((*made, _FilterStep(rows, kalman, none)), errors, first, live, spread)
 
@@ -196,7 +198,7 @@ def _filter_steps(
         feedback = None
     elif feedback is not None:
         # what torques of the step before add to the momenta that the filter follows
-        momentum = course.model_functions.reference_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
+        momentum = course.model_functions.effect_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
         driving = applied_torque_by_torque_error(feedback.gain, momentum)
         # an error of the angles that the filter follows; that of the momenta as their slope averages out
         shaken = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
@@ -206,7 +208,9 @@ def _filter_steps(
     ordered = slopes.select_residual_rows(np.concatenate(rows_of_node))
     (before, after), by_effort = ordered.by_state, ordered.by_effort.sum(axis=0)
     ends = np.cumsum([0, *map(len, rows_of_node)])
-    for state, effort in step_maps(course.model_functions.step, course.theta, course.rollout, inputs, feedback):
+    for state, effort in rollout_step_derivatives(
+        course.model_functions.step, course.theta, course.rollout, inputs, feedback
+    ):
         span = slice(len(made), len(made) + len(state))
         move = state if ns == nx else state[:, kept[:, None], columns]
         starts, own = ends[span.start : span.stop + 1], slice(ends[span.start], ends[span.stop])
@@ -220,14 +224,16 @@ def _filter_steps(
         observe[:, known:] = observe[:, ns:known]
         observe[:, :ns] += before[own]
         noise = (inputs.shape[2] - nu, decay[span], variance[span])
-        steps, covariance = kalman_steps_and_covariance(covariance, observe, starts, move, *noise)
+        steps, covariance = kalman_matrices_and_final_covariance(covariance, observe, starts, move, *noise)
         made += map(_FilterStep, rows_of_node[span], steps, np.split(by_torque, starts[1:-1]))
     return made, covariance
 
 
-def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:
+def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
     """Constant torque error (nu,) [N m] of each driven joint, estimated from all measurements of an episode."""
-    return whitening.whiten(_plain(episode, result)[:, None], result.torque_correction_and_sensitivity)[1][:, 0]
+    return whitening.whiten_and_estimate_torque_bias(
+        _plain(episode, result)[:, None], result.torque_correction_and_sensitivity
+    )[1][:, 0]
 
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:
@@ -259,7 +265,7 @@ def _whitened_episode(
     if isinstance(result, str) or episode.input_errors is None:
         return episode, None
     if before is not None and keep_weights:
-        return episode, replace(before, input_errors=episode.input_errors)
+        return episode, replace(before, input_error_model=episode.input_errors)
     course = nominal_trajectory_from_prediction(predictor, episode, result, at[0])
     return episode, _build_whitening_filter(course, episode.input_errors)
 
@@ -270,14 +276,14 @@ def _about_smoothed(
     """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
-    found = before.smooth(_plain(episode, result), result.torque_correction_and_sensitivity)
+    found = before.smooth_input_errors(_plain(episode, result), result.torque_correction_and_sensitivity)
     own = predictor.theta_with_episode_values(episode, theta)
     errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
-        inputs = predictor.inputs_with_reference_momentum_shift(episode, own, (), result.rollout.state[0])
+        inputs = predictor.inputs_with_effect_momentum_shift(episode, own, (), result.rollout.state[0])
         driven = predictor.system.driven_coordinate_indices
-        guided = inputs.corrected_feedback(feedback, driven, episode.measured_driven_angles)
+        guided = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         assert guided is not None
         true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
         errors = replace(errors, smoothed_reference=true - (guided.reference - feedback.reference))
@@ -296,7 +302,7 @@ def _behind_effects(
         # a reading of which hardly anything acts says nothing of what is wrong with it
         seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
         read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
-    plain = errors.with_torque_bias_only
+    plain = errors.torque_bias_part
     both = (replace(episode, input_errors=own) for own in (plain, replace(plain, recorded_torque_noise=read)))
     none, without = (predictor.corrected_inputs(own, theta, ()).torque for own in both)
     return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=none - without)
@@ -316,7 +322,7 @@ def problem_whitened_at(
 
     def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
         before = _own_filter(problem.whitening_filters[i])
-        own = problem.theta_and_initial_state_offset(x, i)
+        own = problem.theta_and_initial_state_deviation(x, i)
         return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before)
 
     if not problem.has_process_noise:
@@ -346,13 +352,15 @@ def problem_with_whitened_held_out(
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
     """The problem with filters relinearized about the torque offsets at `x`, not at `frozen`; weights unchanged."""
-    parts = problem.theta_and_initial_state_offset
+    parts = problem.theta_and_initial_state_deviation
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
 
 
-def problem_with_relinearized_held_out(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
+def problem_with_relinearized_held_out_whitening(
+    problem: EstimationProblem, x: Array, frozen: Array
+) -> EstimationProblem:
     """The problem with held-out filters relinearized about the torque offsets at `x`, not at `frozen`."""
     before = problem.held_out_theta(frozen)
     at = [(*own, before) for own in problem.held_out_prediction_inputs(x)]
@@ -362,7 +370,7 @@ def problem_with_relinearized_held_out(problem: EstimationProblem, x: Array, fro
 
 def problem_whitened_by_sensor_noise(problem: EstimationProblem) -> EstimationProblem:
     """The same problem whitened by sensor noise alone, with the torque offsets estimated so far."""
-    return _with_errors(problem, lambda errors: errors.with_torque_bias_only)
+    return _with_errors(problem, lambda errors: errors.torque_bias_part)
 
 
 def problem_without_input_errors(problem: EstimationProblem) -> EstimationProblem:
@@ -388,7 +396,7 @@ def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike
     found: list[tuple[Array, Array] | None] = []
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
         whitening = _own_filter(own)
-        parts = problem.theta_and_initial_state_offset(x, i)
+        parts = problem.theta_and_initial_state_deviation(x, i)
         result = "" if whitening is None else problem.predictor.predict_episode(episode, *parts, False)
         if whitening is None or isinstance(result, str):
             found.append(None)
@@ -397,7 +405,7 @@ def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike
     return found
 
 
-def _own_filter(whitening: ResidualWhitener | None) -> WhiteningFilter | None:
+def _own_filter(whitening: ProcessNoiseWhitener | None) -> WhiteningFilter | None:
     assert whitening is None or isinstance(whitening, WhiteningFilter)
     return whitening
 
@@ -405,14 +413,14 @@ def _own_filter(whitening: ResidualWhitener | None) -> WhiteningFilter | None:
 def _relinearized(
     predictor: EpisodePredictor,
     episodes: Sequence[Episode],
-    known: Sequence[ResidualWhitener | None],
+    known: Sequence[ProcessNoiseWhitener | None],
     at: Sequence[tuple[Episode, Array, Array, Array]],
 ) -> tuple[tuple[Episode, ...], tuple[WhiteningFilter | None, ...]]:
     """Episodes and filters about the torque offsets at (episode, theta, offset), so far linearized at a theta."""
     pairs = zip(map(_own_filter, known), at, strict=True)
     made = tuple(own and _settled(predictor, own, *told) for own, told in pairs)
     both = zip(episodes, made, strict=True)
-    return tuple(e if own is None else replace(e, input_errors=own.input_errors) for e, own in both), made
+    return tuple(e if own is None else replace(e, input_errors=own.input_error_model) for e, own in both), made
 
 
 def _settled(
@@ -423,11 +431,11 @@ def _settled(
     now, before = (predictor.corrected_inputs(episode, own, ()).torque for own in both)
 
     def about(offset: Array) -> WhiteningFilter:
-        return replace(whitening, input_errors=replace(whitening.input_errors, torque_bias=offset))
+        return replace(whitening, input_error_model=replace(whitening.input_error_model, torque_bias=offset))
 
-    made = trial = about(whitening.input_errors.torque_bias + np.mean(now - before, axis=0))
-    for _ in range(_MAX_ROLLOUTS if np.any(whitening.input_errors.torque_bias_std > 0) else 0):
-        own = replace(episode, input_errors=trial.input_errors)
+    made = trial = about(whitening.input_error_model.torque_bias + np.mean(now - before, axis=0))
+    for _ in range(_MAX_ROLLOUTS if np.any(whitening.input_error_model.torque_bias_std > 0) else 0):
+        own = replace(episode, input_errors=trial.input_error_model)
         result = predictor.predict_episode(own, theta, start, False)
         if isinstance(result, str):
             break
@@ -437,15 +445,15 @@ def _settled(
     return made
 
 
-def max_torque_bias_change_between_filters(
-    some: Sequence[ResidualWhitener | None], others: Sequence[ResidualWhitener | None]
+def torque_bias_change_in_stds(
+    some: Sequence[ProcessNoiseWhitener | None], others: Sequence[ProcessNoiseWhitener | None]
 ) -> float:
     """Largest difference between the torque offsets of two sets of filters, in stated standard deviations."""
     pairs = zip(some, others, strict=True)
     return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)
 
 
-def _apart(one: ResidualWhitener, other: ResidualWhitener) -> float:
-    stated = one.input_errors.torque_bias_std > 0
-    apart = np.abs(one.input_errors.torque_bias - other.input_errors.torque_bias)
-    return float(np.max(apart[stated] / one.input_errors.torque_bias_std[stated], initial=0.0))
+def _apart(one: ProcessNoiseWhitener, other: ProcessNoiseWhitener) -> float:
+    stated = one.input_error_model.torque_bias_std > 0
+    apart = np.abs(one.input_error_model.torque_bias - other.input_error_model.torque_bias)
+    return float(np.max(apart[stated] / one.input_error_model.torque_bias_std[stated], initial=0.0))

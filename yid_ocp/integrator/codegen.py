@@ -57,8 +57,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
-    if e.closed_form_force_impulses is not None:
-        bodies = [part + push for part, push in zip(bodies, e.closed_form_force_impulses, strict=True)]
+    if e.force_with_derivatives_impulses is not None:
+        bodies = [part + push for part, push in zip(bodies, e.force_with_derivatives_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)
@@ -97,8 +97,8 @@ def _pairs(e: DiscreteEquations) -> ca.SX:
     plus, minus = rigid.S + h / 2 * rigid.D, rigid.S - h / 2 * rigid.D
     lower, upper = rigid.B / 2 - rigid.F / h, rigid.B / 2 + rigid.F / h
     parts = [plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G]
-    if e.closed_form_force is not None:
-        parts += [e.closed_form_force.A, h / 2 * e.closed_form_force.T]
+    if e.force_with_derivatives is not None:
+        parts += [e.force_with_derivatives.A, h / 2 * e.force_with_derivatives.T]
     return ca.vertcat(*(ca.vec(ca.densify(part).T) for part in parts))
 
 
@@ -232,7 +232,7 @@ def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batche
 def _kernel_sizes(functions: StepFunctions, tables: StepSparsityTables) -> dict[str, float]:
     e, system = functions.equations, functions.equations.system
     n, nz, m, nc = system.n_coordinates, e.z0.numel(), e.lam.numel(), len(system.prescribed)
-    left, right = e.closed_form_force_shares
+    left, right = e.force_with_derivatives_shares
     return {
         **{"N": n, "NZ": nz, "M": m, "NU": e.u.numel(), "NC": nc, "NF": n - nc},
         **{"NY": len(tables.elimination_order), "NT": n + nz + m, "NTHETA": e.theta.numel()},
@@ -241,7 +241,7 @@ def _kernel_sizes(functions: StepFunctions, tables: StepSparsityTables) -> dict[
         "SZ_IW": max(f.sz_iw() for f in functions.all_functions),
         "ROW_SCALED": int(bool(system.joint_compliances)),
         "MIDDLE": int(bool(e.constraint_impulses.midpoint_share)),
-        **{"CLOSED": int(e.closed_form_force is not None), "CLOSED_LEFT": left, "CLOSED_RIGHT": right},
+        **{"CLOSED": int(e.force_with_derivatives is not None), "CLOSED_LEFT": left, "CLOSED_RIGHT": right},
     }
 
 

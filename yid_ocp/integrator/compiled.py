@@ -18,20 +18,20 @@ from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
-    CostGradient,
-    CostSlopes,
-    NewtonStatus,
+    CostDerivativesByRollout,
+    NewtonStatusCode,
     Rollout,
+    RolloutCostGradient,
     RolloutInputs,
     StepEquationLinearizations,
     StepModel,
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
-    attach_step_status,
     out_of_memory_error,
+    rollout_with_status,
 )
-from yid_ocp.parallel import CasadiLockedCache, batched_call, map_in_threads
+from yid_ocp.parallel import CasadiLockedCache, call_batched_across_threads, map_in_threads
 
 _BATCH_COST, _BATCH_COST_PER_COLUMN = 1.7, 0.11
 """Cost of a batch in rollouts of one member, whatever its size, and the extra cost per sensitivity column."""
@@ -130,7 +130,7 @@ class CompiledKernel:
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate several rollouts in C, one per entry of `members`, in SIMD batches where that is faster."""
-        return batched_call(self._rollouts, list(members))
+        return call_batched_across_threads(self._rollouts, list(members))
 
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         alike: dict[Hashable, list[int]] = {}
@@ -193,25 +193,30 @@ class CompiledKernel:
         by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
         _check(library.yid_rollout(ctypes.c_int(len(members)), *filled, by, outcomes), outcomes[0])
         ends = ((o.status, o.step, o.error, (o.iterations, o.factorisations)) for o in outcomes)
-        return [attach_step_status(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
+        return [rollout_with_status(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
 
     def adjoint_gradient(
-        self, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, names: tuple[str, ...], by: CostSlopes
-    ) -> CostGradient:
+        self,
+        theta: Array,
+        rollout: Rollout,
+        feedback: TrackingFeedback | None,
+        names: tuple[str, ...],
+        by: CostDerivativesByRollout,
+    ) -> RolloutCostGradient:
         """Gradient of a cost along a rollout by the adjoint method in C; `by` holds the cost's derivatives."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
-        gradient = CostGradient(*(np.zeros(shape) for shape in shapes))
+        gradient = RolloutCostGradient(*(np.zeros(shape) for shape in shapes))
         motion = self._motion(steps, theta, None, None, feedback, self._directions(names, len(names)))
         along, partials = _along(rollout.state, rollout.multipliers, rollout.torque), map(_doubles, by)
         made = _filled(_Gradient, *vars(gradient).values())
         code = self._call("yid_adjoint", motion, along, _filled(_Partials, *partials), made)
-        if code != NewtonStatus.OK:
+        if code != NewtonStatusCode.OK:
             for array in vars(gradient).values():
                 array[:] = np.nan
         return gradient
 
-    def linearize(
+    def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
         """Step residuals and, with `derivatives`, Jacobians along a trajectory, evaluated in C."""
@@ -225,16 +230,16 @@ class CompiledKernel:
         self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
 
-    def step_maps(
+    def rollout_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, evaluated in C; arguments and shapes as in `step.step_maps`."""
+        """Derivatives of a rollout's steps, in C; arguments and shapes as in `step.rollout_step_derivatives`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)
         made = _filled(_StepMaps, *widths, _doubles(inputs), *map(_doubles, loads), after, effort)
         motion, given = self._motion(count, theta, None, None, feedback, None), (along.multipliers, along.torque)
-        if self._call("yid_step_maps", motion, _along(along.state, *given), made) != NewtonStatus.OK:
+        if self._call("yid_step_maps", motion, _along(along.state, *given), made) != NewtonStatusCode.OK:
             raise np.linalg.LinAlgError("the equations of a step are singular")
         return after, effort
 
@@ -272,7 +277,7 @@ class CompiledKernel:
 
 
 def _check(code: int, outcome: Any) -> None:
-    if code == NewtonStatus.OUT_OF_MEMORY:
+    if code == NewtonStatusCode.OUT_OF_MEMORY:
         raise out_of_memory_error("the work on one step", outcome.memory)
 
 
@@ -290,7 +295,7 @@ def _width(member: RolloutInputs) -> int:
 def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
     source = codegen.kernel_c_source(model.functions, model.index_tables, batched=True)
-    library = None if source is None else compiler.compiled_shared_library(source)
+    library = None if source is None else compiler.compile_and_load_library(source)
     count = 0 if library is None else int(library.yid_simd_width())
     return None if library is None or not count else (library, count)
 
@@ -308,7 +313,7 @@ def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]
 
     places = [str(model.system.parameters.index(name)) for name in names]
     told = "\0".join([file_sha256(Path(codegen.__file__)), Path(kernel._name).name, *places])
-    library = compiler.compiled_shared_library(told, source)
+    library = compiler.compile_and_load_library(told, source)
     if library is None:
         raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
     function = ca.external("by_theta", library._name)

@@ -28,7 +28,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.codegen import casadi_c_source, nonzero_indices
-from yid_ocp.integrator.step_model import NewtonStatus, out_of_memory_error
+from yid_ocp.integrator.step_model import NewtonStatusCode, out_of_memory_error
 from yid_ocp.parallel import CasadiLockedCache
 
 _LOG = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ def _machine() -> str:
     return f"{version}|{platform.system()}|{processor}"
 
 
-def compiled_shared_library(
+def compile_and_load_library(
     source: str, make: Callable[[], str] | None = None, level: str | None = None
 ) -> ctypes.CDLL | None:
     """Compile a C source, or take it from the cache, and load the shared library; None if no compiler works.
@@ -264,7 +264,7 @@ class MappedFunction:
         self.shared_inputs = frozenset(shared_inputs)
         self._inputs = [function.numel_in(i) for i in range(function.n_in())]
         self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
-        self._library = compiled_shared_library(self._source()) if use_compiler else None
+        self._library = compile_and_load_library(self._source()) if use_compiler else None
         self._mapped = CasadiLockedCache[int, ca.Function](function.map)
 
     def _source(self) -> str:
@@ -283,11 +283,11 @@ int yid_map(int count, const double **in, double **out) {{
     double *res[{max(f.sz_res(), 1)}];
     double *w = YID_ALLOCATE({max(f.sz_w(), 1)}, sizeof(double));
     long long *iw = YID_ALLOCATE({max(f.sz_iw(), 1)}, sizeof(long long));
-    int status = w && iw ? {NewtonStatus.OK.value} : {NewtonStatus.OUT_OF_MEMORY.value};
+    int status = w && iw ? {NewtonStatusCode.OK.value} : {NewtonStatusCode.OUT_OF_MEMORY.value};
     for (int k = 0; k < count && !status; k++) {{
         for (int i = 0; i < {len(self._inputs)}; i++) arg[i] = in[i] + (size_t)k * stride[i];
         for (int o = 0; o < {len(self._outputs)}; o++) res[o] = out[o] + (size_t)k * width[o];
-        if ({name}(arg, res, iw, w, 0)) status = {NewtonStatus.NOT_FINITE.value};
+        if ({name}(arg, res, iw, w, 0)) status = {NewtonStatusCode.NOT_FINITE.value};
     }}
     YID_FREE(w);
     YID_FREE(iw);
@@ -307,9 +307,9 @@ int yid_map(int count, const double **in, double **out) {{
             pointers = (ctypes.c_void_p * max(len(arrays), 1))(*(a.ctypes.data for a in arrays))
             targets = (ctypes.c_void_p * len(values))(*(v.ctypes.data for v in values))
             code = self._library.yid_map(ctypes.c_int(count), pointers, targets)
-            if code == NewtonStatus.OUT_OF_MEMORY:
+            if code == NewtonStatusCode.OUT_OF_MEMORY:
                 raise out_of_memory_error(self.function.name(), 8 * (self.function.sz_w() + self.function.sz_iw()))
-            if code != NewtonStatus.OK:
+            if code != NewtonStatusCode.OK:
                 raise RuntimeError(f"CasADi could not evaluate {self.function}")
         elif count:
             columns = [np.tile(a, (count, 1)).T if i in self.shared_inputs else a.T for i, a in enumerate(arrays)]

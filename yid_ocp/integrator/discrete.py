@@ -29,13 +29,13 @@ import casadi as ca
 from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import (
     Kinematics,
-    RigidBodyLagrangianDerivatives,
+    MultibodyLagrangianDerivatives,
     forward_kinematics,
     lagrangian_second_derivatives,
     rigid_body_lagrangian_derivatives,
 )
 from yid_ocp.model.mechanism import Frame, Placement
-from yid_ocp.model.system import ForceWithDerivatives, Grasp, MidpointState, System
+from yid_ocp.model.system import ForceWithDerivativeFactors, Grasp, MidpointState, System
 
 ForceSplit = Literal["symmetric", "left"]
 ConstraintForcePlacement = Literal["node", "midpoint"]
@@ -97,13 +97,15 @@ class DiscreteEquations:
     # where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) has 1 minus it
     constraint_relaxation_gain: ca.SX | None
     p1: ca.SX
-    rigid_body_terms: RigidBodyLagrangianDerivatives
+    rigid_body_terms: MultibodyLagrangianDerivatives
     # `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force: for
     # Jacobians without differentiating the tree
     balance_remainder: ca.SX
     p1_remainder: ca.SX
-    closed_form_force: ForceWithDerivatives | None  # sum of those that effects give with their slopes, at the midpoint
-    closed_form_force_shares: tuple[float, float]  # parts of its impulse h F in `momentum_balance` and in `p1`
+    force_with_derivatives: (
+        ForceWithDerivativeFactors | None
+    )  # sum of those that effects give with their slopes, at the midpoint
+    force_with_derivatives_shares: tuple[float, float]  # parts of its impulse h F in `momentum_balance` and in `p1`
     constraint_impulses: _ConstraintImpulses
     row_scale: ca.SX  # factor on rows of the bodies' part and of `constraint_impulses`: 1, or a compliance, (n, 1)
 
@@ -119,11 +121,11 @@ class DiscreteEquations:
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
-    def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
+    def force_with_derivatives_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """Impulses (n, 1) [N m s] of the closed-form force in `momentum_balance` and `p1`; None without one."""
-        if self.closed_form_force is None:
+        if self.force_with_derivatives is None:
             return None
-        force, (left, right) = self.closed_form_force.force, self.closed_form_force_shares
+        force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares
         return left * self.h * self.row_scale * force, right * self.h * self.row_scale * force
 
     @property
@@ -175,7 +177,7 @@ def discrete_equations(
     if closed is not None:
         balance += share * h * scale * closed.force
         p1 += (1 - share) * h * scale * closed.force
-        closed = ForceWithDerivatives(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
+        closed = ForceWithDerivativeFactors(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
     symbols = {name: getattr(at, name) for name in ("q0", "q1", "z0", "z1", "p0", "lam", "u", "time_step", "h")}
     rigid_at_midpoint = {name: at.placed(value) for name, value in vars(rigid).items()}
     return DiscreteEquations(
@@ -190,11 +192,11 @@ def discrete_equations(
         constraint_residual=constraint,
         constraint_relaxation_gain=gain,
         p1=at.placed(p1),
-        rigid_body_terms=RigidBodyLagrangianDerivatives(**rigid_at_midpoint),
+        rigid_body_terms=MultibodyLagrangianDerivatives(**rigid_at_midpoint),
         balance_remainder=at.placed(balance_rest),
         p1_remainder=at.placed(p1_rest),
-        closed_form_force=closed,
-        closed_form_force_shares=(share, 1 - share),
+        force_with_derivatives=closed,
+        force_with_derivatives_shares=(share, 1 - share),
         constraint_impulses=pulls,
         row_scale=ca.densify(scale),
     )
@@ -222,7 +224,7 @@ class _Symbols:
 
     @staticmethod
     def from_system(system: System) -> _Symbols:
-        internal = system.internal_coordinate_symbols
+        internal = system.effect_internal_coordinate_symbols
         n, m, nz = system.n_coordinates, system.n_constraints, len(internal)
         sizes = {"q0": n, "q1": n, "p0": n, "z0": nz, "z1": nz, "lam": m, "u": len(system.driven), "time_step": 1}
         sizes |= {"qm": n, "vm": n, "zm": nz, "z_rate": nz, "pull_rate": m}
@@ -241,16 +243,16 @@ class _Symbols:
 
 def _summed_terms(
     system: System, at: _Symbols, kinematics: Kinematics
-) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithDerivatives | None]:
+) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithDerivativeFactors | None]:
     """Lagrangian, force, internal equations (in motion, at rest) and closed force of springs, inputs and effects."""
-    names = tuple(system.internal_coordinate_symbols)
+    names = tuple(system.effect_internal_coordinate_symbols)
     rows_of = {name: i for i, name in enumerate(names)}
     state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
     energy = -system.elastic_energy(at.qm)
     force, viscous = system.input_force(at.u, at.qm, at.vm), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}
     at_rest: dict[str, ca.SX] = {}
-    closed: list[ForceWithDerivatives] = []
+    closed: list[ForceWithDerivativeFactors] = []
     for effect in system.effects:
         terms = effect.step_terms(state)
         energy += terms.lagrangian
@@ -262,7 +264,7 @@ def _summed_terms(
     if missing := [name for name in names if name not in equations]:
         raise ModelError(f"internal coordinate '{missing[0]}' has no equation")
     parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
-    summed = ForceWithDerivatives(*(sum(rest, first) for first, *rest in parts)) if closed else None
+    summed = ForceWithDerivativeFactors(*(sum(rest, first) for first, *rest in parts)) if closed else None
     internal = [ca.vertcat(ca.SX(0, 1), *(rows[name] for name in names)) for rows in (equations, equations | at_rest)]
     return energy, force + viscous, (internal[0], internal[1]), summed
 
@@ -289,7 +291,7 @@ def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
     if relaxation is not None:
         gain = 1 + relaxation / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
-    return ca.densify(closure - system.constraint_compliance_diagonal() * at.lam / at.h), gain
+    return ca.densify(closure - system.grasp_compliance_diagonal() * at.lam / at.h), gain
 
 
 def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> _ConstraintImpulses:
@@ -445,7 +447,7 @@ def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpS
 
     They do not depend on recordings: torques, prescribed coordinates and parameters may be data or unknowns.
 
-    The bodies' second derivatives have a closed form (`RigidBodyLagrangianDerivatives`) with a quarter of the
+    The bodies' second derivatives have a closed form (`MultibodyLagrangianDerivatives`) with a quarter of the
     operations of automatic differentiation, which gives all others.
     """
     e, h, system = equations, time_step, equations.system
@@ -453,7 +455,7 @@ def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpS
     p1 = ca.SX.sym("p1", e.p0.numel())
     x0, x1 = ca.vertcat(e.q0, e.p0, e.z0), ca.vertcat(e.q1, p1, e.z1)
     names = [f"del[{system.mechanism.joint_names[i]}]" for i in free]
-    names += [f"internal[{name}]" for name in system.internal_coordinate_symbols]
+    names += [f"internal[{name}]" for name in system.effect_internal_coordinate_symbols]
     names += [f"constraint[{name}]" for grasp in system.grasps for name in grasp.constraint_equation_names]
     names += [f"p1[{name}]" for name in system.mechanism.joint_names]
     rows = ca.vertcat(e.momentum_balance[free] / h, e.internal_residual, e.constraint_residual, (p1 - e.p1) / h)
@@ -488,7 +490,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
         1: {"q0": bent, "q1": bent - pulls.midpoint_share * pulls.after_force_by_q},
     }
-    impulses = e.closed_form_force_impulses or (ca.SX(n, 1), ca.SX(n, 1))
+    impulses = e.force_with_derivatives_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
     apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
     for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
-    CostGradient,
-    CostSlopes,
-    NewtonStatus,
+    CostDerivativesByRollout,
+    NewtonStatusCode,
     Rollout,
+    RolloutCostGradient,
     RolloutInputs,
     SensitivityDirections,
     StepEquationLinearizations,
@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import (
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
-    attach_step_status,
+    rollout_with_status,
 )
 from yid_ocp.parallel import CasadiLockedCache
 
@@ -84,7 +84,9 @@ class InterpretedKernel:
         """Where parameters stand in a point."""
         return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 
-    def _newton(self, value: _PointEvaluator, slope: _PointEvaluator, point: Array) -> tuple[NewtonStatus, float, int]:
+    def _newton(
+        self, value: _PointEvaluator, slope: _PointEvaluator, point: Array
+    ) -> tuple[NewtonStatusCode, float, int]:
         """Solve for the unknowns in the point, with the natural monotonicity test (Deuflhard 2011, section 3.3)."""
 
         def largest(change: Array) -> float:
@@ -94,14 +96,14 @@ class InterpretedKernel:
         for iteration in range(1, NEWTON_ITERATION_LIMIT + 1):
             residual = value(point)[self._residual, 0]
             if not np.all(np.isfinite(residual)):
-                return NewtonStatus.NOT_FINITE, error, iteration
+                return NewtonStatusCode.NOT_FINITE, error, iteration
             factors = _factorised(slope(point))
             if factors is None:
-                return NewtonStatus.SINGULAR, error, iteration
+                return NewtonStatusCode.SINGULAR, error, iteration
             change = -_solved(factors, residual)
             error = largest(change)
             if not math.isfinite(error):
-                return NewtonStatus.NOT_FINITE, error, iteration
+                return NewtonStatusCode.NOT_FINITE, error, iteration
             noise, factor = error <= tolerance, min(1.0, 0.5 / error) if error else 1.0
             while not noise:
                 trial = point.copy()
@@ -110,17 +112,17 @@ class InterpretedKernel:
                 if largest(further) <= (1 - 0.25 * factor) * error:
                     break
                 if factor < 1e-4:
-                    return NewtonStatus.NOT_CONVERGED, error, iteration
+                    return NewtonStatusCode.NOT_CONVERGED, error, iteration
                 # near the tolerance a correction that no step makes smaller is rounding
                 noise, factor = error < 1e3 * tolerance, 0.5 * factor
             if noise:
                 point[self._at["lam"]] += change[self._coordinates :]
-                return NewtonStatus.OK, error, iteration
+                return NewtonStatusCode.OK, error, iteration
             point[:] = trial
             if factor == 1.0 and largest(further) <= tolerance:
                 point[self._at["lam"]] -= further[self._coordinates :]
-                return NewtonStatus.OK, largest(further), iteration
-        return NewtonStatus.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
+                return NewtonStatusCode.OK, largest(further), iteration
+        return NewtonStatusCode.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
 
     @np.errstate(over="ignore", invalid="ignore")  # the status says what is not finite
     def rollout(self, inputs: RolloutInputs) -> Rollout:
@@ -133,7 +135,7 @@ class InterpretedKernel:
         state[0] = inputs.initial_state
         if wanted is not None:
             by[0][0] = wanted.initial_state_tangents
-        code, error, total, done = NewtonStatus.OK, 0.0, 0, 0
+        code, error, total, done = NewtonStatusCode.OK, 0.0, 0, 0
         for k, u in enumerate(torque):
             x = state[k]
             if feedback is not None:
@@ -146,21 +148,21 @@ class InterpretedKernel:
                 point[self._fixed] = path[k + 1]
                 code, error, spent = self._newton(value, slope, point)
                 total += spent
-                if code == NewtonStatus.OK:
+                if code == NewtonStatusCode.OK:
                     break
             outputs, lam = value(point)[:, 0], point[self._at["lam"]]
             state[k + 1] = np.concatenate([point[self._at["q1"]], outputs[self._p1], point[self._at["z1"]]])
-            if code != NewtonStatus.OK:
+            if code != NewtonStatusCode.OK:
                 break
             out.torque[k], out.multipliers[k], out.effort[k] = u, lam, outputs[self._effort]
             if wanted is not None:
                 moved = self._moved(slopes(point), wanted, feedback, by[0][k], k)
                 if moved is None:
-                    code = NewtonStatus.SINGULAR
+                    code = NewtonStatusCode.SINGULAR
                     break
                 by[0][k + 1], by[1][k], by[2][k] = moved
             done = k + 1
-        return attach_step_status(out, self._model.sizes, code, done, error, (total, total))
+        return rollout_with_status(out, self._model.sizes, code, done, error, (total, total))
 
     def _moved(
         self,
@@ -201,10 +203,10 @@ class InterpretedKernel:
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
 
-    def step_maps(
+    def rollout_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of the next states and efforts of a rollout's steps; arguments as in `step.step_maps`."""
+        """Derivatives of next states and efforts in a rollout; arguments as in `step.rollout_step_derivatives`."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
@@ -222,8 +224,13 @@ class InterpretedKernel:
         return [self.rollout(member) for member in members]
 
     def adjoint_gradient(
-        self, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, names: tuple[str, ...], by: CostSlopes
-    ) -> CostGradient:
+        self,
+        theta: Array,
+        rollout: Rollout,
+        feedback: TrackingFeedback | None,
+        names: tuple[str, ...],
+        by: CostDerivativesByRollout,
+    ) -> RolloutCostGradient:
         """Gradient of a cost along a finished rollout by the adjoint method; `by` holds the cost's derivatives.
 
         costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
@@ -247,16 +254,16 @@ class InterpretedKernel:
             try:
                 by_point -= jacobian[self._residual].T @ np.linalg.solve(square.T, by_point[self._unknown])
             except np.linalg.LinAlgError:
-                return CostGradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
+                return RolloutCostGradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
             by_theta += by_point[self._columns(names)]
             by_torque[k], by_path[k + 1] = by_point[at["u"]], by_point[self._fixed]
             costate = np.concatenate([by_point[at[name]] for name in ("q0", "p0", "z0")]) + by_state[k]
             if feedback is not None:
                 np.subtract.at(costate, feedback.state_indices, feedback.gain[k].T @ by_torque[k])
         by_path[0] = costate[list(self._model.system.prescribed_coordinate_indices)]
-        return CostGradient(by_theta, costate, by_torque, by_path)
+        return RolloutCostGradient(by_theta, costate, by_torque, by_path)
 
-    def linearize(
+    def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
         """Step residuals and, with `derivatives`, Jacobians along a trajectory of len(torque) steps, one by one."""

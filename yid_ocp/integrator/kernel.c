@@ -20,7 +20,7 @@
 #define YID_FREE free
 #endif
 
-/* The values of NewtonStatus in step_model.py. */
+/* The values of NewtonStatusCode in step_model.py. */
 enum { OK = 0, NOT_CONVERGED = 1, SINGULAR = 2, NOT_FINITE = 3, OUT_OF_MEMORY = 4 };
 
 typedef int (*theta_function)(const double **, double **, long long *, double *, int);

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.codegen import nonzero_indices
 from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
-from yid_ocp.integrator.step import Step, checked_float_array
+from yid_ocp.integrator.step import Step, float_array_with_checked_shape
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
@@ -74,7 +74,7 @@ class EquilibriumSolver:
         self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.u, e.theta], [potential])
 
     @property
-    def equations(self) -> EquilibriumEquations:
+    def symbolic_equations(self) -> EquilibriumEquations:
         """The symbolic equilibrium equations that are solved."""
         return self._equations(None)
 
@@ -102,11 +102,11 @@ class EquilibriumSolver:
             Parameters by which to differentiate.
         """
         step, system = self.step, self.step.system
-        given = checked_float_array("configuration", configuration, (len(self.known_coordinates),))
-        theta = checked_float_array("theta", theta, (len(system.parameters),))
-        stiffness = driven_joint_holding_stiffness(system, torque is not None)
+        given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
+        theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))
+        stiffness = measured_angle_holding_stiffness(system, torque is not None)
         nu, nz = step.sizes["nu"], step.sizes["nz"]
-        held = np.zeros(nu) if torque is None else checked_float_array("torque", torque, (nu,))
+        held = np.zeros(nu) if torque is None else float_array_with_checked_shape("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness, np.where(_is_motor_off(system, held), _HOLD_STIFFNESS, 0.0))
         count, h = len(self.free_coordinates) + nz, step.clock_scaled_time_step(theta)
 
@@ -195,7 +195,7 @@ class EquilibriumSolver:
         if not size or not m:
             return None
         with CASADI_LOCK:
-            function = ca.Function("rest", self.equations.inputs, [self.equations.residual])
+            function = ca.Function("rest", self.symbolic_equations.inputs, [self.symbolic_equations.residual])
             known = (given, hold.held, hold.stiffness, theta, self.step.time_step)
             x = ca.SX.sym("x", size)
             residual = function(ca.vertcat(x, ca.SX(self.step.sizes["nz"] + m, 1)), *known)
@@ -227,7 +227,7 @@ class EquilibriumSolver:
         none, u = np.zeros(n), hold.held + hold.stiffness * hold.give(q, system)
         driven = list(system.driven_coordinate_indices)
         state = np.tile(np.concatenate([q, none, z]), (2, 1))
-        found = step.kernel.linearize(theta, state, lam[None], u[None], names, True)
+        found = step.kernel.linearize_step_equations(theta, state, lam[None], u[None], names, True)
 
         def by_point(new: Array, old: Array, push: Array) -> Array:
             """By (q, z, lam), both nodes together and torques as they follow the angles."""
@@ -313,7 +313,7 @@ def _is_motor_off(system: System, command: Array) -> BoolArray:
     return np.asarray(bool(system.servos) & (command >= MOTOR_OFF_COMMAND / 2))
 
 
-def driven_joint_holding_stiffness(system: System, known: bool) -> float:
+def measured_angle_holding_stiffness(system: System, known: bool) -> float:
     """Stiffness of the springs that hold driven joints at measured angles; `known`: torques or commands are given."""
     if not known:
         return _HOLD_STIFFNESS
@@ -384,7 +384,7 @@ def _solved(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
-def relaxed_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
+def internal_coordinates_at_held_configuration(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
     """Steady internal coordinates (nz,) of a system held at configuration `q` until they have fully relaxed."""
     e = step.equations
     nz = e.z0.numel()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprMixin, ReprSummary
+from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
@@ -20,9 +20,9 @@ from yid_ocp.integrator.interpreted import InterpretedKernel
 from yid_ocp.integrator.step_model import (
     Rollout,
     RolloutInputs,
+    RolloutStatus,
     SensitivityDirections,
     StepModel,
-    StepStatus,
     TrackingFeedback,
     build_step_model,
     newton_correction_tolerance,
@@ -43,9 +43,9 @@ class Step(ReprMixin):
     kernel: CompiledKernel | InterpretedKernel
     is_compiled: bool
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         how = "compiled" if self.is_compiled else "interpreted"
-        return ReprSummary(f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().one_line}")
+        return ReprTexts(f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().one_line}")
 
     @property
     def system(self) -> System:
@@ -91,7 +91,7 @@ class Step(ReprMixin):
         theta: ArrayLike,
         prescribed: tuple[ArrayLike, ArrayLike] | None = None,
         internal: ArrayLike | None = None,
-    ) -> tuple[Array, Array, Array, StepStatus]:
+    ) -> tuple[Array, Array, Array, RolloutStatus]:
         """Compute one DEL step, to (q, p)_{k+1}, the multipliers lam (m,) and a status.
 
         Parameters
@@ -144,7 +144,7 @@ class Step(ReprMixin):
         internal: ArrayLike | None,
         wanted: SensitivityDirections | None,
     ) -> Rollout:
-        sizes, check = self.sizes, checked_float_array
+        sizes, check = self.sizes, float_array_with_checked_shape
         z0 = np.zeros(sizes["nz"]) if internal is None else check("internal", internal, (sizes["nz"],))
         start = np.concatenate([check("q0", q0, (sizes["n"],)), check("p0", p0, (sizes["n"],)), z0])
         if prescribed is None and sizes["nc"]:
@@ -192,7 +192,7 @@ def compile_step(
     """
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
     source = codegen.kernel_c_source(model.functions, model.index_tables) if use_compiler else None
-    library = None if source is None else compiler.compiled_shared_library(source)
+    library = None if source is None else compiler.compile_and_load_library(source)
     if library is None:
         return Step(model, InterpretedKernel(model), is_compiled=False)
     return Step(model, CompiledKernel(model, library), is_compiled=True)
@@ -217,7 +217,7 @@ def _positive(time_step: float) -> float:
     return time_step
 
 
-def checked_float_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Convert values to a contiguous float array; `ModelError` that names `name` if the shape is not `shape`."""
     array = np.ascontiguousarray(values, dtype=float)
     if array.size == 0 and 0 in shape:
@@ -257,10 +257,10 @@ def simulate(
         An array of the wrong shape; where Newton fails `status` says so, and what follows is NaN.
     """
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
-    return simulate_batch(step, [inputs])[0]
+    return simulate_rollouts(step, [inputs])[0]
 
 
-def simulate_batch(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
+def simulate_rollouts(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
     """Simulate several rollouts, each from `checked_rollout_inputs`; equal to `simulate` except for rounding."""
     return step.kernel.rollout_batch(members)
 
@@ -276,7 +276,7 @@ def checked_rollout_inputs(
     directions: SensitivityDirections | None = None,
 ) -> RolloutInputs:
     """Check the shapes of one rollout's inputs and return `RolloutInputs`; arguments and errors as in `simulate`."""
-    sizes, check = step.sizes, checked_float_array
+    sizes, check = step.sizes, float_array_with_checked_shape
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
         raise ModelError(f"steps = {steps}", allowed="a whole number from 1")
@@ -299,7 +299,7 @@ def checked_rollout_inputs(
     return RolloutInputs(values, begin, inputs, course, feedback, directions)
 
 
-def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
+def applied_driven_joint_torques(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
     """Torque that acts on driven joints in every step, (N, nu) [N m]: the input, or the torque of position servos."""
     system, h = step.system, step.time_step
     if not system.servos:
@@ -308,14 +308,14 @@ def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Arra
     n = system.n_coordinates
     with CASADI_LOCK:
         force = ca.densify(system.input_force(e.u, e.q0, e.q1)[driven])
-        internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
+        internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
         function = ca.Function("applied", [e.u, e.q0, e.q1, internal, e.theta], [force])
     middle, rate = (rollout.state[1:] + rollout.state[:-1]) / 2, np.diff(rollout.state[:, :n], axis=0) / h
     inputs = rollout.torque.T, middle[:, :n].T, rate.T, middle[:, 2 * n :].T
     return np.array(function.map(len(rate))(*inputs, np.asarray(theta, float))).T
 
 
-def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
+def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
     """Generalized momentum dL/dv [N m s] at (q, v), in the shape of q; compliant coordinates are scaled by compliance.
 
     `q` and `v` have the shape (n,) or (K, n).
@@ -345,7 +345,10 @@ def moving_observable_state_mask(
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))
-    ends = [next(step_maps(step, theta, rollout, np.repeat(inputs, count, 0), None, loads, one)) for one in chosen]
+    ends = [
+        next(rollout_step_derivatives(step, theta, rollout, np.repeat(inputs, count, 0), None, loads, one))
+        for one in chosen
+    ]
     by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
     by_state, moved = by_all[:, :nx], np.any(by_all > 0, axis=1)
     moved[list(step.system.prescribed_coordinate_indices)] = False
@@ -358,7 +361,7 @@ def moving_observable_state_mask(
     return moved & felt
 
 
-def step_maps(
+def rollout_step_derivatives(
     step: Step,
     theta: Array,
     rollout: Rollout,
@@ -387,4 +390,4 @@ def step_maps(
         span = slice(first, min(first + _STEPS_PER_CHUNK, end))
         nodes, own = rollout.state[first : span.stop + 1], feedback and replace(feedback, gain=feedback.gain[span])
         along = replace(rollout, state=nodes, multipliers=rollout.multipliers[span], torque=rollout.torque[span])
-        yield step.kernel.step_maps(theta, along, own, inputs[span], loads)
+        yield step.kernel.rollout_step_derivatives(theta, along, own, inputs[span], loads)

@@ -64,7 +64,7 @@ def newton_correction_tolerance(time_step: float) -> float:
     return max(_ROUNDING_FLOOR, min(_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE * time_step))
 
 
-class NewtonStatus(IntEnum):
+class NewtonStatusCode(IntEnum):
     """Status with which Newton's iteration of one step ended, with the numbers of the C kernel."""
 
     OK = 0
@@ -75,12 +75,12 @@ class NewtonStatus(IntEnum):
 
 
 _STATUS_MESSAGES = {
-    NewtonStatus.OK: "converged",
-    NewtonStatus.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
-    NewtonStatus.SINGULAR: "the step's equations are singular; "
+    NewtonStatusCode.OK: "converged",
+    NewtonStatusCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping or a fitting start",
+    NewtonStatusCode.SINGULAR: "the step's equations are singular; "
     "look for redundant grasps or a coordinate without inertia",
-    NewtonStatus.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
-    NewtonStatus.OUT_OF_MEMORY: "there is not enough memory",
+    NewtonStatusCode.NOT_FINITE: "the state is not finite; the motion is unstable open loop: add feedback or damping",
+    NewtonStatusCode.OUT_OF_MEMORY: "there is not enough memory",
 }
 
 _LONG_ROLLOUT_STEPS = 100
@@ -92,14 +92,14 @@ _INSTABILITY_HINT = (
 
 
 @dataclass(frozen=True)
-class StepStatus:
+class RolloutStatus:
     """Convergence status of a rollout: status code, Newton's last correction [rad or m], and totals over all steps.
 
     `prescribed_effort` (nc,) is that at the first node of the last step [N m], `internal_coordinates` (nz,) are those
     after it.
     """
 
-    code: NewtonStatus
+    code: NewtonStatusCode
     completed_steps: int
     last_correction: float
     newton_iterations: int
@@ -110,7 +110,7 @@ class StepStatus:
     @property
     def is_converged(self) -> bool:
         """Whether Newton's method converged in every step."""
-        return self.code == NewtonStatus.OK
+        return self.code == NewtonStatusCode.OK
 
     @property
     def message(self) -> str:
@@ -120,7 +120,7 @@ class StepStatus:
         step, what = self.completed_steps, _STATUS_MESSAGES[self.code]
         said = f"step {step}: {what} (last correction {self.last_correction:.2g})"
         is_late = step >= _LONG_ROLLOUT_STEPS
-        unstable = is_late and self.code in (NewtonStatus.NOT_CONVERGED, NewtonStatus.NOT_FINITE)
+        unstable = is_late and self.code in (NewtonStatusCode.NOT_CONVERGED, NewtonStatusCode.NOT_FINITE)
         return f"{said}; {_INSTABILITY_HINT}" if unstable else said
 
 
@@ -192,15 +192,15 @@ class Rollout:
     state_sensitivity: Array | None
     multipliers_sensitivity: Array | None
     effort_sensitivity: Array | None
-    status: StepStatus
+    status: RolloutStatus
 
 
-CostSlopes = tuple[Array, Array | None, Array | None]
+CostDerivativesByRollout = tuple[Array, Array | None, Array | None]
 """Partial derivatives of a cost by states (N + 1, nx), multipliers (N, m) and efforts (N, nc) of a rollout."""
 
 
 @dataclass(frozen=True)
-class CostGradient:
+class RolloutCostGradient:
     """Gradient of a scalar cost along a rollout, by the adjoint method; NaN if the equations of a step are singular.
 
     By the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the prescribed coordinates at
@@ -243,7 +243,7 @@ def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -
         shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
     values: dict[str, Any] = dict.fromkeys(names) | arrays
-    return Rollout(**values, status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0))
+    return Rollout(**values, status=RolloutStatus(NewtonStatusCode.OK, 0, 0.0, 0, 0))
 
 
 def allocate_linearization(
@@ -268,15 +268,15 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
 def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     """The `InsufficientMemoryError` to raise when `size` bytes for `what` cannot be allocated."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
-    said = f"{_STATUS_MESSAGES[NewtonStatus.OUT_OF_MEMORY]} for {what}: it takes {amount}"
+    said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}: it takes {amount}"
     hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
     return InsufficientMemoryError(said, hint=hint)
 
 
-def attach_step_status(
+def rollout_with_status(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """A copy of the rollout with a `StepStatus`; `counts` are Newton iterations and matrix factorisations."""
+    """A copy of the rollout with a `RolloutStatus`; `counts` are Newton iterations and matrix factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
-    return replace(rollout, status=StepStatus(NewtonStatus(code), step, error, *counts, last, inner))
+    return replace(rollout, status=RolloutStatus(NewtonStatusCode(code), step, error, *counts, last, inner))

@@ -25,7 +25,7 @@ _NEWTON_ITERATIONS = 5  # for a law of an internal coordinate that is nonlinear 
 _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the same in the LQR [rad], [rad/s], [N m]
 
 
-def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
+def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
     """Tracking feedback u_k = ubar_k - K (q_k - qbar_k) on the driven joints, with a constant diagonal K.
 
     `measured` are their angles qbar at every node, shape (N + 1, nu) [rad], `gains` one or one arm's worth or nu
@@ -44,7 +44,7 @@ def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> 
     return TrackingFeedback(np.array(step.system.driven_coordinate_indices, np.int32), gain, reference[:-1])
 
 
-def lqr_feedback(
+def lqr_tracking_feedback(
     step: Step, measured: ArrayLike, torque: ArrayLike, theta: ArrayLike, arms: Step | None = None
 ) -> TrackingFeedback:
     """Tracking feedback with finite-horizon LQR gains for the driven arms, linearised about their measured motion.
@@ -53,11 +53,11 @@ def lqr_feedback(
     the object, with the errors that weigh the same; the gains act on the arms' angles and momenta (Anderson and Moore
     1990, Optimal Control: Linear Quadratic Methods, section 2.4). The reference momentum follows from the measured
     angles (N + 1, nu) [rad], smooth enough to be differenced, and torques (N, nu) [N m] by the arms' own DEL equations,
-    so that it means the same as the model's. `arms` is the `driven_joints_only_step`, made when absent.
+    so that it means the same as the model's. `arms` is the `compile_driven_joints_step`, made when absent.
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
-    arm_step = driven_joints_only_step(step) if arms is None else arms
+    arm_step = compile_driven_joints_step(step) if arms is None else arms
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
     parameters = arm_step.system.parameters
     arm_theta = parameters.vector({name: values[name] for name in parameters.names})
@@ -85,7 +85,7 @@ def lqr_feedback(
     return TrackingFeedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
 
 
-def driven_joints_only_step(step: Step) -> Step:
+def compile_driven_joints_step(step: Step) -> Step:
     """Compiled step of the driven joints alone, without object, grasps, prescribed joints and effects.
 
     `ModelError` where the driven joints do not come first in the configuration.
@@ -108,7 +108,7 @@ def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: A
     angles, torques = np.vstack([measured[:1], measured]), np.vstack([torque[:1], torque])
     state = np.hstack([angles, np.zeros_like(angles)])
     none = np.zeros((len(torques), 0))
-    return arm_step.kernel.linearize(theta, state, none, torques, (), False).p1
+    return arm_step.kernel.linearize_step_equations(theta, state, none, torques, (), False).p1
 
 
 def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, theta: Array) -> tuple[Array, Array]:
@@ -123,7 +123,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
     none, own = np.zeros((2 * count - 1, 0)), slice(None, None, 2)
     try:
         for _ in range(NEWTON_ITERATION_LIMIT):
-            found = arm_step.kernel.linearize(theta, state, none, torques, (), True)
+            found = arm_step.kernel.linearize_step_equations(theta, state, none, torques, (), True)
             change = np.linalg.solve(found.residual_by_new[own], found.residual[own, :, None])[:, :, 0]
             if not np.max(np.abs(change), initial=0.0) > arm_step.model.tolerance:
                 break
@@ -163,8 +163,8 @@ class JointMotionWithSensitivities:
 class EffectMomentumShift:
     """Computes the momentum of a motion with effects minus that of the recorded motion without effects.
 
-    `lqr_feedback` computes its reference once, from recorded angles and torques without effects. With a torque other
-    than the recorded one, or an effect such as an armature, the same motion has another momentum, and the feedback
+    `lqr_tracking_feedback` computes its reference once, from recorded angles and torques without effects. With a torque
+    other than the recorded one, or an effect such as an armature, the motion has another momentum, and the feedback
     would counteract the difference: at a wrist, whose gain by momentum times h/2 is near one, by half of the effect.
 
     `parameter_names` are those of effects on which the momentum of a motion under known torques depends.
@@ -207,7 +207,7 @@ class EffectMomentumShift:
 
         self._maps: CasadiLockedCache[bool, MappedFunction] = CasadiLockedCache(compiled)
         self._impulse = ca.Function("impulse", inputs, [ca.densify(ca.jacobian(momentum, e.u))])
-        at_row = {name: row for row, name in enumerate(system.internal_coordinate_symbols)}
+        at_row = {name: row for row, name in enumerate(system.effect_internal_coordinate_symbols)}
         symbols = [before, now, last, then, e.theta, e.time_step]
         self._memories: list[tuple[list[int], _Memory]] = []
         for effect in system.effects:

@@ -2,7 +2,7 @@
 
 A spatial velocity is (angular, linear of the body point now at the world origin), a wrench (moment about the world
 origin, force); with both in one fixed frame the derivatives of the Lagrangian take the closed forms given at
-`RigidBodyLagrangianDerivatives`, which is what makes the compiled step cheap.
+`MultibodyLagrangianDerivatives`, which is what makes the compiled step cheap.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Kinematics:
 
 
 @dataclass(frozen=True)
-class RigidBodyLagrangianDerivatives:
+class MultibodyLagrangianDerivatives:
     """First derivatives of the rigid-body Lagrangian at (q, v), and vectors that give its second derivatives.
 
     With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
@@ -114,7 +114,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 
 def rigid_body_lagrangian_derivatives(
     kinematics: Kinematics, v: ca.SX, gravity: ca.SX
-) -> RigidBodyLagrangianDerivatives:
+) -> MultibodyLagrangianDerivatives:
     """Energies and first Lagrangian derivatives of a mechanism's bodies at velocity v (n, 1) and gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
@@ -137,7 +137,7 @@ def rigid_body_lagrangian_derivatives(
     gradients = [ca.densify(ca.vertcat(ca.SX(0, 1), *entries)) for entries in (by_q, by_v)]
     columns = ((S, 6), (D, 6), (F, 6), (B, 6), (G, 3))
     vectors = [ca.densify(ca.horzcat(ca.SX(rows, 0), *entries)) for entries, rows in columns]
-    return RigidBodyLagrangianDerivatives(*[*gradients, kinetic, potential, *vectors])
+    return MultibodyLagrangianDerivatives(*[*gradients, kinetic, potential, *vectors])
 
 
 @dataclass
@@ -189,13 +189,13 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
     return moved, kinetic, potential
 
 
-def mass_matrix(rigid: RigidBodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
-    """Mass matrix M = L_vv of the mechanism, (n, n), from the closed form in `RigidBodyLagrangianDerivatives`."""
+def mass_matrix(rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
+    """Mass matrix M = L_vv of the mechanism, (n, n), from the closed form in `MultibodyLagrangianDerivatives`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(
-    rigid: RigidBodyLagrangianDerivatives, mechanism: Mechanism
+    rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Second derivatives (L_qq, L_qv, L_vv) of the bodies' Lagrangian, each (n, n); L_qv has rows q, columns v."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G

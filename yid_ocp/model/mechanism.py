@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import snap_near_integer_entries
@@ -138,11 +138,11 @@ class Mechanism(ReprMixin):
     parameters: Parameters = field(default_factory=Parameters)
     link_chains: Mapping[str, ArcLengthChain] = field(default_factory=dict)
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         carriers = ("the world", *self.joint_names)
         rows = [("joint", "type", "moves with"), *((j.name, j.kind, carriers[j.parent_index + 1]) for j in self.joints)]
         joints, frames = count_with_noun(len(self.joints), "joint"), count_with_noun(len(self.frames), "frame")
-        return ReprSummary(f"{self.name}, {joints} and {frames}", rows)
+        return ReprTexts(f"{self.name}, {joints} and {frames}", rows)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -150,7 +150,7 @@ class Mechanism(ReprMixin):
         return tuple(joint.name for joint in self.joints)
 
     @property
-    def parent_indices(self) -> tuple[int, ...]:
+    def parent_joint_indices(self) -> tuple[int, ...]:
         """Index of every joint's parent joint, -1 for the world."""
         return tuple(joint.parent_index for joint in self.joints)
 

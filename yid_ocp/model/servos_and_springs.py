@@ -24,7 +24,9 @@ _MAX_COMMAND_DELAY = 0.5  # [s]
 _MAX_DEAD_BAND = 0.2  # [rad or m]
 MOTOR_OFF_COMMAND = 1e6  # input of a servo whose motor is off; from half of it on there is no torque [rad or m]
 _DEAD_BAND_ROUNDING = 1e-4  # over which the ends of a servo's dead band are rounded off [rad or m]
-SERVO_GAIN_FACTOR = "servo_gain_factor"  # parameter by which a recording states the proportional gain of a firmware
+SERVO_GAIN_FACTOR_PARAMETER = (
+    "servo_gain_factor"  # parameter by which a recording states the proportional gain of a firmware
+)
 
 _MotorKind = Literal["ideal", "dc"]
 _MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
@@ -141,7 +143,7 @@ class PositionServoOptions:
         bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
     ] = False
     motor: Annotated[MotorOptions, OptionInfo("of every servo")] = MotorOptions()
-    firmware: Annotated[
+    firmware_terms: Annotated[
         tuple[_FirmwareTerm, ...],
         OptionInfo(
             "further terms of the firmware, parameters that begin at zero: integral (JOINT.servo_integral: the error's "
@@ -152,10 +154,12 @@ class PositionServoOptions:
     ] = ()
 
     def __post_init__(self) -> None:
-        if "derivative" in self.firmware and self.motor.kind == "ideal":
+        if "derivative" in self.firmware_terms and self.motor.kind == "ideal":
             what = "an ideal motor has a derivative term already, JOINT.servo_damping"
             hint = "leave it out, or set model.arms.servo.motor.kind: dc"
-            raise ConfigError(what, where="model.arms.servo.firmware", allowed="derivative with kind: dc", hint=hint)
+            raise ConfigError(
+                what, where="model.arms.servo.firmware_terms", allowed="derivative with kind: dc", hint=hint
+            )
 
 
 @dataclass(frozen=True)
@@ -236,10 +240,10 @@ def build_joint_servos(
         gain, damping, delay, limit = (entry.symbol for entry in own)
         if options.motor.kind == "dc":
             words = f"the firmware's proportional gain, servo of {joint}"
-            own.append(Parameter(f"{joint}.{SERVO_GAIN_FACTOR}", 1.0, "1", 0.0, math.inf, words))
+            own.append(Parameter(f"{joint}.{SERVO_GAIN_FACTOR_PARAMETER}", 1.0, "1", 0.0, math.inf, words))
             gain = gain * own[-1].symbol
         tightness = limit**-TORQUE_SATURATION_EXPONENT
-        further = _firmware_parameters(at, options.firmware)
+        further = _firmware_parameters(at, options.firmware_terms)
         preset = None if options.motor.preset is None else MOTOR_PRESETS[options.motor.preset]
         more: dict[str, Any] = {term: parameter.symbol for term, parameter in further.items()}
         more["torque_constant"] = None if preset is None else preset.plain.torque_constant

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
@@ -81,7 +81,7 @@ class Grasp:
             rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))))
         return ca.vertcat(*rows)
 
-    def far_start_orientation_error(self, kinematics: Kinematics) -> ca.SX:
+    def holder_minus_held_axes(self, kinematics: Kinematics) -> ca.SX:
         """Holder minus held axes (0, 3 or 9 rows); unlike `constraint_residual` nonzero for opposite axes."""
         if self.kind == "point":
             return ca.SX(0, 1)
@@ -132,10 +132,10 @@ class NodeState:
 
 
 @dataclass(frozen=True)
-class ForceWithDerivatives:
+class ForceWithDerivativeFactors:
     """A dissipative generalized force F(q, v) of wrenches on bodies, (n, 1) [N m or N], with derivatives.
 
-    With S_j and D_j as in `RigidBodyLagrangianDerivatives` and the columns of A and T, shape (6, n), for i an ancestor
+    With S_j and D_j as in `MultibodyLagrangianDerivatives` and the columns of A and T, shape (6, n), for i an ancestor
     of joint j or j itself:
 
         dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
@@ -158,7 +158,7 @@ class StepTerms:
     internal_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     static_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     # a dissipative force on bodies whose slopes are given, because differentiating it would cost too much
-    force_with_derivatives: ForceWithDerivatives | None = None
+    force_with_derivatives: ForceWithDerivativeFactors | None = None
 
 
 @dataclass(frozen=True)
@@ -330,14 +330,14 @@ class System(ReprMixin):
             system = replace(system, effects=(*system.effects, effect))
         return system
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         kinds = {"driven": len(self.driven), "prescribed": len(self.prescribed)}
         kinds |= {"passive": self.n_coordinates - sum(kinds.values())}
         moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
         counts = f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})"
         parts = [self.mechanism.name, counts, count_with_noun(self.n_constraints, "constraint")]
         parts += [f"{effect.kind}@{effect.location}" for effect in self.effects]
-        return ReprSummary(", ".join(parts), self.parameters._summary().table_rows)
+        return ReprTexts(", ".join(parts), self.parameters._summary().table_rows)
 
     @property
     def n_coordinates(self) -> int:
@@ -365,7 +365,7 @@ class System(ReprMixin):
         return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_coordinate_indices)
 
     @property
-    def internal_coordinate_symbols(self) -> dict[str, ca.SX]:
+    def effect_internal_coordinate_symbols(self) -> dict[str, ca.SX]:
         """Symbols of the internal coordinates by name, in the order of z, as they enter grasps and placements."""
         return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
@@ -432,7 +432,7 @@ class System(ReprMixin):
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
         return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
-    def constraint_compliance_diagonal(self) -> ca.SX:
+    def grasp_compliance_diagonal(self) -> ca.SX:
         """Compliances of the constraints: the diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(g.compliance for g in self.grasps for _ in range(g.n_constraint_equations)))
 
@@ -455,7 +455,7 @@ def _check_names(
         tree.frame(frame)
 
 
-def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
+def floating_joint_mechanism(name: str, frame: str | None = None) -> Mechanism:
     """A massless mechanism whose six joints `NAME_x` ... `NAME_rz` move a frame, named `frame` or like the clamp."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(

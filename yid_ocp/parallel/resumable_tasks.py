@@ -77,7 +77,7 @@ class WorkerConfig:
             hint = "leave --workers out: the scheduler knows how many workers it has"
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
-    def check_available(self) -> None:
+    def check_scheduler_available(self) -> None:
         """Raise `WorkerError` if the scheduler does not answer or a worker is unsuitable; for use before long work."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
@@ -109,12 +109,12 @@ def run_tasks(
         Processes of this machine stop at once when the run is interrupted, and one that dies takes no task with it but
         the one that killed it. Workers of a scheduler end the task that they are at.
     code : str, optional
-        Hash of the sources that results depend on, where that is not the whole package; see `version.source_hash`.
+        Hash of the sources that results depend on, if that is not the whole package; see `version.folder_source_hash`.
 
     Raises
     ------
     DataError, OutputError, WorkerError
-        A task's file cannot be read, the folder cannot be made, and as `WorkerConfig.check_available`.
+        A task's file cannot be read, the folder cannot be made, and as `WorkerConfig.check_scheduler_available`.
     """
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
     # paths are absolute, because a worker may run in another folder

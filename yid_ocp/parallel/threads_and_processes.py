@@ -160,7 +160,9 @@ def _answer(requests: Sequence[_Request]) -> None:
         request.answers.set_result(list(islice(found, len(request.questions))))
 
 
-def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]) -> list[_Answer]:
+def call_batched_across_threads(
+    function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
+) -> list[_Answer]:
     """Answers of a function to `questions`, in one call with those of concurrent `map_with_batched_calls` items."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
@@ -170,7 +172,7 @@ def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: l
 
 
 def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Results of a function for all items, run concurrently; their simultaneous `batched_call`s become one call.
+    """Results of a function for all items, run concurrently; their `call_batched_across_threads` become one call.
 
     As many run as there are threads to use. Which questions meet depends on the items alone. No item may hold a lock
     while it asks.

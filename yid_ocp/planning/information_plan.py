@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from yid_ocp.analysis.experiment_design import add_observable_frames_to_step
+from yid_ocp.analysis.experiment_design import step_and_observable_frames
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.effects import EffectBase, make_effect
@@ -17,16 +17,16 @@ from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_RELATIVE_STD_TAKEN_AS_INFINITE
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.options import check_option_bounds
-from yid_ocp.planning.joint_paths import FramePositionFunction, PlannedMotion, PlanOptions
+from yid_ocp.planning.joint_paths import FramePositionEvaluator, PlannedMotion, PlanOptions
 from yid_ocp.planning.motion_search import (
     DOptimalityCriterion,
     EffectDiscriminationCriterion,
     InformativeMotionSearch,
     MotionSearchResult,
     OptimalityCriterion,
-    PlanResidualsAndLimits,
+    PlanResidualAndLimitFunctions,
 )
-from yid_ocp.planning.planned_experiment import PlannedExperiment
+from yid_ocp.planning.planned_experiment import ParameterizedExperiment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
@@ -100,10 +100,10 @@ def plan_informative_motion(
         composed = EstimationProblem(step, recordings, problem.free, problem.options, known, (), extra)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_names))
     shapes = {name: e.parameters[name].value for e in rivals for name in e.shape_parameter_names}
-    experiment = PlannedExperiment.from_options(composed, known | shapes, options, names)
+    experiment = ParameterizedExperiment.from_options(composed, known | shapes, options, names)
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
-    points = FramePositionFunction(system, system.point_frames)
-    limits = PlanResidualsAndLimits(experiment.simulator, options, points, np.zeros(3), still)
+    points = FramePositionEvaluator(system, system.point_frames)
+    limits = PlanResidualAndLimitFunctions(experiment.simulator, options, points, np.zeros(3), still)
     criterion = _criterion(experiment, chosen, rivals)
     search = InformativeMotionSearch(experiment, limits, criterion)
     _check_room(search, limits)
@@ -164,9 +164,9 @@ def _effects(
 
 
 def _criterion(
-    experiment: PlannedExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
+    experiment: ParameterizedExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
 ) -> OptimalityCriterion:
-    columns = [name.split("[")[0] for name in experiment.column_names]
+    columns = [name.split("[")[0] for name in experiment.sensitivity_column_names]
     parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
     if not rivals:
         return DOptimalityCriterion(tuple(i for i, name in enumerate(columns) if name in chosen), parameters)
@@ -188,7 +188,7 @@ def _size(effect: EffectBase) -> Array:
     return np.diag(half)
 
 
-def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits) -> None:
+def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions) -> None:
     """Refuse limits that the arms pass where they begin."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
     for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
@@ -204,11 +204,11 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits)
         raise ConfigError(f"the arms pass their limits before they move: {said}", where="plan.limits", hint=hint)
 
 
-def _random(experiment: PlannedExperiment, seed: int) -> Array:
+def _random(experiment: ParameterizedExperiment, seed: int) -> Array:
     return _RANDOM_COEFFICIENT_STD * np.random.default_rng(seed).normal(size=experiment.zero_coefficients.shape)
 
 
-def _smooth(experiment: PlannedExperiment, w: Array) -> tuple[Array, Array | None]:
+def _smooth(experiment: ParameterizedExperiment, w: Array) -> tuple[Array, Array | None]:
     """The motion, made smaller until what it tells changes smoothly with it, and its sensitivities."""
     for _ in range(10):
         rows = experiment.search_problem_sensitivities(w)
@@ -223,19 +223,22 @@ def _is_near(there: Array, rows: Array) -> bool:
     return bool(np.linalg.norm(there - rows) <= _MAX_RELATIVE_SENSITIVITY_CHANGE * np.linalg.norm(rows))
 
 
-def _unseen(experiment: PlannedExperiment, told: Sequence[Array | None]) -> dict[str, float]:
+def _unseen(experiment: ParameterizedExperiment, told: Sequence[Array | None]) -> dict[str, float]:
     """Parameters of which no reading tells in any motion, by sensitivities: how far one moves at most [stds]."""
-    largest = np.zeros(len(experiment.column_names))
+    largest = np.zeros(len(experiment.sensitivity_column_names))
     for rows in told:
         if rows is not None:
             largest = np.maximum(largest, np.linalg.norm(rows, axis=0))
-    named = zip(experiment.column_names, largest, strict=True)
+    named = zip(experiment.sensitivity_column_names, largest, strict=True)
     hidden = {name: float(size) for name, size in named if size < _UNOBSERVABLE_STDS}
     return {name: size for name, size in hidden.items() if name.split("[")[0] in experiment.free_parameters}
 
 
 def _check_seen(
-    chosen: Sequence[str], rivals: Sequence[EffectBase], unseen: Mapping[str, float], experiment: PlannedExperiment
+    chosen: Sequence[str],
+    rivals: Sequence[EffectBase],
+    unseen: Mapping[str, float],
+    experiment: ParameterizedExperiment,
 ) -> None:
     lost = [name for name in chosen if name in unseen]
     if chosen and len(lost) == len(chosen):
@@ -250,15 +253,15 @@ def _check_seen(
             raise ConfigError(what, where="plan.discriminate", hint="add a sensor that sees it")
 
 
-def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
+def _would_see(experiment: ParameterizedExperiment, name: str, w: Array) -> str:
     """What would see a parameter, in words."""
     mover, n = experiment.simulator, experiment.simulator.step.system.n_coordinates
-    wide, seen = add_observable_frames_to_step(mover.step)
+    wide, seen = step_and_observable_frames(mover.step)
     w = _PROBE_AMPLITUDE * w / max(float(np.abs(w).max()), _PROBE_AMPLITUDE)
     rolled = mover.simulate_path(w, names=[name])
     if rolled.state_sensitivity is None or not rolled.status.is_converged:
         return f"{name} needs another sensor"
-    frames = FramePositionFunction(wide.system, [sight.name for sight in seen])
+    frames = FramePositionEvaluator(wide.system, [sight.name for sight in seen])
     by_q = frames.positions_and_jacobian(rolled.state[:, :n], mover.theta)[1]
     size = abs(mover.theta[wide.system.parameters.index(name)]) or 1.0
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
@@ -273,8 +276,8 @@ def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
 
 
 def _plan(
-    experiment: PlannedExperiment,
-    limits: PlanResidualsAndLimits,
+    experiment: ParameterizedExperiment,
+    limits: PlanResidualAndLimitFunctions,
     search: InformativeMotionSearch,
     criterion: OptimalityCriterion,
     found: Sequence[MotionSearchResult],
@@ -311,7 +314,7 @@ def _plan(
     )
 
 
-def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
+def _judged(experiment: ParameterizedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
     try:
         rows = experiment.configured_problem_sensitivities(found.w)
     except SolverError:
@@ -319,11 +322,15 @@ def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found
     return criterion.value_and_gradient_by_sensitivities(rows, False)[0]
 
 
-def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:
+def _parameters(
+    experiment: ParameterizedExperiment, w: Array
+) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:
     """Parameters of the nominal problem before, after and with both, and what the planned recording leaves open."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
-    after = identifiability(experiment.planned_estimation_problem(w).with_compiled_parameters_free(problem.free))
+    after = identifiability(
+        experiment.planned_estimation_problem(w).with_free_parameters_without_recompiling(problem.free)
+    )
     shared = [name for name in problem.free if name not in problem.options.local_parameters]
     at = [[entry.parameter_names.index(name) for name in shared] for entry in (before, after)]
     both = sum(entry.fisher_information[np.ix_(i, i)] for entry, i in zip((before, after), at, strict=True))
@@ -338,7 +345,7 @@ def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, _Par
 
 
 def _distances(
-    experiment: PlannedExperiment, criterion: OptimalityCriterion, rivals: Sequence[EffectBase], w: Array
+    experiment: ParameterizedExperiment, criterion: OptimalityCriterion, rivals: Sequence[EffectBase], w: Array
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Distances of effects in the recordings that there are, and in the planned one."""
     assert isinstance(criterion, EffectDiscriminationCriterion)
@@ -349,7 +356,9 @@ def _distances(
     return {(labels[i], labels[j]): (float(before[i, j]), float(after[i, j])) for i, j in pairs}
 
 
-def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: Array) -> dict[str, tuple[str, ...]]:
+def _active(
+    search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions, w: Array
+) -> dict[str, tuple[str, ...]]:
     """Limits that a motion reaches."""
     mover, found = search.experiment.simulator, {}
 

@@ -55,10 +55,10 @@ class PlanOptions:
     ] = "place"
     point: Annotated[str | None, OptionInfo("frame that is to arrive: a tip of the object, T3:50%, a gripper")] = None
     target_position: Annotated[_Vector3 | None, OptionInfo("where to, in the world; or give a shift", "m")] = None
-    target_offset: Annotated[_Vector3 | None, OptionInfo("where to, from where the point rests at the start", "m")] = (
-        None
-    )
-    waypoint_offsets: Annotated[
+    target_offset_from_start: Annotated[
+        _Vector3 | None, OptionInfo("where to, from where the point rests at the start", "m")
+    ] = None
+    waypoint_offsets_from_start: Annotated[
         tuple[_Vector3, ...], OptionInfo("of a path: shifts on the way, passed at equal times", "m")
     ] = ()
     box: Annotated[tuple[_Vector3, _Vector3] | None, OptionInfo("lowest and highest corner in the world", "m")] = None
@@ -115,7 +115,7 @@ class PlanOptions:
     ] = 100
 
 
-class FramePositionFunction:
+class FramePositionEvaluator:
     """Numeric function for world positions of named frames and their Jacobian with respect to the configuration.
 
     Raises `ConfigError` for a frame that does not exist.
@@ -248,7 +248,7 @@ class PathSimulator:
         begin, steps, path = self.start_equilibrium.state, len(self.node_times) - 1, self.joint_positions(w)
         return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
 
-    def frame_trajectories(self, frames: FramePositionFunction, state: Array) -> Array:
+    def frame_position_trajectories(self, frames: FramePositionEvaluator, state: Array) -> Array:
         """Positions of frames along states (N, nx), shape (N, frames, 3) [m]."""
         q = state[:, : self.step.system.n_coordinates]
         return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
@@ -309,7 +309,7 @@ class PlannedMotion:
         """Trajectories (N + 1, 3) [m] of the system's points, and of a target point if there is one, by name."""
         system = self.simulator.step.system
         names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
-        places = self.simulator.frame_trajectories(FramePositionFunction(system, names), self.rollout.state)
+        places = self.simulator.frame_position_trajectories(FramePositionEvaluator(system, names), self.rollout.state)
         return {name: places[:, i] for i, name in enumerate(names)}
 
     @property
@@ -374,8 +374,8 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
             raise ConfigError(what, where=where, allowed=f"up to {limit:.4g} {unit}", hint=hint)
 
 
-def solve_equilibrium_at_target(
-    step: Step, theta: Array, start: Equilibrium, point: FramePositionFunction, place: Array, tolerance: float
+def solve_equilibrium_at_point_target(
+    step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, place: Array, tolerance: float
 ) -> Equilibrium:
     """Solve for an equilibrium near the start, within joint limits, at which a point rests at its target.
 
@@ -417,7 +417,7 @@ def solve_equilibrium_at_target(
         limits = f", with {names} at the joint's limit" if names else ""
         what = f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
         where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)"
-        hint = "take a nearer place, a smaller plan.target_offset, or another plan.start_joint_positions to begin with"
+        hint = "take a nearer place, a smaller plan.target_offset_from_start, or other plan.start_joint_positions"
         raise ConfigError(what, where=where, allowed="a place at which the point can rest", hint=hint)
     return rest
 

@@ -16,17 +16,17 @@ from yid_ocp.model.system import System
 from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.joint_paths import (
     TARGET_REACHED_TOLERANCE_FACTOR,
-    FramePositionFunction,
+    FramePositionEvaluator,
     PathSimulator,
     PlannedMotion,
     PlanOptions,
     SplinePath,
     check_standstill_limits,
-    solve_equilibrium_at_target,
+    solve_equilibrium_at_point_target,
     solve_start_equilibrium,
     start_joint_positions_as_array,
 )
-from yid_ocp.planning.motion_search import PlanResidualsAndLimits, PlanShootingProblem, PlanShootingResult
+from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionSearch, TargetMotionSearchResult
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
@@ -87,18 +87,18 @@ def plan_motion_to_target(
     path = SplinePath(options.duration, options.n_spline_coefficients)
     mover = PathSimulator(step, values, start, path, options.hold_duration)
     point, inside = _points(system, options)
-    place = _place(options, mover.frame_trajectories(point, start.state[None])[0, 0])
+    place = _place(options, mover.frame_position_trajectories(point, start.state[None])[0, 0])
     if inside is not None:
-        _check_box(options, inside, mover.frame_trajectories(inside, start.state[None])[0], place)
+        _check_box(options, inside, mover.frame_position_trajectories(inside, start.state[None])[0], place)
     check_standstill_limits(step, values, start, options.limits, "where the motion begins")
-    end = solve_equilibrium_at_target(step, values, start, point, place, options.position_tolerance)
+    end = solve_equilibrium_at_point_target(step, values, start, point, place, options.position_tolerance)
     check_standstill_limits(step, values, end, options.limits, "where it ends")
 
     def attempt(duration: float) -> TargetMotionPlan:
         own = replace(mover, path=replace(path, duration=duration))
         travel = end.state[own.moved_joint_indices] - own.moved_joint_start_positions
         straight = own.path.straight_line_coefficients(travel)
-        rows = PlanResidualsAndLimits(own, replace(options, duration=duration), point, place, straight, inside)
+        rows = PlanResidualAndLimitFunctions(own, replace(options, duration=duration), point, place, straight, inside)
         return _attempt(rows, known)
 
     progress.begin_stage(f"searching the motion in {options.duration:g} s")
@@ -120,32 +120,32 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     return start_joint_positions_as_array(system, {name: angles[name] for name in angles if name in system.prescribed})
 
 
-def _points(system: System, options: PlanOptions) -> tuple[FramePositionFunction, FramePositionFunction | None]:
+def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
     if options.point is None:
         hint = nearest_name_hint("", system.point_frames)
         raise ConfigError("no point is named", where="plan.point", allowed="a frame of the model", hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
-    inside = FramePositionFunction(system, boxed) if options.goal == "box" else None
-    return FramePositionFunction(system, [options.point, *calm]), inside
+    inside = FramePositionEvaluator(system, boxed) if options.goal == "box" else None
+    return FramePositionEvaluator(system, [options.point, *calm]), inside
 
 
 def _place(options: PlanOptions, begin: Array) -> Array:
-    if (options.target_position is None) == (options.target_offset is None):
-        said, hint = "nothing says", "set plan.target_position, or plan.target_offset from where it rests"
+    if (options.target_position is None) == (options.target_offset_from_start is None):
+        said, hint = "nothing says", "set plan.target_position, or plan.target_offset_from_start from where it rests"
         if options.target_position is not None:
             said, hint = "it is said twice", "set the other one to null"
         allowed, where = "one of place and shift", "plan.target_position"
         raise ConfigError(f"{said} where the point is to arrive", where=where, allowed=allowed, hint=hint)
-    if options.goal == "path" and not options.waypoint_offsets:
-        what, where = "the path has no places on the way", "plan.waypoint_offsets"
+    if options.goal == "path" and not options.waypoint_offsets_from_start:
+        what, where = "the path has no places on the way", "plan.waypoint_offsets_from_start"
         raise ConfigError(what, where=where, allowed="one or more shifts [m]")
     if options.target_position is not None:
         return np.array(options.target_position, float)
-    return begin + np.array(options.target_offset, float)
+    return begin + np.array(options.target_offset_from_start, float)
 
 
-def _check_box(options: PlanOptions, inside: FramePositionFunction, at: Array, place: Array) -> None:
+def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, place: Array) -> None:
     """Refuse a box that frames begin outside of at places (frames, 3) [m], or that the point leaves."""
     if options.box is None:
         raise ConfigError("there is no box", where="plan.box", allowed="two corners [m]", hint="goal: place needs none")
@@ -167,7 +167,7 @@ def _check_box(options: PlanOptions, inside: FramePositionFunction, at: Array, p
             raise ConfigError(what, where="plan.box", allowed=allowed, hint=hint)
 
 
-def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> TargetMotionPlan:
+def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> TargetMotionPlan:
     """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
 
     What swings in the end is a small difference of large motions, and a part of it is lost by too coarse a step.
@@ -176,7 +176,7 @@ def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> Target
     lower, upper = mover.coefficient_bounds()
     for halved in range(_MAX_STEP_HALVINGS + 1):
         cases = [rows, *_scenarios(rows, known)] if options.minimize_parameter_sensitivity else [rows]
-        shot = PlanShootingProblem(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
+        shot = TargetMotionSearch(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
         evaluations += shot.n_evaluations
         if not shot.is_converged or halved == _MAX_STEP_HALVINGS:
             break
@@ -194,10 +194,12 @@ def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
     return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
 
-def _steady(rows: PlanResidualsAndLimits, finer: PathSimulator, w: Array) -> bool:
+def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array) -> bool:
     """Whether half the time step moves the point neither from where it arrives nor from rest."""
     pairs = ((rows.simulator, 1), (finer, 2))
-    own, other = (mover.frame_trajectories(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs)
+    own, other = (
+        mover.frame_position_trajectories(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs
+    )
     change = (other - own)[rows.simulator.standstill_node_indices]
     place = np.linalg.norm(change[:, 0], axis=1).max()
     speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step
@@ -205,7 +207,7 @@ def _steady(rows: PlanResidualsAndLimits, finer: PathSimulator, w: Array) -> boo
     return bool(np.all(np.array([place / reached, speed / rest]) <= _CONVERGED_TOLERANCE_FRACTION))
 
 
-def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list[PlanResidualsAndLimits]:
+def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> list[PlanResidualAndLimitFunctions]:
     """The same motion with parameters a standard deviation off, along the axes that move the point's rest most."""
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
@@ -228,7 +230,7 @@ def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list
     return found
 
 
-def _point_slopes(rows: PlanResidualsAndLimits, w: Array, known: ParameterCovariance) -> Array:
+def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: ParameterCovariance) -> Array:
     """Derivative of the point's place at every node of the end by the uncertain parameters, shape (nodes, 3, count)."""
     mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.standstill_node_indices
     rollout = mover.simulate_path(w, names=known.parameter_names)
@@ -237,13 +239,15 @@ def _point_slopes(rows: PlanResidualsAndLimits, w: Array, known: ParameterCovari
     return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n, : len(known.parameter_names)])
 
 
-def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: ParameterCovariance) -> TargetMotionPlan:
+def _outcome(
+    rows: PlanResidualAndLimitFunctions, shot: TargetMotionSearchResult, known: ParameterCovariance
+) -> TargetMotionPlan:
     mover = rows.simulator
     rollout, std = mover.simulate_path(shot.w), None
     if len(known.parameter_names):
         slope = _point_slopes(rows, shot.w, known)[-1]
         std = np.sqrt(np.maximum(np.diag(slope @ known.covariance @ slope.T), 0.0))
-    own = mover.frame_trajectories(rows.point, rollout.state)
+    own = mover.frame_position_trajectories(rows.point, rollout.state)
     end = mover.standstill_node_indices
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)

@@ -24,8 +24,8 @@ from scipy.optimize import least_squares, minimize
 from yid_ocp.arrays import Array
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanOptions, memoize_last_call
-from yid_ocp.planning.planned_experiment import PlannedExperiment
+from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions, memoize_last_call
+from yid_ocp.planning.planned_experiment import ParameterizedExperiment
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
@@ -51,15 +51,15 @@ def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array,
 
 
 @dataclass(eq=False)
-class PlanResidualsAndLimits:
+class PlanResidualAndLimitFunctions:
     """Functions for goal residuals and limited quantities of a planned motion, for one set of model parameters."""
 
     simulator: PathSimulator
     options: PlanOptions
-    point: FramePositionFunction  # of the frame that is to arrive, and of all frames that are to rest
+    point: FramePositionEvaluator  # of the frame that is to arrive, and of all frames that are to rest
     target: Array  # (3,), where it is to arrive [m]
     quasi_static_coefficients: Array  # (K, nc); of motions that do equally well, the one nearest to them is wanted
-    inside: FramePositionFunction | None = None  # frames that stay in the box
+    inside: FramePositionEvaluator | None = None  # frames that stay in the box
 
     def __post_init__(self) -> None:
         system = self.simulator.step.system
@@ -76,7 +76,9 @@ class PlanResidualsAndLimits:
             return None
         begin = self.simulator.start_configuration[None]
         first = self.point.positions_and_jacobian(begin, self.simulator.theta)[0][0, :3]
-        places = np.vstack([first, *(first + np.asarray(via) for via in self.options.waypoint_offsets), self.target])
+        places = np.vstack(
+            [first, *(first + np.asarray(via) for via in self.options.waypoint_offsets_from_start), self.target]
+        )
         at = np.linspace(0.0, self.simulator.path.duration, len(places))
         # the clock starts and stops gently as well, so that the way is one that can be followed
         return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.simulator.node_times, at[-1])))
@@ -189,7 +191,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 
 @dataclass(frozen=True)
-class PlanShootingResult:
+class TargetMotionSearchResult:
     """Result of a search for a planned motion: coefficients w (K, nc), and whether it converged within the limits."""
 
     w: Array
@@ -198,10 +200,10 @@ class PlanShootingResult:
     n_evaluations: int
 
 
-class PlanShootingProblem:
+class TargetMotionSearch:
     """Shooting problem for a motion: goal residuals of several parameter cases, and limits of the first case."""
 
-    def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
+    def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
         self._residual_and_limit_values = memoize_last_call(self._evaluated)
         self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
@@ -219,7 +221,7 @@ class PlanShootingProblem:
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
-    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> PlanShootingResult:
+    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> TargetMotionSearchResult:
         """Optimise the spline coefficients of a motion from `start` within bounds, all of shape (K, nc).
 
         Rockafellar (1973), doi:10.1007/BF01580138; Branch, Coleman and Li (1999), doi:10.1137/S1064827595289108.
@@ -246,7 +248,7 @@ class PlanShootingProblem:
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
             message = f"the search was stopped after {iterations} evaluations; raise plan.max_iterations"
-        return PlanShootingResult(x.reshape(self._shape), finished, message, self.evaluations)
+        return TargetMotionSearchResult(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
@@ -371,7 +373,7 @@ class InformativeMotionSearch:
     """Search for the motion of a planned experiment that maximises an optimality criterion within limits."""
 
     def __init__(
-        self, experiment: PlannedExperiment, limits: PlanResidualsAndLimits, criterion: OptimalityCriterion
+        self, experiment: ParameterizedExperiment, limits: PlanResidualAndLimitFunctions, criterion: OptimalityCriterion
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())

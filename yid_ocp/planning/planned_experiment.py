@@ -25,7 +25,7 @@ from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.planning.joint_paths import (
-    FramePositionFunction,
+    FramePositionEvaluator,
     PathSimulator,
     PlanOptions,
     SplinePath,
@@ -34,8 +34,8 @@ from yid_ocp.planning.joint_paths import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.signal_filters import effort_filter_from_path_cutoff
+from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.problem.signal_filters import effort_filter_with_path_cutoff
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 
 _PLANNED_RECORDING_NAME = "planned"
@@ -47,7 +47,7 @@ _SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
 
 
 @dataclass(frozen=True, eq=False)
-class PlannedExperiment:
+class ParameterizedExperiment:
     """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients w."""
 
     configured_problem: EstimationProblem  # of the settings; its first recording defines sensors, noise and rates
@@ -58,15 +58,15 @@ class PlannedExperiment:
     @staticmethod
     def from_options(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
-    ) -> PlannedExperiment:
+    ) -> ParameterizedExperiment:
         """Planned experiment from a plan's options at parameter `values`, with the parameters `names` free.
 
         Raises `ConfigError` if no joint moves or clamps follow measured points, `ModelError` without an equilibrium.
         """
         system, episode = problem.system, problem.episodes[0]
-        if problem.options.clamp_pose_definitions or not (system.driven or system.prescribed):
+        if problem.options.clamp_poses_from_points or not (system.driven or system.prescribed):
             said, allowed = "no joint moves whose motion could be planned", "a robot whose arms move"
-            if problem.options.clamp_pose_definitions:
+            if problem.options.clamp_poses_from_points:
                 said = "the ends of a cable follow measured points: there is no joint whose motion could be planned"
             raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
@@ -83,7 +83,7 @@ class PlannedExperiment:
         path = SplinePath(options.duration, options.n_spline_coefficients)
         mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
         _check_long_enough(problem, float(mover.node_times[-1]))
-        return PlannedExperiment(problem, known, mover, tuple(names) or problem.free)
+        return ParameterizedExperiment(problem, known, mover, tuple(names) or problem.free)
 
     def _noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
         """Noise-free predicted recording of a motion (K, nc); it states the standard deviations of its sensors.
@@ -123,12 +123,14 @@ class PlannedExperiment:
         groups = [self._seen(samples, frames, q, fastest) for samples, frames in self._points]
         return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", _PLANNED_RECORDING_NAME)
 
-    def _seen(self, samples: Measurements, frames: FramePositionFunction, q: Array, fastest: float) -> PointGroup:
+    def _seen(
+        self, samples: SensorMeasurements, frames: FramePositionEvaluator, q: Array, fastest: float
+    ) -> PointGroup:
         """Points of one sensor along the motion, their information per second as in the recording."""
         mover, base = self.simulator, self.configured_problem.episodes[0]
         sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
-        inverse = np.sum(np.where(samples.used_output_mask, samples.weight**2, 0.0), axis=0)
-        rate = float(np.max(np.count_nonzero(samples.used_output_mask, axis=0))) / spent
+        inverse = np.sum(np.where(samples.positive_weight_mask, samples.weight**2, 0.0), axis=0)
+        rate = float(np.max(np.count_nonzero(samples.positive_weight_mask, axis=0))) / spent
         stride = max(1, round(1.0 / (mover.step.time_step * min(max(rate, _MIN_POINT_RATE), fastest))))
         at = np.arange(0, len(mover.node_times), stride)
         dense = 1.0 / (stride * mover.step.time_step)
@@ -142,11 +144,11 @@ class PlannedExperiment:
         return PointGroup(*points, times, places, std.copy(), group.sensor, pose=group.pose)
 
     @cached_property
-    def _points(self) -> list[tuple[Measurements, FramePositionFunction]]:
+    def _points(self) -> list[tuple[SensorMeasurements, FramePositionEvaluator]]:
         """Measurements of points, each with their frames."""
         system, measured = self.simulator.step.system, self.configured_problem.episodes[0].measurements
         seen = [samples for samples in measured if samples.sensor.point_names]
-        return [(samples, FramePositionFunction(system, samples.sensor.frame_names)) for samples in seen]
+        return [(samples, FramePositionEvaluator(system, samples.sensor.frame_names)) for samples in seen]
 
     def _options(self, **changes: object) -> ProblemOptions:
         """The problem's options for the planned recording alone, which states its points' noise itself."""
@@ -173,7 +175,7 @@ class PlannedExperiment:
         free = [name for name in self.free_parameters if name in self.configured_problem.free]
         extra = [name for name in self.free_parameters if name not in free]
         problem = EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra)
-        return problem.with_compiled_parameters_free(self.free_parameters)
+        return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
     def configured_problem_sensitivities(self, w: Array) -> Array:
         """Whitened sensitivities of the planned recording to relative changes; `SolverError` if its rollout fails."""
@@ -183,7 +185,7 @@ class PlannedExperiment:
     def existing_recording_sensitivities(self) -> Array:
         """Whitened sensitivities of existing recordings to relative changes of the configured problem's unknowns."""
         problem = self.configured_problem.with_parameter_values(self.parameter_values)
-        return self._weighted(problem.with_compiled_parameters_free(self.free_parameters))
+        return self._weighted(problem.with_free_parameters_without_recompiling(self.free_parameters))
 
     def _weighted(self, problem: EstimationProblem) -> Array:
         problem = problem_whitened_at(problem, problem.initial_unknowns)
@@ -214,7 +216,7 @@ class PlannedExperiment:
             joints = replace(joints, position_std=None)
             sensors.pop(JOINT_POSITION_GROUP_NAME, None)
         options = self._options(
-            huber_threshold=np.inf, weak_prior_std_as_factor=0.0, weighting="whitened", sensors=sensors
+            huber_threshold=np.inf, weak_prior_geometric_std=0.0, weighting="whitened", sensors=sensors
         )
         return self._problem(self.simulator.step, replace(recording, joints=joints), options)
 
@@ -224,7 +226,7 @@ class PlannedExperiment:
         return _sizes(self._known)
 
     @cached_property
-    def column_names(self) -> tuple[str, ...]:
+    def sensitivity_column_names(self) -> tuple[str, ...]:
         """Column names of `search_problem_sensitivities`: parameters, other unknowns, constant torque errors."""
         return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
 
@@ -244,10 +246,12 @@ class PlannedExperiment:
         for samples, rows in zip(problem.episodes[0].measurements, problem.residual_rows.measurements[0], strict=True):
             if not samples.sensor.effort_joints:
                 continue
-            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.used_output_mask]
+            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[
+                samples.positive_weight_mask
+            ]
             for i, (name, size) in enumerate(std.items()):
                 own = np.where(joint == samples.sensor.effort_joints.index(name), size, 0.0)
-                found[rows, i] = samples.decorrelate(own * samples.weight[samples.used_output_mask])
+                found[rows, i] = samples.decorrelate(own * samples.weight[samples.positive_weight_mask])
         return np.vstack([found, np.eye(len(std))])
 
     def search_problem_sensitivities(self, w: Array) -> Array | None:
@@ -317,7 +321,7 @@ class PlannedExperiment:
 
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
-    joints, low_pass = problem.episodes[0].recording.joints, effort_filter_from_path_cutoff(problem.options.path_cutoff)
+    joints, low_pass = problem.episodes[0].recording.joints, effort_filter_with_path_cutoff(problem.options.path_cutoff)
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:

@@ -11,21 +11,21 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_batch
+from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_rollouts
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
 from yid_ocp.integrator.tracking_feedback import JointMotionWithSensitivities
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialStateWithSensitivity
+from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import (
     CorrectedInputs,
     ModelFunctions,
     TimeGridStateValues,
-    node_acceleration,
-    node_acceleration_adjoint,
-    node_velocity,
-    node_velocity_adjoint,
+    central_difference_velocity,
+    central_difference_velocity_adjoint,
+    second_difference_acceleration,
+    second_difference_acceleration_adjoint,
 )
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads, mean_step_input_delay_derivative, mean_step_inputs
@@ -47,7 +47,7 @@ class _Prepared:
     """An episode whose rollout can begin."""
 
     episode: Episode
-    start: InitialState
+    start: InitialStateWithSensitivity
     inputs: CorrectedInputs
     member: RolloutInputs
     wanted: tuple[str, ...]
@@ -63,7 +63,7 @@ class EpisodePredictor:
     unknowns: UnknownVectorLayout
 
     @property
-    def step(self) -> Step:
+    def integrator_step(self) -> Step:
         """The integrator step with which episodes are rolled out."""
         return self.model_functions.step
 
@@ -78,7 +78,7 @@ class EpisodePredictor:
     def estimated_initial_state_indices(self) -> tuple[int, ...]:
         """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
-        hidden = list(self.system.internal_coordinate_symbols)
+        hidden = list(self.system.effect_internal_coordinate_symbols)
         split = (name.split(".", 1) for name in self.unknowns.initial_state_names)
         return tuple(
             2 * n + hidden.index(name) if kind == "z" else joints(name) + (n if kind == "p" else 0)
@@ -92,8 +92,8 @@ class EpisodePredictor:
         samples = episode.measurements
         if self.options.start_point_noise_std is not None:
             weight = 1.0 / self.options.start_point_noise_std
-            samples = tuple(replace(s, weight=np.where(s.used_output_mask, weight, 0.0)) for s in samples)
-        own, window = self._with(theta, episode.known_parameters), self.options.start_fit_window
+            samples = tuple(replace(s, weight=np.where(s.positive_weight_mask, weight, 0.0)) for s in samples)
+        own, window = self._with(theta, episode.known_parameters), self.options.initial_state_fit_window
         start = self.model_functions.initial_state_fitter.fit_to_points(
             episode.initial_known_coordinates, samples, own, window, episode.prescribed_path
         )
@@ -110,16 +110,16 @@ class EpisodePredictor:
             own[self.system.parameters.index(name)] = value
         return own
 
-    def initial_state(
+    def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
-    ) -> InitialState:
+    ) -> InitialStateWithSensitivity:
         """Initial state of an episode's rollout and its derivative with respect to (`wanted` parameters, `offset`).
 
         `theta` is that of `theta_with_episode_values`, `offset` that of an estimated initial state from equilibrium,
         and `guess` (n,) a configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of
         least energy.
         """
-        nx, rows = self.step.sizes["nx"], list(self.estimated_initial_state_indices)
+        nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0
         rest: Equilibrium | None = None
@@ -133,23 +133,23 @@ class EpisodePredictor:
             rest = statics.solve(known, theta, first, near, wanted)
             if not rest.is_converged:
                 none = np.zeros((nx, len(wanted) + len(rows)))
-                return InitialState(rest.state, none, rest, f"{episode.name}: {rest.message}")
+                return InitialStateWithSensitivity(rest.state, none, rest, f"{episode.name}: {rest.message}")
             state = rest.state.copy()
             by_known = inputs.initial_known_coordinates_sensitivity(len(wanted))
             by_theta = rest.state_by_theta + rest.state_by_known_coordinates @ by_known
             if inputs.first_torque_sensitivity is not None:
                 by_theta += rest.state_by_torque @ inputs.first_torque_sensitivity
         state[rows] += offset
-        return InitialState(state, np.hstack([by_theta, by_offset]), rest, "")
+        return InitialStateWithSensitivity(state, np.hstack([by_theta, by_offset]), rest, "")
 
-    def uses_inputs_as_recorded(self, episode: Episode, theta: Array) -> bool:
+    def has_no_input_corrections(self, episode: Episode, theta: Array) -> bool:
         """Whether all effects that correct the episode's inputs, times or tracked reference are neutral and fixed."""
         wanted = self.unknowns.free_parameters
         inputs = self.corrected_inputs(episode, theta, wanted)
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
         recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
-        if self._follows_momenta and self.model_functions.reference_momentum_shift.is_active(theta, wanted):
+        if self._follows_momenta and self.model_functions.effect_momentum_shift.is_active(theta, wanted):
             return False
         slopes += self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
@@ -160,11 +160,11 @@ class EpisodePredictor:
     @property
     def _follows_momenta(self) -> bool:
         """Whether a filter keeps the driven joints on their measured motion by their momenta too."""
-        return bool(self.system.driven) and not self.system.servos and self.options.tracking_filter == "lqr"
+        return bool(self.system.driven) and not self.system.servos and self.options.arm_tracking_feedback == "lqr"
 
     # -- what drives the rollout --------------------------------------------------------------------------------------
 
-    def inputs_with_reference_momentum_shift(
+    def inputs_with_effect_momentum_shift(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
         """Inputs of an episode corrected by effects, with the momentum shift of its tracking filter's reference.
@@ -177,8 +177,8 @@ class EpisodePredictor:
         rows = slice(2 * self.system.n_coordinates, None)
         recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
-        shift, measured = self.model_functions.reference_momentum_shift, episode.measured_driven_angles
-        return inputs.with_reference_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
+        shift, measured = self.model_functions.effect_momentum_shift, episode.measured_driven_angles
+        return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
         """Recorded torques, angles and paths corrected by effects, with derivatives with respect to `wanted`."""
@@ -207,9 +207,9 @@ class EpisodePredictor:
                 by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
         if (lag := corrections.joint_delay_or_lag("torque_lag", theta, wanted)) is not None:
-            torque, by_torque = FirstOrderLag(*lag, self.step.time_step).lagged_step_means(torque, by_torque)
+            torque, by_torque = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
-            left = errors.remaining_torque_error_after_effects
+            left = errors.remaining_estimated_torque_error
             torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true_angles_and_efforts(
@@ -233,12 +233,14 @@ class EpisodePredictor:
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
-            rollouts = iter(simulate_batch(self.step, [p.member for p in prepared if not isinstance(p, str)]))
+            rollouts = iter(
+                simulate_rollouts(self.integrator_step, [p.member for p in prepared if not isinstance(p, str)])
+            )
             pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 
         width = len(self.unknowns.free_parameters) + len(self.estimated_initial_state_indices) if derivatives else 0
-        each = [8 * (episode.grid.steps + 1) * self.step.sizes["nx"] * (width + 1) for episode, *_ in asked]
+        each = [8 * (episode.grid.steps + 1) * self.integrator_step.sizes["nx"] * (width + 1) for episode, *_ in asked]
         found: list[EpisodePrediction | str] = []
         while len(found) < len(asked):
             held = np.cumsum(each[len(found) :][:_MAX_PARALLEL_ROLLOUTS])
@@ -252,11 +254,11 @@ class EpisodePredictor:
         """What an episode's rollout starts from and is driven by."""
         wanted = self.unknowns.free_parameters if derivatives else ()
         theta = self.theta_with_episode_values(episode, theta)
-        start = self.initial_state(episode, theta, offset, wanted, guess)
+        start = self.initial_state_of_episode(episode, theta, offset, wanted, guess)
         if start.failure_message:
             return start.failure_message
         by_start = start.state_sensitivity
-        inputs = self.inputs_with_reference_momentum_shift(episode, theta, wanted, start.state, by_start)
+        inputs = self.inputs_with_effect_momentum_shift(episode, theta, wanted, start.state, by_start)
         feedback, driven = episode.feedback_about_smoother_estimate, self.system.driven_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
@@ -264,9 +266,9 @@ class EpisodePredictor:
             by_torque = inputs.nominal_torque_sensitivity(feedback, driven, width)
             by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
-        feedback = inputs.corrected_feedback(feedback, driven, episode.measured_driven_angles)
+        feedback = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         given = (start.state, episode.grid.steps, inputs.torque, inputs.prescribed_path)
-        member = checked_rollout_inputs(self.step, theta, *given, feedback, directions)
+        member = checked_rollout_inputs(self.integrator_step, theta, *given, feedback, directions)
         return _Prepared(episode, start, inputs, member, wanted, derivatives)
 
     def _told(self, prepared: _Prepared | str, rollout: Rollout | None) -> EpisodePrediction | str:
@@ -305,42 +307,46 @@ class EpisodePredictor:
         return EpisodePrediction(*said, guess, correction, by_correction)
 
     def readings_along_trajectory(
-        self, samples: Measurements, state: Array, by_state: Array, theta: Array
+        self, samples: SensorMeasurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
         """Predicted sensor readings (M, k) along a trajectory (N + 1, nx), and their derivatives (M, k, d).
 
         `by_state` (N + 1, nx, d) are those of the trajectory, the first ones by the free parameters.
         """
-        read = _Trajectory(TimeGridStateValues.from_trajectory(self.step, state), by_state, None, None, None)
+        read = _Trajectory(TimeGridStateValues.from_trajectory(self.integrator_step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
-    def node_values(self, rollout: Rollout) -> TimeGridStateValues:
+    def state_values_at_nodes(self, rollout: Rollout) -> TimeGridStateValues:
         """State values at all nodes of a rollout; the load is effort (prescribed joints) or torque (driven joints)."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.driven_coordinate_indices)] = rollout.torque
         load[-1] = load[-2]
-        lam = rollout.multipliers[np.minimum(np.arange(len(load)), len(load) - 2)] / self.step.time_step
-        return TimeGridStateValues.from_trajectory(self.step, rollout.state, load, lam)
+        lam = rollout.multipliers[np.minimum(np.arange(len(load)), len(load) - 2)] / self.integrator_step.time_step
+        return TimeGridStateValues.from_trajectory(self.integrator_step, rollout.state, load, lam)
 
     def _delay_in_steps(
-        self, samples: Measurements, theta: Array, wanted: tuple[str, ...]
+        self, samples: SensorMeasurements, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
         """Delay of each output in steps, shape (k,), and its derivative, (k, d); None without delays."""
-        found = self.model_functions.input_corrections.sensor_delay(samples.sensor, theta, wanted)
-        return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
+        found = self.model_functions.input_corrections.sensor_delays_with_derivatives(samples.sensor, theta, wanted)
+        return (
+            None
+            if found is None
+            else (found[0] / self.integrator_step.time_step, found[1] / self.integrator_step.time_step)
+        )
 
-    def delay_corrected_measurements(self, samples: Measurements, theta: Array) -> Measurements:
+    def delay_corrected_measurements(self, samples: SensorMeasurements, theta: Array) -> SensorMeasurements:
         """Measurements shifted earlier by the sensor's delay at `theta`, to the times at which they were true."""
         late = self._delay_in_steps(samples, theta, ())
-        return samples if late is None else samples.shifted_earlier_by(late[0])
+        return samples if late is None else samples.shifted_earlier_by_steps(late[0])
 
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
         """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
         effort, slope = rollout.effort, rollout.effort_sensitivity
         if (lag := self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted)) is not None:
-            effort, slope = FirstOrderLag(*lag, self.step.time_step).lagged_node_values(effort, slope)
+            effort, slope = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_node_values(effort, slope)
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
         return replace(rollout, effort=effort, effort_sensitivity=slope)
@@ -352,24 +358,29 @@ class EpisodePredictor:
             return None
         nodes = [self.delay_corrected_measurements(samples, theta).evaluation_nodes for samples in compared]
         smooth, grid = LowPassFilter(self.options.path_cutoff), episode.grid
-        return smooth.node_smoother(np.unique(np.concatenate(nodes)), grid.steps, self.step.time_step)
+        return smooth.node_smoother(np.unique(np.concatenate(nodes)), grid.steps, self.integrator_step.time_step)
 
     def _predict(
-        self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
+        self,
+        samples: SensorMeasurements,
+        rollout: Rollout,
+        by_applied: Array | None,
+        theta: Array,
+        wanted: tuple[str, ...],
     ) -> tuple[Array, Array]:
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
-            samples = samples.shifted_earlier_by(late[0])
+            samples = samples.shifted_earlier_by_steps(late[0])
         slopes_of = (rollout.state_sensitivity, rollout.effort_sensitivity, by_applied, rollout.multipliers_sensitivity)
-        along = _Trajectory(self.node_values(rollout), *slopes_of)
+        along = _Trajectory(self.state_values_at_nodes(rollout), *slopes_of)
         y, total = self._read(samples, along, theta, wanted)
         predicted, slopes = samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
         if late is not None and rollout.state_sensitivity is not None:
-            slopes[:, :, : len(wanted)] -= samples.prediction_rate_per_step(y, unmoved, late[0])[:, :, None] * late[1]
+            slopes[:, :, : len(wanted)] -= samples.prediction_change_per_step(y, unmoved, late[0])[:, :, None] * late[1]
         return predicted, slopes
 
     def _read(
-        self, samples: Measurements, along: _Trajectory, theta: Array, wanted: tuple[str, ...]
+        self, samples: SensorMeasurements, along: _Trajectory, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
         """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d)."""
         n, nodes = self.system.n_coordinates, samples.evaluation_nodes
@@ -379,9 +390,9 @@ class EpisodePredictor:
         total = read.by_q @ along.by_state[nodes, :n]
         if read.by_z.shape[2]:
             total += read.by_z @ along.by_state[nodes, 2 * n :]
-        for by_rate, rate in ((read.by_v, node_velocity), (read.by_a, node_acceleration)):
+        for by_rate, rate in ((read.by_v, central_difference_velocity), (read.by_a, second_difference_acceleration)):
             if by_rate.shape[2]:
-                total += by_rate @ rate(along.by_state[:, :n], nodes, self.step.time_step)
+                total += by_rate @ rate(along.by_state[:, :n], nodes, self.integrator_step.time_step)
         prescribed, driven = self.system.prescribed_coordinate_indices, self.system.driven_coordinate_indices
         for index, by_load_there in ((prescribed, along.by_effort), (driven, along.by_torque)):
             by_load = read.by_load[:, :, list(index)]
@@ -392,7 +403,7 @@ class EpisodePredictor:
                 what = f"'{samples.sensor.group_name}' depends on constraint forces, which node states do not carry"
                 raise SolverError(what, hint="use gauss_newton")
             last = np.minimum(nodes, len(along.by_multipliers) - 1)
-            total += read.by_lam @ along.by_multipliers[last] / self.step.time_step
+            total += read.by_lam @ along.by_multipliers[last] / self.integrator_step.time_step
         total[:, :, : len(wanted)] += read.by_theta
         return read.output, total
 
@@ -408,14 +419,14 @@ class EpisodePredictor:
         wanted, rollout = self.unknowns.free_parameters, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
         pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}
-        total, read = np.zeros(len(wanted)), self.node_values(self._recorded(episode, rollout, theta, ()))
+        total, read = np.zeros(len(wanted)), self.state_values_at_nodes(self._recorded(episode, rollout, theta, ()))
         for samples, pull in zip(episode.measurements, pulls, strict=True):
             total += self._pull(samples, pull, read, theta, pulled)
         by_state, by_effort, by_applied, by_multipliers = pulled.values()
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             by_effort = smooth.smoothing_adjoint(by_effort)
         if (lag := self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted)) is not None:
-            lagged = FirstOrderLag(*lag, self.step.time_step)
+            lagged = FirstOrderLag(*lag, self.integrator_step.time_step)
             by_effort, by_lag = lagged.lagged_node_values_adjoint(rollout.effort, by_effort)
             total += by_lag
         feedback = episode.tracking_feedback
@@ -423,9 +434,9 @@ class EpisodePredictor:
             by_state[:-1, feedback.state_indices] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
         by_lam = by_multipliers if np.any(by_multipliers) else None
         partials = (by_state, by_lam, by_effort)
-        by_inputs = self.step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
-        start = self.initial_state(episode, theta, offset, wanted, result.equilibrium_guess)
-        inputs = self.inputs_with_reference_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
+        by_inputs = self.integrator_step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
+        start = self.initial_state_of_episode(episode, theta, offset, wanted, result.equilibrium_guess)
+        inputs = self.inputs_with_effect_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
         by_torque = inputs.nominal_torque_sensitivity(feedback, self.system.driven_coordinate_indices, len(own))
         if by_torque is not None:
@@ -437,23 +448,31 @@ class EpisodePredictor:
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 
     def _pull(
-        self, samples: Measurements, pull: Array, values: TimeGridStateValues, theta: Array, pulled: dict[str, Array]
+        self,
+        samples: SensorMeasurements,
+        pull: Array,
+        values: TimeGridStateValues,
+        theta: Array,
+        pulled: dict[str, Array],
     ) -> Array:
         """Add the pull at one group's samples to that of what a rollout gives; the direct part by the parameters."""
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
-            samples = samples.shifted_earlier_by(late[0])
+            samples = samples.shifted_earlier_by_steps(late[0])
         at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_nodes
         read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(values.at(nodes), theta)
         direct = np.einsum("mk,mkq->q", at_nodes, read.by_theta)
         if late is not None:
-            direct -= np.sum(pull * samples.prediction_rate_per_step(read.output, unmoved, late[0]), axis=0) @ late[1]
+            direct -= np.sum(pull * samples.prediction_change_per_step(read.output, unmoved, late[0]), axis=0) @ late[1]
         by_state = pulled["state"]
         by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, read.by_q)
         by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, read.by_z)
-        last, h = np.minimum(nodes, len(by_state) - 2), self.step.time_step
-        for by_rate, adjoint in ((read.by_v, node_velocity_adjoint), (read.by_a, node_acceleration_adjoint)):
+        last, h = np.minimum(nodes, len(by_state) - 2), self.integrator_step.time_step
+        for by_rate, adjoint in (
+            (read.by_v, central_difference_velocity_adjoint),
+            (read.by_a, second_difference_acceleration_adjoint),
+        ):
             if by_rate.shape[2]:
                 by_state[:, :n] += adjoint(np.einsum("mk,mkq->mq", at_nodes, by_rate), nodes, len(by_state), h)
         if read.by_lam.shape[2]:
@@ -494,7 +513,7 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
         return episode
     own, n = predictor.theta_with_episode_values(episode, theta), predictor.system.n_coordinates
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
-    least = predictor.initial_state(episode, own, offset, ())
+    least = predictor.initial_state_of_episode(episode, own, offset, ())
     error = _error(predictor, seen, least, own)
     if not error > _POOR_EQUILIBRIUM_RMSE:
         return episode
@@ -504,15 +523,15 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
         shape = fit(at, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path, roughly=True).state[:n]
     except DataError:
         return episode
-    other = predictor.initial_state(episode, own, offset, (), shape)
+    other = predictor.initial_state_of_episode(episode, own, offset, (), shape)
     if not _error(predictor, seen, other, own) < _MAX_REMAINING_ERROR_FRACTION * error:
         return episode
     return replace(episode, equilibrium_guess=other.state[:n])
 
 
-def _first(samples: Measurements, time_step: float) -> Measurements | None:
+def _first(samples: SensorMeasurements, time_step: float) -> SensorMeasurements | None:
     """The first sample of points, as if it were taken at node 0; None where it comes too late."""
-    rows = np.flatnonzero(samples.used_output_mask.any(axis=1))[:1]
+    rows = np.flatnonzero(samples.positive_weight_mask.any(axis=1))[:1]
     if not samples.sensor.point_names or not len(rows):
         return None
     if np.max(samples.node[rows]) * time_step > _MAX_FIRST_SAMPLE_TIME:
@@ -521,7 +540,9 @@ def _first(samples: Measurements, time_step: float) -> Measurements | None:
     return replace(samples, node=np.zeros(1, np.int64), fraction=np.zeros(1), noise_correlation=None, **parts)
 
 
-def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: InitialState, theta: Array) -> float:
+def _error(
+    predictor: EpisodePredictor, seen: Sequence[SensorMeasurements], start: InitialStateWithSensitivity, theta: Array
+) -> float:
     """Root mean square error of first points at a start [standard deviations]; infinite where it is not at rest."""
     if start.failure_message:
         return math.inf
@@ -529,8 +550,8 @@ def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: Ini
     squares: list[Array] = []
     for samples in seen:
         read = predictor.model_functions.compiled_sensor_function(samples.sensor, predictor.unknowns.free_parameters)
-        predicted = read(TimeGridStateValues.from_trajectory(predictor.step, state), theta).output
-        squares.append(samples.whitened_residual(predicted)[samples.used_output_mask] ** 2)
+        predicted = read(TimeGridStateValues.from_trajectory(predictor.integrator_step, state), theta).output
+        squares.append(samples.whitened_residual(predicted)[samples.positive_weight_mask] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
@@ -543,7 +564,7 @@ def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epis
     result = predictor.predict_episode(episode, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
     if isinstance(result, str):
         return episode
-    load, own = episode.joint_loads.copy(), predictor.node_values(result.rollout).load
+    load, own = episode.joint_loads.copy(), predictor.state_values_at_nodes(result.rollout).load
     for samples in compared:
         at = [corrections.joint_names.index(joint) for joint in samples.sensor.effort_joints]
         column = [predictor.system.mechanism.joint_index(joint) for joint in samples.sensor.effort_joints]

@@ -15,27 +15,27 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Step, checked_float_array, generalized_momentum
+from yid_ocp.integrator.step import Step, float_array_with_checked_shape, generalized_momentum_from_velocity
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
-from yid_ocp.integrator.tracking_feedback import lqr_feedback, proportional_feedback
+from yid_ocp.integrator.tracking_feedback import lqr_tracking_feedback, proportional_tracking_feedback
 from yid_ocp.model.system import System
-from yid_ocp.problem.initial_state_fit import FixedInitialState
+from yid_ocp.problem.initial_state_fit import PrecomputedInitialState
 from yid_ocp.problem.measurements import (
-    Measurements,
+    SensorMeasurements,
     TimeGrid,
-    locate_measurements_on_grid,
-    make_time_grid,
+    measurements_on_grid,
     measurements_with_paper_weights,
+    recording_time_grid,
 )
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.problem.recorded_inputs import (
     mean_step_inputs,
-    prescribed_path,
-    smoothed_joint_angles,
+    prescribed_coordinates_at_nodes,
+    smoothed_joint_angles_at_nodes,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_from_path_cutoff
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_with_path_cutoff
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
@@ -71,7 +71,7 @@ class EpisodePrediction:
 
 
 @dataclass(frozen=True)
-class InitialState:
+class InitialStateWithSensitivity:
     """Initial state of a rollout with its derivative and equilibrium, and a message if it was not found."""
 
     state: Array  # (q, p, z), (nx,)
@@ -113,12 +113,12 @@ class InputErrorModel:
         return self.torque_bias + self.torque_noise
 
     @property
-    def remaining_torque_error_after_effects(self) -> Array:
+    def remaining_estimated_torque_error(self) -> Array:
         """Part of the torque error that remains to be subtracted once effects on torques apply, (N, nu) [N m]."""
         return self.estimated_torque_error - self.transmitted_torque_noise
 
     @property
-    def with_torque_bias_only(self) -> InputErrorModel:
+    def torque_bias_part(self) -> InputErrorModel:
         """The same errors with only the torques' constant offset: without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
         return replace(
@@ -146,7 +146,7 @@ def _recorded_input_errors(
     system: System,
     grid: TimeGrid,
     sensors: Mapping[str, SensorOptions],
-    samples: Sequence[Measurements],
+    samples: Sequence[SensorMeasurements],
 ) -> InputErrorModel | None:
     """Error levels of the torques and angles that drive a recording's rollout; None where there are none."""
     joints, driven = recording.joints, system.driven
@@ -186,7 +186,7 @@ class Episode:
     prescribed_path: Array  # (N + 1, nc)
     initial_known_coordinates: Array  # driven, then prescribed, at node 0, (nk,)
     measured_driven_angles: Array  # measured angles of the driven joints at every node, (N + 1, nu)
-    measurements: tuple[Measurements, ...]
+    measurements: tuple[SensorMeasurements, ...]
     # recorded effort of driven, then prescribed joints, where their true angle depends on it, (N + 1, nk) [N m]
     joint_loads: Array
     # the measured ones, smooth enough to be differenced; as measured where no filter needs them, (N + 1, nu)
@@ -194,7 +194,7 @@ class Episode:
     tracking_feedback: TrackingFeedback | None = None  # of the driven joints, its gains of the nominal parameters
     known_parameters: Mapping[str, float] = field(default_factory=dict)  # values that differ among recordings
     input_errors: InputErrorModel | None = None  # of the torques and angles that drive the rollout
-    fixed_initial_state: FixedInitialState | None = None  # given or fitted to points; else it is an equilibrium
+    fixed_initial_state: PrecomputedInitialState | None = None  # given or fitted to points; else it is an equilibrium
     # index of the estimation episode whose initial state this held-out part of the same recording shares
     initial_state_shared_with: int | None = None
     equilibrium_guess: Array | None = None  # near the initial equilibrium, where that is not of least energy, (n,)
@@ -227,18 +227,18 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     recording = recording.with_effort_sampling_kind(
         options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_sampling_kind
     )
-    grid = make_time_grid(recording, step.time_step, options.duration)
+    grid = recording_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
     low_pass = LowPassFilter(options.path_cutoff)
-    path = prescribed_path(recording, system, grid, low_pass, options.clamp_pose_definitions)
+    path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, options.clamp_poses_from_points)
     arm = smooth = np.zeros((grid.steps + 1, 0))
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
         read = (recording.joints, system.driven, grid, recording.name)
         torque = mean_step_inputs(*read, servos=system.servos)
-        arm = smoothed_joint_angles(*read, LowPassFilter(math.inf))
-        smooth = smoothed_joint_angles(*read, low_pass) if options.tracking_filter == "lqr" else arm
+        arm = smoothed_joint_angles_at_nodes(*read, LowPassFilter(math.inf))
+        smooth = smoothed_joint_angles_at_nodes(*read, low_pass) if options.arm_tracking_feedback == "lqr" else arm
     samples = _samples(step, recording, options, theta, grid)
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))
@@ -247,7 +247,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     known_parameters = options.parameters_by_recording.get(recording.name, {})
     start = errors = None
     if (state := options.known_initial_states.get(recording.name)) is not None:
-        start = FixedInitialState(checked_float_array("known_start", state, (step.sizes["nx"],)))
+        start = PrecomputedInitialState(float_array_with_checked_shape("known_start", state, (step.sizes["nx"],)))
     if options.weighting != "paper":
         errors = _recorded_input_errors(recording, system, grid, options.sensors, samples)
     inputs = (recording, grid, torque, path, np.concatenate([arm[0], path[0]]), arm)
@@ -258,14 +258,14 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
 def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOptions, theta: Array) -> Episode:
     """The episode with the tracking filter of its driven joints, its gains worked out at given parameters."""
     step = functions.step
-    if not step.system.driven or step.system.servos or options.tracking_filter == "none":
+    if not step.system.driven or step.system.servos or options.arm_tracking_feedback == "none":
         return episode
-    if options.tracking_filter == "proportional":
-        loop = proportional_feedback(step, episode.measured_driven_angles, options.tracking_filter_gains)
+    if options.arm_tracking_feedback == "proportional":
+        loop = proportional_tracking_feedback(step, episode.measured_driven_angles, options.arm_tracking_feedback_gains)
     else:
-        plain = functions.reference_momentum_shift.theta_without_effects(theta)
+        plain = functions.effect_momentum_shift.theta_without_effects(theta)
         known = episode.smoothed_driven_angles, episode.torque, plain
-        loop = lqr_feedback(step, *known, functions.arms_only_integrator_step)
+        loop = lqr_tracking_feedback(step, *known, functions.arms_only_integrator_step)
     return replace(episode, tracking_feedback=loop)
 
 
@@ -313,20 +313,22 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
     velocity = np.zeros((len(places), *q.shape))
     velocity[range(len(places)), :, places] = 1.0
     still = np.broadcast_to(q, velocity.shape).reshape(-1, q.shape[1])
-    momentum = generalized_momentum(step, still, velocity.reshape(still.shape), theta).reshape(velocity.shape)
+    momentum = generalized_momentum_from_velocity(step, still, velocity.reshape(still.shape), theta).reshape(
+        velocity.shape
+    )
     return momentum[:, :, places].transpose(1, 2, 0)
 
 
 def _samples(
     step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: TimeGrid
-) -> tuple[Measurements, ...]:
+) -> tuple[SensorMeasurements, ...]:
     around = SensorDataInputs(
         step.system,
         recording,
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.node_times,
         grid.time_step,
-        effort_filter_from_path_cutoff(options.path_cutoff),
+        effort_filter_with_path_cutoff(options.path_cutoff),
         LowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
     )
@@ -335,7 +337,7 @@ def _samples(
         found = [data for data in found if data.sensor.has_paper_weight]
     # places before efforts, which follow from the motion
     found.sort(key=lambda data: bool(data.sensor.effort_joints))
-    samples = tuple(locate_measurements_on_grid(data, grid, recording.name) for data in found)
+    samples = tuple(measurements_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
         what = "the recording holds no measurement that the model could be compared with"
         raise DataError(what, where=recording.name, hint="check `sensors` and the names of the recorded points")

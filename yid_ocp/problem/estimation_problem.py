@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.problem.episode_prediction import EpisodePredictor, with_seen_equilibrium_and_denoised_loads
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
-    InitialState,
+    InitialStateWithSensitivity,
     mass_matrix_diagonal_at_zero,
     prepare_episode,
     truncate_episode,
@@ -27,8 +27,8 @@ from yid_ocp.problem.episodes import (
 from yid_ocp.problem.evaluation import (
     EquilibriumGuesses,
     Evaluation,
+    ProcessNoiseWhitener,
     ResidualVectorLayout,
-    ResidualWhitener,
     whitened_episode_residual,
 )
 from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_residual_factors
@@ -40,10 +40,10 @@ from yid_ocp.problem.unknown_vector import (
     check_free_parameters,
     check_parameter_bounds,
     estimated_initial_state_names,
-    initial_state_offset_limits,
+    max_initial_state_offsets,
     soft_logarithm_and_slope,
     stated_prior_jacobian,
-    stated_prior_std,
+    stated_prior_stds,
 )
 
 _HELD_OUT_START_WINDOW = 0.2
@@ -71,7 +71,7 @@ class EstimationProblem(ReprMixin):
     held_out : sequence of Recording
         Not used by the fit, only predicted by `predict_held_out`.
     may_free : sequence of str, optional
-        Further parameters that `with_compiled_parameters_free` may be asked for.
+        Further parameters that `with_free_parameters_without_recompiling` may be asked for.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class EstimationProblem(ReprMixin):
         Initial values of free parameters and values of fixed ones.
     unknowns, residual_rows : UnknownVectorLayout, ResidualVectorLayout
         Layouts of the unknown vector and of the residual.
-    whitening_filters, held_out_whitening_filters : tuple of ResidualWhitener or None
+    whitening_filters, held_out_whitening_filters : tuple of ProcessNoiseWhitener or None
         Filter that whitens each recording's residual; None where sensor noise is the only noise.
 
     Raises
@@ -109,7 +109,7 @@ class EstimationProblem(ReprMixin):
             raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
         theta = step.system.parameters.vector(values)
         names = (*free, *(name for name in may_free if name not in free))
-        functions = ModelFunctions(step, names, options.start_fit_parameters)
+        functions = ModelFunctions(step, names, options.initial_state_fit_parameters)
         check_parameter_bounds(step.system, free, theta)
         prepare = partial(prepare_episode, functions, options=options, theta=theta)
         episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
@@ -129,8 +129,8 @@ class EstimationProblem(ReprMixin):
         theta: Array,
         episodes: tuple[Episode, ...],
         held_out: tuple[Episode, ...],
-        whitening_filters: tuple[ResidualWhitener | None, ...] = (),
-        held_out_whitening_filters: tuple[ResidualWhitener | None, ...] = (),
+        whitening_filters: tuple[ProcessNoiseWhitener | None, ...] = (),
+        held_out_whitening_filters: tuple[ProcessNoiseWhitener | None, ...] = (),
     ) -> None:
         theta.setflags(write=False)
         self.whitening_filters = whitening_filters or (None,) * len(episodes)
@@ -145,8 +145,8 @@ class EstimationProblem(ReprMixin):
         self.unknown_names = self.unknowns.unknown_names
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
         inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
-        self._prior_std = stated_prior_std(self.unknowns, options, model_functions.step.system, inertia)
-        has_weak_priors = options.weighting != "paper" and options.weak_prior_std_as_factor > 1
+        self._prior_std = stated_prior_stds(self.unknowns, options, model_functions.step.system, inertia)
+        has_weak_priors = options.weighting != "paper" and options.weak_prior_geometric_std > 1
         weak = self.positive_unknowns_mask & ~np.isfinite(self._prior_std) & has_weak_priors
         self._weak: IntArray = np.flatnonzero(weak)
         self._stated = stated_prior_jacobian(self.unknowns, options, self._prior_std)
@@ -160,14 +160,14 @@ class EstimationProblem(ReprMixin):
         made._set(**{**same, **changes})
         return made
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         free = f"{len(self.free)} of {count_with_noun(len(self.system.parameters), 'parameter')} free"
         seen = sum(samples.n_residuals for episode in self.episodes for samples in episode.measurements)
         used, held = (count_with_noun(len(entries), "recording") for entries in (self.episodes, self.held_out))
         rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
         table = zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
         rows += [(name, *(f"{value:.4g}" for value in own)) for name, *own in table]
-        return ReprSummary(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
+        return ReprTexts(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
 
     # -- what it is made of -------------------------------------------------------------------------------------------
 
@@ -184,7 +184,7 @@ class EstimationProblem(ReprMixin):
         """Lower and upper bounds of the unknown vector, two arrays (nx,)."""
         parts = (self.shared_parameters, self.local_parameters)
         (low, high), (own_low, own_high) = (self.system.parameters.bounds(part) for part in parts)
-        wide = initial_state_offset_limits(self.system, self.unknowns.initial_state_names)
+        wide = max_initial_state_offsets(self.system, self.unknowns.initial_state_names)
         pack = self.unknowns.pack_same_for_all_recordings
         return pack(low, own_low, -wide), pack(high, own_high, wide)
 
@@ -217,15 +217,15 @@ class EstimationProblem(ReprMixin):
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
     @property
-    def uses_inputs_as_recorded(self) -> bool:
+    def has_no_input_corrections(self) -> bool:
         """Whether all effects that correct recorded inputs, times or tracked references are neutral and fixed."""
-        return all(self.predictor.uses_inputs_as_recorded(episode, self.theta) for episode in self.episodes)
+        return all(self.predictor.has_no_input_corrections(episode, self.theta) for episode in self.episodes)
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
 
-    def theta_and_initial_state_offset(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
+    def theta_and_initial_state_deviation(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Extract theta and the initial state offset of episode number `episode` from the unknown vector."""
-        return self.unknowns.theta_and_initial_state_offset(x, episode, self.theta, self.system)
+        return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
         """Initial unknown vector (nx,) with the entries in `values` replaced, clipped to the bounds."""
@@ -248,7 +248,7 @@ class EstimationProblem(ReprMixin):
         """
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
-        asked = [(e, *self.theta_and_initial_state_offset(x, i), guess) for i, (e, guess) in enumerate(pairs)]
+        asked = [(e, *self.theta_and_initial_state_deviation(x, i), guess) for i, (e, guess) in enumerate(pairs)]
         results = self.predictor.predict_episodes(asked, derivatives)
         failures = [result for result in results if isinstance(result, str)]
         if failures:
@@ -297,7 +297,7 @@ class EstimationProblem(ReprMixin):
                 raw = samples.whitened_residual(result.predicted_outputs[k])
                 _, factor = huber_loss_and_residual_factors(raw, self.options.huber_threshold)
                 pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
-            theta, offset = self.theta_and_initial_state_offset(x, i)
+            theta, offset = self.theta_and_initial_state_deviation(x, i)
             own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, theta, offset, pulls)
             gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
         prior, prior_jacobian = self.prior_residual_and_jacobian(x)
@@ -307,21 +307,21 @@ class EstimationProblem(ReprMixin):
         """Return the residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
         stated, weak, start = self._stated, self._weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
-        spread = np.log(max(self.options.weak_prior_std_as_factor, 1.0 + 1e-9))
+        spread = np.log(max(self.options.weak_prior_geometric_std, 1.0 + 1e-9))
         value, slope = soft_logarithm_and_slope(x[weak] / start[weak])
         rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
         return np.concatenate([stated @ (x - start), value / spread]), rows
 
-    def initial_state(
+    def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
-    ) -> InitialState:
+    ) -> InitialStateWithSensitivity:
         """Initial state of an episode, with derivative with respect to (free parameters, offset from equilibrium).
 
         `guess` (n,) is a configuration near the equilibrium.
         """
         own = self.predictor.theta_with_episode_values(episode, theta)
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
-        return self.predictor.initial_state(episode, own, none, self.unknowns.free_parameters, guess)
+        return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameters, guess)
 
     # -- held-out recordings ------------------------------------------------------------------------------------------
 
@@ -345,7 +345,7 @@ class EstimationProblem(ReprMixin):
             shared = held.initial_state_shared_with
             if shared is not None:
                 episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
-                found.append((episode, theta, self.theta_and_initial_state_offset(x, shared)[1]))
+                found.append((episode, theta, self.theta_and_initial_state_deviation(x, shared)[1]))
                 continue
             episode = self.predictor.episode_with_fitted_initial_state(held, theta)
             std = self.initial_state_prior_std
@@ -354,14 +354,14 @@ class EstimationProblem(ReprMixin):
 
     def held_out_theta(self, x: Array) -> Array:
         """Vector theta with the shared parameters in `x`; local parameters keep their initial values."""
-        theta, _ = self.theta_and_initial_state_offset(x, 0)
+        theta, _ = self.theta_and_initial_state_deviation(x, 0)
         for name in self.local_parameters:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return theta
 
     # -- without data -------------------------------------------------------------------------------------------------
 
-    def simulate_recording(
+    def simulate_noisy_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
     ) -> Recording:
         """Simulate a synthetic recording with the inputs of one recording and, if given, other parameter values.
@@ -385,7 +385,7 @@ class EstimationProblem(ReprMixin):
 
     # -- problems like this one ---------------------------------------------------------------------------------------
 
-    def with_compiled_parameters_free(self, names: Sequence[str]) -> EstimationProblem:
+    def with_free_parameters_without_recompiling(self, names: Sequence[str]) -> EstimationProblem:
         """The same problem with other free parameters out of `free` and `may_free`; compiled functions are shared."""
         return self._changed(free=tuple(names))
 
@@ -400,8 +400,8 @@ class EstimationProblem(ReprMixin):
         self,
         episodes: Sequence[Episode],
         held_out: Sequence[Episode],
-        whitening_filters: Sequence[ResidualWhitener | None] = (),
-        held_out_whitening_filters: Sequence[ResidualWhitener | None] = (),
+        whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
+        held_out_whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
     ) -> EstimationProblem:
         """The same problem on other episodes; without given filters, residuals are whitened by sensor noise alone."""
         filters = {"whitening_filters": whitening_filters, "held_out_whitening_filters": held_out_whitening_filters}
@@ -413,7 +413,9 @@ class EstimationProblem(ReprMixin):
         """Whether errors of recorded torques or angles act as process noise in at least one recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
 
-    def whitened_held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualAndJacobian:
+    def whitened_held_out_prediction_residual(
+        self, i: int, episode: Episode, result: EpisodePrediction
+    ) -> ResidualAndJacobian:
         """Whitened residual of a prediction of held-out recording `i` (`predict_held_out`), without a robust loss."""
         return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
@@ -467,10 +469,10 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
     if not len(offset):
         return offset
-    short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.step.time_step), 2))
+    short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
-    limit = initial_state_offset_limits(predictor.system, predictor.unknowns.initial_state_names)
+    limit = max_initial_state_offsets(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

@@ -10,29 +10,29 @@ from typing import Protocol
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.measurements import (
-    Measurements,
     ResidualAndJacobian,
+    SensorMeasurements,
     huber_loss_and_residual_factors,
     whitened_for_sensor_biases,
-    whitened_sensitivities_to_unit_biases,
+    whitened_sensitivities_to_standardized_biases,
 )
 
 EquilibriumGuesses = tuple[Array | None, ...]
 """For each recording, a configuration near the equilibrium from which it starts; None where it is not known."""
 
 
-class ResidualWhitener(Protocol):
+class ProcessNoiseWhitener(Protocol):
     """Interface of a Kalman filter with fixed gains that whitens one recording's residual, with process noise."""
 
     @property
-    def input_errors(self) -> InputErrorModel:
+    def input_error_model(self) -> InputErrorModel:
         """Standard deviations of torque and angle errors, and the errors about which the filter is linearized."""
         ...
 
-    def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+    def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten residual and derivatives; return them (r, c) and estimated constant torque errors (nu, c) [N m].
 
         Of `rows` (r, c), a residual in units of the sensors' noise and columns of its derivative, and `push`
@@ -80,10 +80,10 @@ class Evaluation(ReprMixin):
     message: str
     episode_predictions: tuple[EpisodePrediction, ...]
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         slopes = "" if self.jacobian is None else f", by {count_with_noun(self.jacobian.shape[1], 'unknown')}"
         said = f"cost {self.cost:.6g} of {count_with_noun(len(self.residual), 'residual')}{slopes}"
-        return ReprSummary(said if self.ok else f"failed, {self.message}")
+        return ReprTexts(said if self.ok else f"failed, {self.message}")
 
     @property
     def equilibrium_guesses(self) -> EquilibriumGuesses:
@@ -96,7 +96,7 @@ EvaluateFunction = Callable[..., Evaluation]
 
 
 def _sensor_whitened_residual(
-    measurements: Sequence[Measurements], result: EpisodePrediction, threshold: float = math.inf
+    measurements: Sequence[SensorMeasurements], result: EpisodePrediction, threshold: float = math.inf
 ) -> ResidualAndJacobian:
     """Residual of one recording in units of the sensors' noise, group after group."""
     slopes = result.output_sensitivities or (None,) * len(measurements)
@@ -112,13 +112,13 @@ def _sensor_whitened_residual(
 
 
 def whitened_episode_residual(
-    episode: Episode, whitening: ResidualWhitener | None, result: EpisodePrediction, threshold: float
+    episode: Episode, whitening: ProcessNoiseWhitener | None, result: EpisodePrediction, threshold: float
 ) -> ResidualAndJacobian:
     """Whitened residual of one episode, by sensor noise or by the Kalman filter `whitening` if it is given.
 
     Constant sensor errors count as noise, see `whitened_for_sensor_biases`.
     """
-    by_constants = whitened_sensitivities_to_unit_biases(episode.measurements)
+    by_constants = whitened_sensitivities_to_standardized_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
     plain = _sensor_whitened_residual(episode.measurements, result)
@@ -129,7 +129,7 @@ def whitened_episode_residual(
         kept, push = columns.shape[1], result.torque_correction_and_sensitivity
         # constant errors of sensors drive nothing
         push = None if push is None else np.pad(push, ((0, 0), (0, 0), (0, by_constants.shape[1])))
-        innovations, _ = whitening.whiten(np.hstack([columns, by_constants]), push)
+        innovations, _ = whitening.whiten_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
         columns = whitened_for_sensor_biases(by_constants, columns)

@@ -11,13 +11,13 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.statics import relaxed_internal_coordinates
-from yid_ocp.integrator.step import Step, generalized_momentum
+from yid_ocp.integrator.statics import internal_coordinates_at_held_configuration
+from yid_ocp.integrator.step import Step, generalized_momentum_from_velocity
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.objects.cable import START_ANGLE_AND_LOAD_SUFFIXES, START_SPEED_PARAMETER_NAME
 from yid_ocp.parallel import CasadiLockedCache
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import Sensor, sensor_reading_function
 
 # Width of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
@@ -38,7 +38,7 @@ _TRIALS_PER_PARAMETER = 4
 
 
 @dataclass(frozen=True)
-class FixedInitialState:
+class PrecomputedInitialState:
     """Initial state, given or fitted to the first measured points, that does not depend on the unknowns."""
 
     state: Array  # (q, p, z) at node 0, (nx,)
@@ -49,7 +49,7 @@ class FixedInitialState:
 class _Task:
     """One fit: measured rows, theta, configuration and weights of the prior, number of parameters sought, softness."""
 
-    measured: list[tuple[Measurements, int]]
+    measured: list[tuple[SensorMeasurements, int]]
     theta: Array
     rest: Array
     prior: Array
@@ -82,8 +82,8 @@ class InitialStateFitter:
         )
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self.fitted_parameters))
         kinematics = forward_kinematics(system.mechanism, e.q1)
-        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.far_start_orientation_error(kinematics) for grasp in system.grasps))
-        internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
+        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.holder_minus_held_axes(kinematics) for grasp in system.grasps))
+        internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
         held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
         self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)
@@ -104,13 +104,13 @@ class InitialStateFitter:
     def fit_to_points(
         self,
         configuration: Array,
-        samples: Sequence[Measurements],
+        samples: Sequence[SensorMeasurements],
         theta: Array,
         window: float,
         path: Array,
         *,
         roughly: bool = False,
-    ) -> FixedInitialState:
+    ) -> PrecomputedInitialState:
         """Fit configuration and momentum to the first frame's points and their change within the window.
 
         Given are driven, then prescribed coordinates at node 0 (nk,), samples, of which only points are used, how far
@@ -119,7 +119,7 @@ class InitialStateFitter:
         """
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
-        frames: dict[int, list[tuple[Measurements, int]]] = {}
+        frames: dict[int, list[tuple[SensorMeasurements, int]]] = {}
         for group in samples:
             if group.sensor.point_names:
                 for row, (node, fraction) in enumerate(zip(group.node, group.fraction, strict=True)):
@@ -128,7 +128,7 @@ class InitialStateFitter:
                         frames.setdefault(near, []).append((group, row))
         if not frames:
             what = f"no point is seen in the first {window:g} s, so the start state cannot be fitted"
-            raise DataError(what, hint="widen problem.start_fit_window, or start from equilibrium")
+            raise DataError(what, hint="widen problem.initial_state_fit_window, or start from equilibrium")
         nodes = sorted(frames)
         first, then = nodes[0], nodes[-1]
         index = [system.parameters.index(name) for name in self.fitted_parameters]
@@ -160,12 +160,12 @@ class InitialStateFitter:
             velocity = (self._fit(guess, values, task)[0] - q) / span
         q0 = q - velocity * first * step.time_step
         q0[list(system.prescribed_coordinate_indices)] = path[0]
-        momentum = generalized_momentum(step, q0, velocity, theta)
-        state = np.concatenate([q0, momentum, relaxed_internal_coordinates(step, q0, theta)])
+        momentum = generalized_momentum_from_velocity(step, q0, velocity, theta)
+        state = np.concatenate([q0, momentum, internal_coordinates_at_held_configuration(step, q0, theta)])
         own = dict(zip(self.fitted_parameters, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
         if START_SPEED_PARAMETER_NAME in system.parameters:
             own[START_SPEED_PARAMETER_NAME] = _speed(frames[first], frames[then], (then - first) * step.time_step)
-        return FixedInitialState(state, own)
+        return PrecomputedInitialState(state, own)
 
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
         """Angle of every joint with a preset, and the torque that its spring holds there if the object is at rest.
@@ -250,7 +250,9 @@ class InitialStateFitter:
         return np.concatenate(residuals), np.vstack(jacobians)
 
 
-def _speed(before: Sequence[tuple[Measurements, int]], after: Sequence[tuple[Measurements, int]], span: float) -> float:
+def _speed(
+    before: Sequence[tuple[SensorMeasurements, int]], after: Sequence[tuple[SensorMeasurements, int]], span: float
+) -> float:
     """Root mean square speed of the points seen in both frames, zero where there is one frame only [m/s]."""
     squares = []
     for samples, row in before:

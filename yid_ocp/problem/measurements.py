@@ -44,7 +44,7 @@ class TimeGrid:
         return node, position - node
 
 
-def make_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
+def recording_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
     """Time grid that covers a recording's joint samples, or without joints its first point group.
 
     `DataError` where it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its length.
@@ -63,7 +63,7 @@ def make_time_grid(recording: Recording, time_step: float, duration: float | Non
     return TimeGrid(float(t[0]), time_step, steps)
 
 
-ResidualWeighting = Literal["whitened", "paper"]
+ResidualWeightingName = Literal["whitened", "paper"]
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class ResidualAndJacobian:
 
 
 @dataclass(frozen=True)
-class Measurements:
+class SensorMeasurements:
     """M samples of a sensor's k outputs, located between the nodes of a rollout, with weights and noise levels."""
 
     sensor: Sensor
@@ -91,7 +91,7 @@ class Measurements:
     noise_correlation: Array | None = None  # of the noise of a sample's outputs, if not independent, (M, k, k)
 
     @property
-    def output_channel_names(self) -> tuple[str, ...]:
+    def channel_name_per_output(self) -> tuple[str, ...]:
         """Name of the channel that each of the k outputs belongs to."""
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
@@ -107,7 +107,7 @@ class Measurements:
         return np.unique(np.concatenate([self.node, after]))
 
     @property
-    def used_output_mask(self) -> BoolArray:
+    def positive_weight_mask(self) -> BoolArray:
         """Mask of measured outputs with positive weight, shape (M, k)."""
         return self.weight > 0
 
@@ -117,7 +117,7 @@ class Measurements:
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
-    def output_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
+    def residual_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
         """Matrix R^(-1/2), (nr, nr), that decorrelates normalized residuals; None if outputs are independent.
 
         R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
@@ -125,7 +125,7 @@ class Measurements:
         """
         if self.noise_correlation is None:
             return None
-        seen = self.used_output_mask
+        seen = self.positive_weight_mask
         together = seen[:, :, None] & seen[:, None, :]
         size, turn = np.linalg.eigh(np.where(together, self.noise_correlation, np.eye(seen.shape[1])))
         blocks = (turn / np.sqrt(np.maximum(size, 1e-12))[:, None, :]) @ turn.transpose(0, 2, 1)
@@ -135,20 +135,20 @@ class Measurements:
 
     def decorrelate(self, rows: Any) -> Any:
         """Decorrelate rows (nr,) or (nr, d), dense or sparse, already divided by their standard deviations."""
-        return rows if self.output_decorrelation_matrix is None else self.output_decorrelation_matrix @ rows
+        return rows if self.residual_decorrelation_matrix is None else self.residual_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
         """Whitened residual (M, k), prediction minus measurement; zero where nothing was measured."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
-        if self.output_decorrelation_matrix is not None:
-            plain[self.used_output_mask] = self.output_decorrelation_matrix @ plain[self.used_output_mask]
+        if self.residual_decorrelation_matrix is not None:
+            plain[self.positive_weight_mask] = self.residual_decorrelation_matrix @ plain[self.positive_weight_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
         """Adjoint of `whitened_residual`: maps a cost's gradient (M, k) by residual to the gradient by prediction."""
-        if self.output_decorrelation_matrix is not None:
+        if self.residual_decorrelation_matrix is not None:
             pull = pull.copy()
-            pull[self.used_output_mask] = self.output_decorrelation_matrix.T @ pull[self.used_output_mask]
+            pull[self.positive_weight_mask] = self.residual_decorrelation_matrix.T @ pull[self.positive_weight_mask]
         return np.asarray(pull * self.weight)
 
     def residual_and_jacobian(
@@ -157,13 +157,13 @@ class Measurements:
         """Residual block with Huber weights and, if the prediction's slopes (M, k, d) are given, its Jacobian."""
         raw = self.whitened_residual(predicted)
         cost, factor = huber_loss_and_residual_factors(raw, threshold)
-        seen, jacobian = self.used_output_mask, None
+        seen, jacobian = self.positive_weight_mask, None
         robust = factor[seen]
         if slopes is not None:
             jacobian = robust[:, None] * self.decorrelate(self.weight[seen][:, None] * slopes[seen])
         return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
-    def shifted_earlier_by(self, steps: Array) -> Measurements:
+    def shifted_earlier_by_steps(self, steps: Array) -> SensorMeasurements:
         """The same samples, shifted earlier by each output's delay (k,) [steps] and clipped to predictable nodes."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
@@ -172,7 +172,7 @@ class Measurements:
         node = np.minimum(np.floor(position), max(last - 1, first)).astype(np.int64)
         return replace(self, node=node, fraction=position - node)
 
-    def prediction_rate_per_step(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
+    def prediction_change_per_step(self, at_nodes: Array, unmoved: SensorMeasurements, steps: Array) -> Array:
         """Change of a prediction per step at delayed samples, (M, k); at a node the mean of both adjacent steps.
 
         `at_nodes` (len(nodes), k) is the prediction, `unmoved` the measurements before the delay of `steps` (k,).
@@ -217,7 +217,7 @@ class Measurements:
         return result
 
 
-def locate_measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) -> Measurements:
+def measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) -> SensorMeasurements:
     """Locate a sensor's samples between the nodes of a rollout; `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
@@ -229,10 +229,10 @@ def locate_measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) ->
     std = np.where(seen, data.std, np.nan)
     bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
     span = data.predictable_nodes or (0, grid.steps)
-    return Measurements(data.sensor, node, fraction, data.value, weight, std, span, bias, data.noise_correlation)
+    return SensorMeasurements(data.sensor, node, fraction, data.value, weight, std, span, bias, data.noise_correlation)
 
 
-def measurements_with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
+def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
     """The measurements at nearest nodes with the source paper's weights: 0 at k = 0, double at the last node, else 1.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
@@ -273,7 +273,7 @@ def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
-def whitened_sensitivities_to_unit_biases(samples: Sequence[Measurements]) -> Array:
+def whitened_sensitivities_to_standardized_biases(samples: Sequence[SensorMeasurements]) -> Array:
     """Derivatives (r, m) of whitened measurements with respect to constant sensor errors of unit variance.
 
     Those of the residual, prediction minus measurement, have the opposite sign.
@@ -283,22 +283,24 @@ def whitened_sensitivities_to_unit_biases(samples: Sequence[Measurements]) -> Ar
     found = np.zeros((sum(s.n_residuals for s in samples), count))
     rows = 0
     for s, part in zip(samples, parts, strict=True):
-        own = s.decorrelate(part[s.used_output_mask])
+        own = s.decorrelate(part[s.positive_weight_mask])
         found[rows : rows + s.n_residuals, before : before + own.shape[1]] = own
         rows, before = rows + s.n_residuals, before + own.shape[1]
     return found
 
 
-def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequence[Array]) -> tuple[Measurements, ...]:
+def subtract_estimated_biases(
+    samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
+) -> tuple[SensorMeasurements, ...]:
     """Measurements minus their constant errors, which are estimated from a prediction; their `bias_std` is zero.
 
     `predicted` has the shape (M, k) for each.
     """
-    slopes = whitened_sensitivities_to_unit_biases(samples)
+    slopes = whitened_sensitivities_to_standardized_biases(samples)
     if not slopes.shape[1]:
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)
-    residual = np.concatenate([s.whitened_residual(y)[s.used_output_mask] for s, y in pairs])
+    residual = np.concatenate([s.whitened_residual(y)[s.positive_weight_mask] for s, y in pairs])
     left = estimated_constant_errors(slopes, residual)
     made = []
     for s in samples:

@@ -17,7 +17,7 @@ from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
     EffectMomentumShift,
     JointMotionWithSensitivities,
-    driven_joints_only_step,
+    compile_driven_joints_step,
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
@@ -51,7 +51,7 @@ class CorrectedInputs:
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
 
-    def corrected_feedback(
+    def feedback_with_corrected_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
         """Tracking filter whose reference is corrected to true angles and by the effects' momentum shift."""
@@ -65,7 +65,7 @@ class CorrectedInputs:
                     reference[:, column] += moved[: len(reference), at]
         return replace(feedback, reference=reference)
 
-    def with_reference_momentum_shift(
+    def with_effect_momentum_shift(
         self,
         shift: EffectMomentumShift,
         recorded: JointMotionWithSensitivities,
@@ -112,7 +112,7 @@ class CorrectedInputs:
         return list(zip(later, range(len(driven)), strict=False))
 
 
-class InputCorrections:
+class InputCorrectionFunctions:
     """Compiled maps from recorded to true inputs and times, from the system's effects on recordings.
 
     Derivatives may be asked for by the parameters `names`; those wanted are some of them.
@@ -195,7 +195,9 @@ class InputCorrections:
         """
         return self._evaluate(self._times[kind], theta, wanted)
 
-    def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+    def sensor_delays_with_derivatives(
+        self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array] | None:
         """Recorded minus true time of each sensor output, (k,) [s], and its derivatives; None without delays."""
         return self._evaluate(self._sensor_delays(sensor), theta, wanted)
 
@@ -242,7 +244,9 @@ class TimeGridStateValues:
         """Compute the values at all nodes of a trajectory (K, nx); absent loads and constraint forces are zero."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
-        v, a = (rate(q, nodes, step.time_step) for rate in (node_velocity, node_acceleration))
+        v, a = (
+            rate(q, nodes, step.time_step) for rate in (central_difference_velocity, second_difference_acceleration)
+        )
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
         return TimeGridStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
 
@@ -251,15 +255,15 @@ class TimeGridStateValues:
         return TimeGridStateValues(*(values[nodes] for values in vars(self).values()))
 
 
-def node_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
+def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
     """Velocity (len(nodes), ...) at some nodes of a trajectory (K, ...), the mean over the adjacent steps."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
 
 
-def node_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of the linear map `node_velocity`: values (len(nodes), n) to (count, n)."""
+def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
+    """Transpose of the linear map `central_difference_velocity`: values (len(nodes), n) to (count, n)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
     scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))
     np.add.at(result, after, scaled)
@@ -267,14 +271,14 @@ def node_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: f
     return result
 
 
-def node_acceleration(q: Array, nodes: IntArray, time_step: float) -> Array:
+def second_difference_acceleration(q: Array, nodes: IntArray, time_step: float) -> Array:
     """Acceleration (len(nodes), ...) at some nodes of a trajectory (K, ...), by second differences."""
     middle = _inner_nodes(nodes, len(q))
     return np.asarray((q[middle + 1] - 2 * q[middle] + q[middle - 1]) / time_step**2) if len(q) > 2 else 0 * q[nodes]
 
 
-def node_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of the linear map `node_acceleration`: values (len(nodes), n) to (count, n)."""
+def second_difference_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
+    """Transpose of the linear map `second_difference_acceleration`: values (len(nodes), n) to (count, n)."""
     middle, result = _inner_nodes(nodes, count), np.zeros((count, pull.shape[1]))
     for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
         np.add.at(result, middle + shift, factor / time_step**2 * pull)
@@ -312,12 +316,12 @@ class ModelFunctions:
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:
         self.step = step
         self.parameter_names, self._start_parameters = names, start_parameters
-        self.input_corrections = InputCorrections(step.system, names, step.is_compiled)
+        self.input_corrections = InputCorrectionFunctions(step.system, names, step.is_compiled)
         self._statics = CasadiLockedCache[None, EquilibriumSolver](lambda _: EquilibriumSolver(step))
         self._start_fit = CasadiLockedCache[None, InitialStateFitter](
             lambda _: InitialStateFitter(step, start_parameters)
         )
-        self._arms = CasadiLockedCache[None, Step](lambda _: driven_joints_only_step(step))
+        self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_joints_step(step))
         self._momentum = CasadiLockedCache[None, EffectMomentumShift](lambda _: EffectMomentumShift(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
@@ -344,7 +348,7 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def reference_momentum_shift(self) -> EffectMomentumShift:
+    def effect_momentum_shift(self) -> EffectMomentumShift:
         """Calculator of the momentum that effects add to the tracking filter's reference at every step."""
         return self._momentum(None)
 

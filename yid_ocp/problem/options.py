@@ -14,7 +14,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.issues import Issue
 from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.options import OptionInfo
-from yid_ocp.problem.measurements import ResidualWeighting
+from yid_ocp.problem.measurements import ResidualWeightingName
 from yid_ocp.sensors import SensorOptions as SensorOptions
 
 _InitialStateKind = Literal["equilibrium", "estimated", "fitted_to_points"]
@@ -67,15 +67,15 @@ class ProblemOptions:
             "at rest at the first posture; that plus a free offset with a prior; fitted to the first measured points"
         ),
     ] = "equilibrium"
-    tracking_filter: Annotated[
+    arm_tracking_feedback: Annotated[
         Literal["none", "proportional", "lqr"], OptionInfo("tracking filter of driven arms; arms with servos have none")
     ] = "lqr"
-    tracking_filter_gains: Annotated[
+    arm_tracking_feedback_gains: Annotated[
         tuple[Annotated[float, Ge(0)], ...],
         Len(1),
         OptionInfo("of the filter `proportional`, for one arm or for all driven joints", "N m/rad"),
     ] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
-    weighting: Annotated[ResidualWeighting, OptionInfo("cost in standard deviations, or the paper's")] = "whitened"
+    weighting: Annotated[ResidualWeightingName, OptionInfo("cost in standard deviations, or the paper's")] = "whitened"
     huber_threshold: Annotated[
         float,
         Gt(0),
@@ -85,11 +85,11 @@ class ProblemOptions:
         float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of the efforts compared with them", "Hz")
     ] = 10.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
-    clamp_pose_definitions: tuple[ClampPoseDefinition, ...] = ()
+    clamp_poses_from_points: tuple[ClampPoseDefinition, ...] = ()
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)
-    weak_prior_std_as_factor: Annotated[
+    weak_prior_geometric_std: Annotated[
         float,
         Ge(0),
         OptionInfo(
@@ -97,12 +97,12 @@ class ProblemOptions:
             "without a prior near their start where nothing informs them; 0 for none; the paper's weighting has none"
         ),
     ] = 10.0
-    start_configuration_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an estimated start", "rad")] = (
-        0.05
-    )
-    start_velocity_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an estimated start", "rad/s")] = 0.2
+    initial_configuration_std: Annotated[
+        float, Gt(0), OptionInfo("standard deviation of an estimated start", "rad")
+    ] = 0.05
+    initial_velocity_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an estimated start", "rad/s")] = 0.2
     duration: Annotated[float | None, Gt(0), OptionInfo("use only the first seconds of every recording", "s")] = None
-    start_fit_window: Annotated[
+    initial_state_fit_window: Annotated[
         float, Gt(0), OptionInfo("how long the measured points that fix a fitted start may reach", "s")
     ] = 0.02
     start_point_noise_std: Annotated[
@@ -112,7 +112,7 @@ class ProblemOptions:
             "noise standard deviation of these points, where the sensors' one stands for the model's error too", "m"
         ),
     ] = None
-    start_fit_parameters: Annotated[
+    initial_state_fit_parameters: Annotated[
         tuple[str, ...],
         OptionInfo(
             "fitted along with a fitted start in every recording, held-out ones too, from these points alone; not free"
@@ -123,6 +123,6 @@ class ProblemOptions:
     data_issues: tuple[Issue, ...] = ()
 
     @property
-    def has_no_serious_data_issues(self) -> bool:
+    def all_data_issues_are_warnings(self) -> bool:
         """Whether no data quality issue of the recordings is more severe than a warning."""
         return all(doubt.weight == "warning" for doubt in self.data_issues)

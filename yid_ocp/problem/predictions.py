@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validate_recording
-from yid_ocp.display import ReprMixin, ReprSummary
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
+from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.errors import DataError, SolverError, nearest_name_hint
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -49,7 +49,7 @@ def constant_position_baseline(recording: Recording, points: Sequence[str], give
     return _carried(recording, points, (), given, np.zeros((len(points), 0)))
 
 
-def mean_clamp_displacement_baseline(
+def mean_clamp_displacement_baseline_prediction(
     recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2
 ) -> Array:
     """Baseline prediction: every point moves by the clamped points' mean displacement since the last given frame.
@@ -60,7 +60,7 @@ def mean_clamp_displacement_baseline(
     return _carried(recording, points, clamped, given, share)
 
 
-def interpolated_displacement_baseline(
+def interpolated_displacement_position_baseline(
     recording: Recording,
     points: Sequence[str],
     parent: Sequence[str],
@@ -105,14 +105,14 @@ def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
     return float(np.sqrt(np.mean(square[seen]))) if np.any(seen) else float("nan")
 
 
-def measured_point_positions(recording: Recording, points: Sequence[str]) -> Array:
+def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
     """Measured positions (M, len(points), 3) [m] of some points of one group of a recording."""
     group = _group_with_points(recording, points)
     return group.position[:, [group.names.index(point) for point in points]]
 
 
 def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Array:
-    at = measured_point_positions(recording, points)
+    at = recorded_point_positions(recording, points)
     if not 1 <= given < len(at):
         raise DataError(f"given = {given} frames", where=recording.name, allowed=f"1 to {len(at) - 1}")
     if not np.all(np.isfinite(at[given - 1])):
@@ -124,10 +124,10 @@ def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Arr
 def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], given: int, share: Array) -> Array:
     """Given frames as measured, then the last one plus each point's share of the known points' displacement."""
     here = _given_frame(recording, points, given)
-    result = np.array(measured_point_positions(recording, points))
+    result = np.array(recorded_point_positions(recording, points))
     moved = np.zeros((len(result), len(points), 3))
     if known:
-        paths = measured_point_positions(recording, known)
+        paths = recorded_point_positions(recording, known)
         moved = np.einsum("pk,mkx->mpx", share, paths - _given_frame(recording, known, given))
     result[given:] = here + moved[given:]
     return result
@@ -158,9 +158,9 @@ class ChannelPrediction(ReprMixin):
         """Root mean square error in the channel's unit; for a point, that of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         samples = f"{len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"
-        return ReprSummary(f"{self.channel} of '{self.recording}', {samples}")
+        return ReprTexts(f"{self.channel} of '{self.recording}', {samples}")
 
 
 def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[ChannelPrediction, ...]:
@@ -218,7 +218,7 @@ def recording_from_prediction(
     groups = []
     for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
         if samples.sensor.point_names:
-            t = episode.grid.start_time + predictor.step.time_step * (samples.node + samples.fraction)
+            t = episode.grid.start_time + predictor.integrator_step.time_step * (samples.node + samples.fraction)
             shape = (len(t), len(samples.sensor.point_names), 3)
             std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
             position = np.where(samples.weight > 0, predicted, np.nan).reshape(shape)
@@ -234,7 +234,7 @@ def recording_from_prediction(
     channels = _channel_groups(predictor, episode, outcome, own, rng)
     said = (text, "yid_ocp simulate", f"{episode.name}_simulated")
     made = Recording(joints, tuple(groups), *said, true_parameters=truth, channel_groups=channels)
-    return validate_recording(replace(made, marker_reference_pose=_straight(made, source)))
+    return validated_recording(replace(made, marker_reference_pose=_straight(made, source)))
 
 
 def synthesize_recording(
@@ -275,17 +275,15 @@ def _channel_groups(
             if given is not None:
                 stds[attribute] = expand_to_joint_values(given, original.names, names, f"sensors.{sensor.group_name}")
         function = predictor.model_functions.compiled_sensor_function(sensor)
-        read = function(predictor.node_values(outcome.rollout), theta).output
+        read = function(predictor.state_values_at_nodes(outcome.rollout), theta).output
         values = read.reshape(len(read), len(names), *([-1] if sensor.channel.components else []))
         std, bias = (stds.get(attribute, np.zeros(len(names))) for attribute in sensor.channel.std_attribute_names)
         widen = (slice(None), *[None] * (values.ndim - 2))
         values = _noisy(values, np.broadcast_to(std[widen], values.shape), rng)
         values = values + _noisy(np.zeros(values.shape[1:]), np.broadcast_to(bias[widen], values.shape[1:]), rng)
         before = made.get(name, SensorChannelGroup(name, names, episode.grid.node_times, {}))
-        by_quantity, by_attribute = (
-            {**before.values_by_quantity, quantity: values},
-            {**before.stds_by_attribute, **stds},
-        )
+        by_quantity = {**before.values_by_quantity, quantity: values}
+        by_attribute = {**before.stds_by_attribute, **stds}
         made[name] = replace(before, values_by_quantity=by_quantity, stds_by_attribute=by_attribute)
     return tuple(made.values())
 
@@ -293,8 +291,8 @@ def _channel_groups(
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
     """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
     original = next(entry for entry in source.points if entry.name == group.name)
-    clamps = predictor.options.clamp_pose_definitions
-    followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point, clamp.z_axis_point))
+    clamps = predictor.options.clamp_poses_from_points
+    followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point_name, clamp.z_axis_point_name))
     names = tuple(name for name in followed if name in original.names and name not in group.names)
     if not names:
         return group

@@ -12,11 +12,11 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.objects.base import ClampPoseDefinition
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR, PositionServo
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR_PARAMETER, PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_columns
+from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_column_indices
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
@@ -75,7 +75,7 @@ def _motor_off_steps(
     if is_off or not has_servos or joints.torque_enable is None:
         return np.full((grid.steps, len(driven)), is_off)
     row = np.searchsorted(joints.t, grid.node_times[:-1] + grid.time_step / 2, "right") - 1
-    enabled = joints.torque_enable[:, recorded_joint_columns(joints, driven, where)]
+    enabled = joints.torque_enable[:, recorded_joint_column_indices(joints, driven, where)]
     return np.asarray(enabled[np.clip(row, 0, len(joints.t) - 1)] < 0.5)
 
 
@@ -84,7 +84,7 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
 
     `DataError` where some recordings state it and others, whose motors are on, do not: their gains would not compare.
     """
-    wanted = {name: f"{name}.{SERVO_GAIN_FACTOR}" for name in system.servos}
+    wanted = {name: f"{name}.{SERVO_GAIN_FACTOR_PARAMETER}" for name in system.servos}
     wanted = {name: parameter for name, parameter in wanted.items() if parameter in system.parameters}
     found: dict[str, dict[str, float]] = {}
     silent = []
@@ -124,14 +124,14 @@ def _courses(
                 "with motors off an effort that is zero throughout says so"
             )
             raise DataError(what, where=f"{where}: joints/position_command", allowed=allowed, hint=hint)
-        rows = joints.position_command[:, recorded_joint_columns(joints, driven, where)].T
+        rows = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)].T
         held = [servos[name].command_interpolation == "held" for name in driven]
         return [_held(row, edges) if jumps else _straight(row, t) for row, jumps in zip(rows, held, strict=True)]
     if joints.effort is None:
         what = "the recording has no joint effort, which drives the model"
         hint = "prescribe the arms' motion instead (model.arms.mode: prescribed)"
         raise DataError(what, where=f"{where}: joints/effort", hint=hint)
-    effort = joints.effort[:, recorded_joint_columns(joints, driven, where)]
+    effort = joints.effort[:, recorded_joint_column_indices(joints, driven, where)]
     if joints.effort_sampling_kind_or_default == "sample":
         return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
     if joints.effort_sampling_kind_or_default == "command":
@@ -155,11 +155,11 @@ def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
     return np.asarray(course.antiderivative()(inside) + course(inside) * (t - inside))
 
 
-def smoothed_joint_angles(
+def smoothed_joint_angles_at_nodes(
     joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: LowPassFilter
 ) -> Array:
     """Joint angles at every node, low-pass filtered from the recording, (steps + 1, len(names)) [rad]."""
-    columns = recorded_joint_columns(joints, names, where)
+    columns = recorded_joint_column_indices(joints, names, where)
     return _smoothed_at_nodes(joints.t, joints.position[:, columns], grid, low_pass)
 
 
@@ -177,7 +177,7 @@ def smoothed_joint_efforts(
         what = "the model's gears give way under an effort that the recording does not have"
         hint = "leave series_elasticity and backlash out"
         raise DataError(what, where=f"{recording.name}: joints/effort", hint=hint)
-    effort = low_pass(joints.t, joints.effort[:, recorded_joint_columns(joints, names, recording.name)])
+    effort = low_pass(joints.t, joints.effort[:, recorded_joint_column_indices(joints, names, recording.name)])
     return np.stack([np.interp(grid.node_times, joints.t, column) for column in effort.T], axis=1)
 
 
@@ -191,14 +191,14 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
 
-def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
+def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     """Kinds of signals, such as `joints.effort`, that recordings contain and effects can require.
 
     Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`.
     """
     found, mounted = set[str](), set[str]()
     for recording in recordings:
-        own = {} if recording.joints is None else {"joints": recording.joints.channels}
+        own = {} if recording.joints is None else {"joints": recording.joints.values_by_channel}
         own |= {group.name: dict(group.values_by_quantity) for group in recording.channel_groups}
         for kind in CHANNEL_KINDS:
             channel = CHANNEL_KINDS[kind]
@@ -214,7 +214,7 @@ def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     return frozenset(found & signal_kinds_required_by_any_effect() | mounted)
 
 
-def prescribed_path(
+def prescribed_coordinates_at_nodes(
     recording: Recording,
     system: System,
     grid: TimeGrid,
@@ -238,7 +238,7 @@ def prescribed_path(
             allowed, hint = "a recording with the group `joints`", "record the joints too, or give another recording"
             raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
         joints = recording.joints
-        sampled = smoothed_joint_angles(joints, remaining, grid, recording.name, low_pass)
+        sampled = smoothed_joint_angles_at_nodes(joints, remaining, grid, recording.name, low_pass)
         course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
     return np.stack([course[name] for name in system.prescribed], axis=1)
 
@@ -246,11 +246,13 @@ def prescribed_path(
 def _clamp_course(
     recording: Recording, clamp: ClampPoseDefinition, grid: TimeGrid, low_pass: LowPassFilter
 ) -> Mapping[str, Array]:
-    origin = _smoothed_point_path(recording, clamp.origin_point, grid, low_pass)
-    direction = _smoothed_point_path(recording, clamp.z_axis_point, grid, low_pass) - origin
+    origin = _smoothed_point_path(recording, clamp.origin_point_name, grid, low_pass)
+    direction = _smoothed_point_path(recording, clamp.z_axis_point_name, grid, low_pass) - origin
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if np.any(length < 1e-6):
-        raise DataError(f"points '{clamp.origin_point}' and '{clamp.z_axis_point}' coincide", where=recording.name)
+        raise DataError(
+            f"points '{clamp.origin_point_name}' and '{clamp.z_axis_point_name}' coincide", where=recording.name
+        )
     d = direction / length
     about_y = np.arcsin(np.clip(d[:, 0], -1, 1))
     about_x = np.unwrap(np.arctan2(-d[:, 1], d[:, 2]))

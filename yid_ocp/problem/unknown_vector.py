@@ -42,7 +42,7 @@ class UnknownVectorLayout:
         """Names of the free parameters, shared then local, in the order of one recording's derivative columns."""
         return (*self.shared_parameters, *self.local_parameters)
 
-    def unknown_indices_of_recording(self, recording: int) -> IntArray:
+    def unknown_indices_affecting_recording(self, recording: int) -> IntArray:
         """Indices in the unknown vector of shared unknowns and of one recording's local and initial state unknowns."""
         shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
@@ -50,14 +50,14 @@ class UnknownVectorLayout:
     def scatter_to_unknown_columns(self, block: Array, recording: int) -> Array:
         """Scatter one recording's derivative columns (r, d) to those of the unknown vector (r, nx); others are zero."""
         wide = np.zeros((len(block), len(self.unknown_names)))
-        wide[:, self.unknown_indices_of_recording(recording)] = block
+        wide[:, self.unknown_indices_affecting_recording(recording)] = block
         return wide
 
-    def theta_and_initial_state_offset(
+    def theta_and_initial_state_deviation(
         self, x: ArrayLike, recording: int, theta: Array, system: System
     ) -> tuple[Array, Array]:
         """Return theta with one recording's values in `x`, and that recording's initial state offset."""
-        own = np.asarray(x, float)[self.unknown_indices_of_recording(recording)]
+        own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
         result = theta.copy()
         for name, value in zip(self.free_parameters, own, strict=False):
             result[system.parameters.index(name)] = value
@@ -70,7 +70,7 @@ class UnknownVectorLayout:
         return np.concatenate(parts)
 
 
-def stated_prior_std(
+def stated_prior_stds(
     unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
 ) -> Array:
     """Standard deviation (nx,) of each unknown's stated Gaussian prior; infinite for unknowns without one.
@@ -85,10 +85,10 @@ def stated_prior_std(
     for name in unknowns.unknown_names:
         base = name.split("[")[0]
         if base.startswith(f"{INITIAL_STATE_PREFIX}q."):
-            stds.append(options.start_configuration_std)
+            stds.append(options.initial_configuration_std)
         elif base.startswith(f"{INITIAL_STATE_PREFIX}p."):
             mass = float(inertia((base.removeprefix(f"{INITIAL_STATE_PREFIX}p."),))[0])
-            stds.append(options.start_velocity_std * max(mass, 1e-9))
+            stds.append(options.initial_velocity_std * max(mass, 1e-9))
         elif base.startswith(f"{INITIAL_STATE_PREFIX}z."):
             stds.append(limits[base.removeprefix(f"{INITIAL_STATE_PREFIX}z.")] / math.sqrt(3))
         else:
@@ -138,7 +138,7 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
     return {name: size for effect in effects for name, size in effect.max_abs_unknown_initial_states.items()}
 
 
-def initial_state_offset_limits(system: System, names: Sequence[str]) -> Array:
+def max_initial_state_offsets(system: System, names: Sequence[str]) -> Array:
     """Largest absolute offset of each estimated initial state component; infinite for coordinates and momenta."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])

@@ -13,7 +13,7 @@ from typing import Any
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
-    SummaryBlocksAndTexts,
+    SummaryBlockOrTextIterator,
     SummaryStatement,
     SummaryTable,
     TableRows,
@@ -32,7 +32,7 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 
 
 @register_summary("yid-diagnosis/2")
-def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a diagnosis."""
     yield from issue_summary_blocks(result)
     yield SummaryStatement(result["summary"], "verdict")
@@ -106,7 +106,7 @@ def _planning_command(section: Mapping[str, Any]) -> str:
 
 
 @register_summary("yid-blind/1")
-def _blind_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a blind validation."""
     score, *others, cases = _blind_tables(result)
     yield replace(score, is_key_table=True)
@@ -199,7 +199,7 @@ def _rate(own: Mapping[str, Any]) -> str:
 
 
 @register_summary("yid-batch/1")
-def _batch_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of the runs of a batch side by side: estimates, drift and outlying runs."""
     runs = result["runs"]
     found: dict[str, list[Mapping[str, Any]]] = {}
@@ -252,7 +252,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> 
 
 
 @register_summary("yid-history/1")
-def _history_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of how estimates drifted over runs of one model, and which runs disagree with the others."""
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]

@@ -351,7 +351,7 @@ def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts:
     return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
 
 
-def explained_fraction_matrix_figure(names: Sequence[str], values: Array) -> Figure:
+def confusability_matrix_figure(names: Sequence[str], values: Array) -> Figure:
     """Heat-map figure of explained fractions `values` (n, n), row explained by column, shown in per cent."""
     figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
     text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]

@@ -10,13 +10,13 @@ from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
     interval_text,
-    percent_text,
+    percent_number_text,
     value_and_uncertainty_text,
 )
 from yid_ocp.report.terminal import (
     MAX_CHANNELS_SHOWN_SINGLY,
     CodeBlock,
-    SummaryBlocksAndTexts,
+    SummaryBlockOrTextIterator,
     SummaryStatement,
     SummaryTable,
     TableRows,
@@ -42,7 +42,7 @@ _MAX_INSPECTED_PARAMETERS = 12  # free parameters of which `inspect` speaks; res
 
 
 @register_summary("yid-solve/1")
-def _solve_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a fit."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
@@ -76,7 +76,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
 
 
-def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Errors of each shown channel, in each recording and over three or more, with those of guesses without a model."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     found: dict[str, list[tuple[str, str, float, dict[str, float]]]] = {}
@@ -134,7 +134,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 
 @register_summary("yid-compare/1")
-def _compare_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of several methods on one problem."""
     methods: dict[str, Any] = result["methods"]
     judged, disturbed = result["judged"], result["disturbed"]
@@ -210,7 +210,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 
 
 @register_summary("yid-identifiability/1")
-def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of what recordings tell of each parameter."""
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
@@ -253,11 +253,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts
 
 
 def _relative(value: float | None) -> str:
-    return "unknown" if value is None else f"{percent_text(value)} %" if value < 10 else f"{value:.2g} times"
+    return "unknown" if value is None else f"{percent_number_text(value)} %" if value < 10 else f"{value:.2g} times"
 
 
 @register_summary("yid-friction/1")
-def _friction_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of which friction law the recordings warrant."""
     unit, best = result["unit"], result["warranted"]
     rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
@@ -277,7 +277,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
 
 
 @register_summary("yid-plan/1")
-def _plan_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a planned motion."""
     rows: TableRows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
     for name, own in result["joints"].items():
@@ -311,7 +311,7 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield "the parameters are those of the configuration, so nothing is said of how uncertain that is"
 
 
-def _information_parts(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("parameter", "from the recordings", "from this motion", "from both", "verdict of this motion")]
     for name, own in result["parameters"].items():
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
@@ -341,7 +341,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
 
 
 @register_summary("yid-check/1")
-def _check_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a model and its recordings before a run."""
     model = result["model"]
     yield (
@@ -395,7 +395,7 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
 
 
 @register_summary("yid-inspect/1")
-def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a model's equations and linearised step."""
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
@@ -435,7 +435,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     yield f"exported: {', '.join(result['exported'])}" if result["exported"] else ""
 
 
-def _patterns(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("matrix (sparsity.png)", "size", "can differ from zero", "do at this point")]
     for name, entry in result["patterns"].items():
         height, width = entry["shape"]
@@ -453,7 +453,7 @@ def _patterns(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
 
 
 @register_summary("yid-simulate/1")
-def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a simulation."""
     if result["status"] == "failed":
         yield SummaryStatement(f"failed: {result['message']}", "verdict")
@@ -464,7 +464,7 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
 
 
 @register_summary("yid-track/1")
-def _track_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of points tracked in the frames of a depth camera."""
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
@@ -485,7 +485,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
 
 
 @register_summary("yid-export/1")
-def export_summary(manifest: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of an export: what of the model the format cannot express, and errors of the replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     changed = {

@@ -53,29 +53,31 @@ class CodeBlock:
     text: str
 
 
-SummaryBlock = SummaryStatement | SummaryTable | CodeBlock
+StatementTableOrCode = SummaryStatement | SummaryTable | CodeBlock
 
 
-SummaryBlocksAndTexts = Iterator[SummaryBlock | str]
+SummaryBlockOrTextIterator = Iterator[StatementTableOrCode | str]
 """Blocks of a summary as they are made: a string is a note, and some may be empty."""
-_Summary = Callable[[Mapping[str, Any]], list[SummaryBlock]]
-SUMMARY_BY_FORMAT: dict[str, _Summary] = {}
+_Summary = Callable[[Mapping[str, Any]], list[StatementTableOrCode]]
+SUMMARY_BY_RESULT_FORMAT: dict[str, _Summary] = {}
 """The summary of every result, by its format."""
 
 
-def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlocksAndTexts]], _Summary]:
+def register_summary(
+    result_format: str,
+) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]], _Summary]:
     """Decorator that registers a function as summary of a result format and makes its output a list of blocks.
 
     Texts without a word and tables without a row below the header are left out.
     """
 
-    def enter(make: Callable[[Mapping[str, Any]], SummaryBlocksAndTexts]) -> _Summary:
+    def enter(make: Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]) -> _Summary:
         @functools.wraps(make)
-        def summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+        def summary(result: Mapping[str, Any]) -> list[StatementTableOrCode]:
             blocks = (SummaryStatement(part) if isinstance(part, str) else part for part in make(result))
             return [own for own in blocks if (len(own.rows) > 1 if isinstance(own, SummaryTable) else own.text)]
 
-        SUMMARY_BY_FORMAT[result_format] = summary
+        SUMMARY_BY_RESULT_FORMAT[result_format] = summary
         return summary
 
     return enter
@@ -102,11 +104,11 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
-def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary blocks on issues of the recordings: a table and advice."""
     doubts = result.get("doubts", ())
     rows: TableRows = [("in doubt", "where", "how sure", "times its limit")]
-    advice: list[SummaryBlock | str] = []
+    advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in doubts):
         alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
         for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE], start=1):
@@ -121,7 +123,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
         yield SummaryStatement(text, "verdict")
 
 
-def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryBlocksAndTexts:
+def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Conclusions on a poor fit: a model-free guess predicts better, or the model does not explain the recordings."""
     worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
@@ -169,7 +171,7 @@ def parameter_bounds_text(entry: Mapping[str, Any], digits: int) -> str:
     return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
 
 
-def summary_terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:
+def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
     """Text lines of summary blocks: aligned tables, wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:

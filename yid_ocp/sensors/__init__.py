@@ -5,12 +5,12 @@ from pkgutil import iter_modules
 
 from yid_ocp.sensors.base import CHANNEL_KINDS as CHANNEL_KINDS
 from yid_ocp.sensors.base import SENSOR_READERS as SENSOR_READERS
-from yid_ocp.sensors.base import ChannelKind as ChannelKind
+from yid_ocp.sensors.base import ChannelSpecification as ChannelSpecification
 from yid_ocp.sensors.base import Sensor as Sensor
 from yid_ocp.sensors.base import SensorData as SensorData
 from yid_ocp.sensors.base import SensorDataInputs as SensorDataInputs
 from yid_ocp.sensors.base import SensorOptions as SensorOptions
-from yid_ocp.sensors.base import recorded_joint_columns as recorded_joint_columns
+from yid_ocp.sensors.base import recorded_joint_column_indices as recorded_joint_column_indices
 from yid_ocp.sensors.base import sensor_reading_function as sensor_reading_function
 from yid_ocp.sensors.joints import EffortSensor as EffortSensor
 from yid_ocp.sensors.joints import PositionSensor as PositionSensor

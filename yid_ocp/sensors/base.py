@@ -79,7 +79,7 @@ class SensorOptions:
 
 
 @dataclass(frozen=True)
-class ChannelKind:
+class ChannelSpecification:
     """Kind of recorded quantity: its group and dataset in a recording, unit, components and sensor constants.
 
     The noise stands in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`, of points in the dataset `std`.
@@ -102,11 +102,11 @@ class ChannelKind:
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
-CHANNEL_KINDS: Registry[ChannelKind] = Registry("recorded channel")
+CHANNEL_KINDS: Registry[ChannelSpecification] = Registry("recorded channel")
 """Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def channel_kinds_for_group_name(group: str) -> tuple[ChannelKind, ...]:
+def channel_kinds_for_group_name(group: str) -> tuple[ChannelSpecification, ...]:
     """Channel kinds registered for a recording's group of this name; an empty tuple for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
@@ -134,7 +134,7 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
     def pose(self) -> Array | None: ...
 
 
-class RecordedJoints(Protocol):
+class RecordedJointGroup(Protocol):
     """Interface of recorded joints (names, times, channels), as implemented by `data.recording.JointGroup`."""
 
     @property
@@ -172,14 +172,14 @@ class _RecordingData(Protocol):
     @property
     def name(self) -> str: ...
     @property
-    def joints(self) -> RecordedJoints | None: ...
+    def joints(self) -> RecordedJointGroup | None: ...
     @property
     def points(self) -> Sequence[RecordedPointGroup]: ...
     @property
     def channel_groups(self) -> Sequence[RecordedChannelGroup]: ...
 
 
-def recorded_joint_columns(joints: RecordedJoints, names: tuple[str, ...], where: str) -> list[int]:
+def recorded_joint_column_indices(joints: RecordedJointGroup, names: tuple[str, ...], where: str) -> list[int]:
     """Column indices of the named joints in the recorded arrays; `DataError` for a joint that is not recorded."""
     for name in names:
         if name not in joints.names:
@@ -210,7 +210,7 @@ class Sensor(ABC):
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
     """
 
-    channel: ClassVar[ChannelKind]  # kind of its recorded channels
+    channel: ClassVar[ChannelSpecification]  # kind of its recorded channels
     group_name: str  # key of its settings: a group of points, such as `points_camera`, or `joints.effort`
     # what a trivial prediction without a model is: zero, or the first measured value
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
@@ -240,7 +240,7 @@ class Sensor(ABC):
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
-    def output_frames(self) -> tuple[str, ...]:
+    def output_frame_names(self) -> tuple[str, ...]:
         """Name of the mechanism's frame at which each output is measured; an empty string for joints."""
         frames = self.frame_names or ("",) * len(self.channel_names)
         return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))
@@ -272,7 +272,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     `NodeState`, the last one by the parameters `names`; v, a and lam by the recorded clock. Slopes by these have no
     columns where nothing reads them.
     """
-    rows = {name: i for i, name in enumerate(system.internal_coordinate_symbols)}
+    rows = {name: i for i, name in enumerate(system.effect_internal_coordinate_symbols)}
     n = system.n_coordinates
     sizes = {"q": n, "v": n, "a": n, "z": len(rows), "load": n, "lam": system.n_constraints}
     at = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
@@ -287,7 +287,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
             part = effect.distorted_reading(channel, part, replace(state, marked_frame=frame))
         read.append(part)
     output = ca.vertcat(*read)
-    symbols = ca.vertcat(*system.internal_coordinate_symbols.values()) if rows else ca.SX(0, 1)
+    symbols = ca.vertcat(*system.effect_internal_coordinate_symbols.values()) if rows else ca.SX(0, 1)
     output = ca.densify(ca.substitute(output, symbols, at["z"]))
     chosen = ca.vertcat(*(system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     slopes = {name: ca.jacobian(output, symbol) for name, symbol in at.items()}

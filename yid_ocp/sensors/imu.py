@@ -5,14 +5,16 @@ from __future__ import annotations
 import casadi as ca
 
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import CHANNEL_KINDS, ChannelKind
+from yid_ocp.sensors.base import CHANNEL_KINDS, ChannelSpecification
 from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
 _XYZ = ("x", "y", "z")
 _ANGULAR_VELOCITY = CHANNEL_KINDS.register("imu.angular_velocity")(
-    ChannelKind("imu", "angular_velocity", "rad/s", _XYZ)
+    ChannelSpecification("imu", "angular_velocity", "rad/s", _XYZ)
 )
-_SPECIFIC_FORCE = CHANNEL_KINDS.register("imu.specific_force")(ChannelKind("imu", "specific_force", "m/s^2", _XYZ))
+_SPECIFIC_FORCE = CHANNEL_KINDS.register("imu.specific_force")(
+    ChannelSpecification("imu", "specific_force", "m/s^2", _XYZ)
+)
 
 
 @register_mounted_sensor

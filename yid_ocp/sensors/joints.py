@@ -17,21 +17,21 @@ from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    ChannelKind,
-    RecordedJoints,
+    ChannelSpecification,
+    RecordedJointGroup,
     RecordedPointGroup,
     Sensor,
     SensorData,
     SensorDataInputs,
     SensorOptions,
     expand_to_joint_values,
-    recorded_joint_columns,
+    recorded_joint_column_indices,
 )
 
 JOINT_EFFORT_GROUP_NAME = "joints.effort"
 JOINT_POSITION_GROUP_NAME = "joints.position"
-_EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelKind("joints", "effort", "N m"))
-_POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelKind("joints", "position", "rad"))
+_EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelSpecification("joints", "effort", "N m"))
+_POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelSpecification("joints", "position", "rad"))
 _MAX_STEPS_PER_GAP = 0.1  # median gap between a quantized channel's values, in smallest gaps and per value
 NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: they remove motion slow against sampling
 
@@ -103,7 +103,7 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
     where = around.recording.name
     later = joints.t > around.node_times[0] + 1e-9
     later &= joints.t <= around.node_times[-1] + 1e-9
-    value = joints.position[later][:, recorded_joint_columns(joints, names, where)]
+    value = joints.position[later][:, recorded_joint_column_indices(joints, names, where)]
     std = np.broadcast_to(joint_angle_noise_std(joints, names, choice, where), value.shape)
     return [SensorData(PositionSensor(names), joints.t[later], value, std)]
 
@@ -117,7 +117,7 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     names = tuple(name for name in around.system.prescribed if name in joints.names)
     if not names:
         return []
-    effort = joints.effort[:, recorded_joint_columns(joints, names, around.recording.name)]
+    effort = joints.effort[:, recorded_joint_column_indices(joints, names, around.recording.name)]
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
         what = "the noise level of the joint efforts is neither recorded nor given"
@@ -148,7 +148,7 @@ def smoothed_effort_data(
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
     # what stands for an interval belongs to its middle
     late = 0.0 if is_sample else 0.5 * period
-    kept, measured = smoothed_node_values(around, t, values, "efforts", late)
+    kept, measured = nodes_and_decorrelated_values(around, t, values, "efforts", late)
     times = around.node_times[kept]
     unit = sensor.effort_per_unit_reading
     total, correlation = _smoothed_effort_noise(around, sensor.joint_names, std * np.abs(unit), period, times)
@@ -157,7 +157,7 @@ def smoothed_effort_data(
     return SensorData(sensor, times, measured, total / np.abs(unit), (1, last - 1), bias, correlation)
 
 
-def smoothed_node_values(
+def nodes_and_decorrelated_values(
     around: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Return nodes (K,) and low-pass filtered values (K, k) there, so far apart that noise is nearly independent.
@@ -187,7 +187,7 @@ def smoothed_node_values(
 # -- noise levels -----------------------------------------------------------------------------------------------------
 
 
-def is_noise_std_stated(joints: RecordedJoints, group: str, choice: SensorOptions) -> bool:
+def is_noise_std_stated(joints: RecordedJointGroup, group: str, choice: SensorOptions) -> bool:
     """Whether the recording or the settings specify the noise of `group`, `joints.effort` or `joints.position`.
 
     The step of the encoders, where the recording states it, is a statement of their noise.
@@ -212,9 +212,9 @@ def quantization_step(values: Array) -> float:
 
 
 def _joint_noise_std(
-    joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str, *, group: str
+    joints: RecordedJointGroup, names: Sequence[str], choice: SensorOptions, where: str, *, group: str
 ) -> Array:
-    channel, columns = CHANNEL_KINDS[group], recorded_joint_columns(joints, tuple(names), where)
+    channel, columns = CHANNEL_KINDS[group], recorded_joint_column_indices(joints, tuple(names), where)
     values, given, step = getattr(joints, channel.quantity)[:, columns], choice.std, np.zeros(len(names))
     if given is None and group == JOINT_POSITION_GROUP_NAME:
         found = joints.position_resolution
@@ -243,7 +243,7 @@ joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME
 """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
 
 
-def joint_torque_bias_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions) -> Array:
+def joint_torque_bias_std(joints: RecordedJointGroup, names: Sequence[str], choice: SensorOptions) -> Array:
     """Standard deviation of the recorded torques' constant errors, (len(names),) [N m]; zero if unknown."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
     key = f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"
@@ -280,7 +280,7 @@ def _smoothed_effort_noise(
     own = (std * value_gain) ** 2
     if not np.any(angle > 0):
         return np.broadcast_to(np.sqrt(own), (len(times), len(names))), None
-    measured = joints.position[:, recorded_joint_columns(joints, names, around.recording.name)]
+    measured = joints.position[:, recorded_joint_column_indices(joints, names, around.recording.name)]
     angles = np.stack([np.interp(times, joints.t, column) for column in measured.T], axis=1)
     by_acceleration = around.joint_mass_matrices(names, angles) * (angle * second_gain)
     covariance = by_acceleration @ by_acceleration.transpose(0, 2, 1) + np.diag(own)

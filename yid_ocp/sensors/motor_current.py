@@ -13,7 +13,7 @@ from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    ChannelKind,
+    ChannelSpecification,
     RecordedChannelGroup,
     SensorData,
     SensorDataInputs,
@@ -23,7 +23,7 @@ from yid_ocp.sensors.joints import JointSensor, smoothed_effort_data
 
 _TORQUE_CONSTANT = "torque_constant"
 _CURRENT = CHANNEL_KINDS.register("motors.current")(
-    ChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
+    ChannelSpecification("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
 )
 
 

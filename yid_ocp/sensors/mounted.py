@@ -21,7 +21,7 @@ from yid_ocp.sensors.base import (
     expand_to_joint_values,
     sensor_reading_function,
 )
-from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, smoothed_node_values
+from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, nodes_and_decorrelated_values
 
 _Kind = TypeVar("_Kind", bound="MountedSensor")
 
@@ -104,7 +104,7 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
         return SensorData(sensor, group.t[kept], values[kept], own, inner, by_output[1])
     low_pass = around.path_filter
     period = float(np.median(np.diff(group.t)))
-    nodes, measured = smoothed_node_values(around, group.t, values, key, like_path=True)
+    nodes, measured = nodes_and_decorrelated_values(around, group.t, values, key, like_path=True)
     times = around.node_times[nodes]
     own = by_output[0] * low_pass.noise_gains_of_value_and_rates(period)[0]
     total, correlation = _with_encoder_noise(around, sensor, own, times)

@@ -14,7 +14,7 @@ from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    ChannelKind,
+    ChannelSpecification,
     RecordedPointGroup,
     Sensor,
     SensorData,
@@ -22,7 +22,7 @@ from yid_ocp.sensors.base import (
     SensorOptions,
 )
 
-_POINTS = CHANNEL_KINDS.register("points")(ChannelKind("points", "position", "m", ("x", "y", "z")))
+_POINTS = CHANNEL_KINDS.register("points")(ChannelSpecification("points", "position", "m", ("x", "y", "z")))
 
 
 @dataclass(frozen=True)

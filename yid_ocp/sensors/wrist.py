@@ -16,13 +16,13 @@ import casadi as ca
 
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Inertia, Placement
-from yid_ocp.model.system import MidpointState, NodeState, System, floating_clamp
-from yid_ocp.sensors.base import CHANNEL_KINDS, ChannelKind
+from yid_ocp.model.system import MidpointState, NodeState, System, floating_joint_mechanism
+from yid_ocp.sensors.base import CHANNEL_KINDS, ChannelSpecification
 from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
 _XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
-_FORCE = CHANNEL_KINDS.register("wrist.force")(ChannelKind("wrist", "force", "N", _XYZ, _SIGN))
-_TORQUE = CHANNEL_KINDS.register("wrist.torque")(ChannelKind("wrist", "torque", "N m", _XYZ, _SIGN))
+_FORCE = CHANNEL_KINDS.register("wrist.force")(ChannelSpecification("wrist", "force", "N", _XYZ, _SIGN))
+_TORQUE = CHANNEL_KINDS.register("wrist.torque")(ChannelSpecification("wrist", "torque", "N m", _XYZ, _SIGN))
 _N_LOCKED_JOINTS = 6
 
 
@@ -80,7 +80,7 @@ def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
     before, first = frame.joint_index, frame.joint_index + 1
     last, turn = before + _N_LOCKED_JOINTS, frame.placement.rotation.T
     back = Placement(turn, -turn @ frame.placement.translation)
-    chain = list(floating_clamp(f"{name} cut").joints)
+    chain = list(floating_joint_mechanism(f"{name} cut").joints)
     chain[0] = replace(chain[0], parent_index=before, placement=frame.placement)
     near = (body.scaled_by(ca.SX(-1)) for body in frame.proximal_bodies)
     bodies = tuple(body.transformed_by(back) for body in (*tree.joints[before].bodies, *near))

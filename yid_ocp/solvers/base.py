@@ -16,7 +16,7 @@ import numpy as np
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.inference.linearized_residual import is_stationary_point
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
@@ -38,7 +38,7 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.predictions import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
-from yid_ocp.solvers.initial_guess import unknowns_with_active_effects
+from yid_ocp.solvers.initial_guess import unknowns_with_neutral_effects_activated
 
 if TYPE_CHECKING:
     import pandas
@@ -106,7 +106,7 @@ class Solution(ReprMixin):
     solver_name: str
     problem: EstimationProblem | None = None
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
         words, rows = {}, [("parameter", "value", "unit", "")]
         for name, e in free.items():
@@ -116,7 +116,7 @@ class Solution(ReprMixin):
         more = f"and {count_with_noun(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
         fit = f"chi2 per degree of freedom {self.goodness_of_fit.chi2_per_dof:.3g}"
         how = f"{self.status.value.replace('_', ' ')} by {self.solver_name}"
-        return ReprSummary(", ".join(filter(None, (how, *told, more, fit))), rows)
+        return ReprTexts(", ".join(filter(None, (how, *told, more, fit))), rows)
 
     @property
     def n_iterations(self) -> int:
@@ -138,7 +138,7 @@ class Solution(ReprMixin):
         if found.ok:
             return found.episode_predictions
         predict, pairs = problem.predictor.predict_episode, enumerate(problem.episodes)
-        parts = problem.theta_and_initial_state_offset
+        parts = problem.theta_and_initial_state_deviation
         return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
@@ -229,7 +229,7 @@ class AcceptedIterateRecorder:
         if self.callback is not None:
             self.callback(self.history[-1])
 
-    def result(
+    def solver_result_at(
         self, status: Status, message: str, x: Array, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> SolverResult:
         """Solver result of a search that ended at the unknown vector `x`, with the iterates recorded so far."""
@@ -271,7 +271,7 @@ def solve(
 ) -> Solution:
     """Solve an estimation problem and return estimates with uncertainty and verdicts.
 
-    Free effects begin off their neutral value (`unknowns_with_active_effects`) unless a start is given. Where the
+    Free effects begin off their neutral value (`unknowns_with_neutral_effects_activated`) without a start. Where the
     rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first seconds
     only, and then over longer and longer horizons. A poor fit is started again from other initial values. Where noise
     drives the motion, methods that can weigh residuals by it do so in several passes, its covariance frozen in each
@@ -296,7 +296,7 @@ def solve(
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
         if initial_unknowns is None:
-            start = unknowns_with_active_effects(problem, problem.initial_unknowns)
+            start = unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns)
         else:
             start = np.clip(np.asarray(initial_unknowns, float), *problem.bounds)
         search = _MultiStartSearch(problem, solver or SOLVERS[_DEFAULT_SOLVER](), callback, start)

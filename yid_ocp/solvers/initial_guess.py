@@ -12,9 +12,9 @@ import numpy as np
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
-from yid_ocp.integrator.step import generalized_momentum, simulate
-from yid_ocp.integrator.tracking_feedback import lqr_feedback
-from yid_ocp.problem.episodes import Episode, InitialState
+from yid_ocp.integrator.step import generalized_momentum_from_velocity, simulate
+from yid_ocp.integrator.tracking_feedback import lqr_tracking_feedback
+from yid_ocp.problem.episodes import Episode, InitialStateWithSensitivity
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.signal_filters import LowPassFilter
@@ -42,7 +42,7 @@ class UnknownsAndNodeStateGuess:
     """Guess of the unknown vector, and of each recording's initial state, node states and constraint multipliers."""
 
     x: Array
-    initial_states: tuple[InitialState, ...]
+    initial_states: tuple[InitialStateWithSensitivity, ...]
     node_states: tuple[Array, ...]  # shape (K + 1, nx) each
     multipliers: tuple[Array, ...]  # shape (K, m) or (N, m) each
 
@@ -62,9 +62,9 @@ def guess_unknowns_and_node_states(
         moved = np.where(problem.positive_unknowns_mask, np.clip(factor * x, lower, upper), x)
         begins, states, multipliers, total = [], [], [], 0.0
         for i, episode in enumerate(problem.episodes):
-            shared, _ = problem.theta_and_initial_state_offset(moved, i)
+            shared, _ = problem.theta_and_initial_state_deviation(moved, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
-            begins.append(problem.initial_state(episode, theta))
+            begins.append(problem.initial_state_of_episode(episode, theta))
             found: list[tuple[Array, Array]] = []
             if not begins[-1].failure_message:
                 found += _tracked(problem, episode, nodes[i], theta, begins[-1].state)
@@ -86,7 +86,7 @@ def guess_unknowns_and_node_states(
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
     """Mean square whitened residual of a trajectory (N + 1, nx) of recording `i`, without effort channels."""
-    shared, _ = problem.theta_and_initial_state_offset(x, i)
+    shared, _ = problem.theta_and_initial_state_deviation(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
     parts = [np.zeros(1)]
@@ -105,7 +105,7 @@ def _tracked(
     if feedback is None and problem.system.driven and not problem.system.servos:
         smooth = LowPassFilter(problem.options.path_cutoff)(episode.grid.node_times, episode.measured_driven_angles)
         arms = problem.model_functions.arms_only_integrator_step
-        feedback = lqr_feedback(problem.step, smooth, episode.torque, theta, arms=arms)
+        feedback = lqr_tracking_feedback(problem.step, smooth, episode.torque, theta, arms=arms)
     inputs = episode.grid.steps, episode.torque, episode.prescribed_path, feedback
     rollout = simulate(problem.step, theta, start, *inputs)
     return [(rollout.state[nodes], rollout.multipliers)] if rollout.status.is_converged else []
@@ -139,11 +139,11 @@ def _resting(
     driven = list(problem.system.driven_coordinate_indices)
     state[:, driven] = episode.measured_driven_angles[nodes]
     velocity = np.gradient(state[:, :n], times, axis=0)
-    state[:, n : 2 * n] += generalized_momentum(step, state[:, :n], velocity, theta)
+    state[:, n : 2 * n] += generalized_momentum_from_velocity(step, state[:, :n], velocity, theta)
     return state, pull[:-1] * h
 
 
-def unknowns_with_active_effects(problem: EstimationProblem, x: Array) -> Array:
+def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array) -> Array:
     """Initial unknown vector (nx,) at which every free effect is slightly active.
 
     At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the

@@ -17,7 +17,7 @@ from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_st
 from yid_ocp.integrator.step import simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo
-from yid_ocp.problem.episodes import InitialState
+from yid_ocp.problem.episodes import InitialStateWithSensitivity
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.solvers.base import (
     SOLVERS,
@@ -95,7 +95,7 @@ class MultipleShooting(SolverWithCheckedSettings):
         HessianKind, OptionInfo("of the Lagrangian in IPOPT; exact adds the curvature of equations and sensors")
     ] = "gauss_newton"
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
-    tolerance: Annotated[float, Gt(0), OptionInfo("IPOPT's tol")] = 1e-6
+    ipopt_tolerance: Annotated[float, Gt(0), OptionInfo("IPOPT's tol")] = 1e-6
     step_tolerance: Annotated[
         float, Gt(0), OptionInfo("condensing: converged when no unknown moves by more than this fraction of its size")
     ] = 1e-5
@@ -142,7 +142,7 @@ class MultipleShooting(SolverWithCheckedSettings):
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
             message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
-            return recorder.result(Status.FAILED, message + "gauss_newton", start)
+            return recorder.solver_result_at(Status.FAILED, message + "gauss_newton", start)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
         watch = _Watch(problem, program, functions, ridge, recorder)
         solver = program.make_solver(
@@ -160,7 +160,7 @@ class MultipleShooting(SolverWithCheckedSettings):
 
     def _solver_options(self, cost_factor: float) -> dict[str, Any]:
         """Options of CasADi's IPOPT interface."""
-        told = {"max_iter": self.max_iterations, "tol": self.tolerance, "mu_init": self.mu_init}
+        told = {"max_iter": self.max_iterations, "tol": self.ipopt_tolerance, "mu_init": self.mu_init}
         acceptable = {"tol": 1e-3, "iter": 4, "constr_viol_tol": 1e-6, "obj_change_tol": 1e-5}
         ipopt = {
             **{"obj_scaling_factor": cost_factor, "nlp_scaling_method": "none", "print_level": 0, "sb": "yes"},
@@ -190,7 +190,7 @@ class MultipleShooting(SolverWithCheckedSettings):
         x, nodes = intervals.initial_guess(start)
 
         def ended(status: Status, message: str) -> SolverResult:
-            return recorder.result(status, message, x, intervals.equilibrium_guesses)
+            return recorder.solver_result_at(status, message, x, intervals.equilibrium_guesses)
 
         recorder.n_evaluations += 1
         now = intervals.linearize(x, nodes)
@@ -360,8 +360,8 @@ class _ShootingIntervals:
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are looked for near those of the problem's start, whatever the point
         x = problem.initial_unknowns
-        thetas = (problem.theta_and_initial_state_offset(x, i)[0] for i in range(len(problem.episodes)))
-        starts = map(problem.initial_state, problem.episodes, thetas)
+        thetas = (problem.theta_and_initial_state_deviation(x, i)[0] for i in range(len(problem.episodes)))
+        starts = map(problem.initial_state_of_episode, problem.episodes, thetas)
         found = [None if start.failure_message else start.equilibrium for start in starts]
         n = problem.step.sizes["n"]
         self.equilibrium_guesses = tuple(None if rest is None else rest.state[:n] for rest in found)
@@ -376,7 +376,7 @@ class _ShootingIntervals:
         return x, list(found.node_states)
 
     def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        shared, _ = self.problem.theta_and_initial_state_offset(x, i)
+        shared, _ = self.problem.theta_and_initial_state_deviation(x, i)
         theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], shared)
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
@@ -384,7 +384,7 @@ class _ShootingIntervals:
 
     def moved(self, nodes: list[Array], now: _Linearization, step: Array, factor: float) -> list[Array]:
         """Node states after a part of a step of the unknowns that also closes as large a part of the defects."""
-        columns = map(self.problem.unknowns.unknown_indices_of_recording, range(len(nodes)))
+        columns = map(self.problem.unknowns.unknown_indices_affecting_recording, range(len(nodes)))
         parts = zip(nodes, now.node_slopes, columns, strict=True)
         return [state + factor * (by_x @ step[own] + by_defect) for state, (by_x, by_defect), own in parts]
 
@@ -393,9 +393,9 @@ class _ShootingIntervals:
         problem = self.problem
         cost, defect, residuals, jacobians, changes, slopes = 0.0, 0.0, [], [], [], []
         for i, episode in enumerate(problem.episodes):
-            theta, offset = problem.theta_and_initial_state_offset(x, i)
+            theta, offset = problem.theta_and_initial_state_deviation(x, i)
             theta = problem.predictor.theta_with_episode_values(episode, theta)
-            start = problem.initial_state(episode, theta, offset, self.equilibrium_guesses[i])
+            start = problem.initial_state_of_episode(episode, theta, offset, self.equilibrium_guesses[i])
             condensed = start.failure_message or self._condensed(i, theta, start, nodes[i])
             if isinstance(condensed, str):
                 return condensed
@@ -416,7 +416,7 @@ class _ShootingIntervals:
         return _Linearization(cost + 0.5 * float(prior @ prior), defect, residual, jacobian, change, tuple(slopes))
 
     def _condensed(
-        self, i: int, theta: Array, start: InitialState, nodes: Array
+        self, i: int, theta: Array, start: InitialStateWithSensitivity, nodes: Array
     ) -> tuple[Array, Array, Array, Array, float] | str:
         """Trajectory (N + 1, nx), its and the nodes' derivatives by unknowns and closing of defects; largest defect."""
         wanted, by_start = self.problem.unknowns.free_parameters, start.state_sensitivity

@@ -19,16 +19,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import SolverError, nearest_name_hint
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.solvers.program_terms import (
     GaussNewtonHessianRidge,
-    ProgramTerm,
+    MappedFunctionTerm,
     ResidualTerm,
     ThreadSafeCachedProperty,
-    sparse_matrix_from_entries,
     sparse_matrix_summing_duplicates,
+    sparse_mx_from_entries,
 )
 
 HessianKind = Literal["gauss_newton", "exact"]
@@ -113,7 +113,7 @@ class NonlinearProgram(ReprMixin):
 
     variables: Mapping[str, _VectorBlock]  # what the column `w` of unknowns is made of
     parameters: Mapping[str, _VectorBlock]  # what the column `p` of parameters is made of
-    constraint_terms: tuple[ProgramTerm, ...]  # equalities, one below the other in `g`
+    constraint_terms: tuple[MappedFunctionTerm, ...]  # equalities, one below the other in `g`
     residual_terms: tuple[ResidualTerm, ...]  # their losses make the objective
     lower: Array  # of `w`, shape (nw,), as `upper` and the guess
     upper: Array
@@ -124,12 +124,12 @@ class NonlinearProgram(ReprMixin):
     p: ca.MX
     user_terms: tuple[_UserTerms, ...] = ()
 
-    def _summary(self) -> ReprSummary:
+    def _summary(self) -> ReprTexts:
         rows = [("block", "entries"), *((name, str(block.index.size)) for name, block in self.variables.items())]
         equalities = count_with_noun(sum(term.n_values for term in self.constraint_terms), "equation")
-        return ReprSummary(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
+        return ReprTexts(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
-    def block_layout(self, name: str) -> _VectorBlock:
+    def named_block(self, name: str) -> _VectorBlock:
         """Indices, row names and unit of a named block; with one recording, `[NAME]` may be left out.
 
         Raises `SolverError` where there is none, or more than one.
@@ -145,7 +145,7 @@ class NonlinearProgram(ReprMixin):
 
     def __getitem__(self, name: str) -> ca.MX:
         """Block of variables or parameters as an MX matrix of its shape."""
-        block = self.block_layout(name)
+        block = self.named_block(name)
         vector = self.w if any(block is own for own in self.variables.values()) else self.p
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 
@@ -221,7 +221,7 @@ class NonlinearProgram(ReprMixin):
             columns.append(column)
             at += term.n_values
         where = np.concatenate(rows), np.concatenate(columns)
-        placed = sparse_matrix_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
+        placed = sparse_mx_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
         return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
 
     @ThreadSafeCachedProperty
@@ -282,7 +282,7 @@ class NonlinearProgram(ReprMixin):
             total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
         return total
 
-    def _curvature(self, term: ProgramTerm, weight: ca.MX) -> ca.MX | int:
+    def _curvature(self, term: MappedFunctionTerm, weight: ca.MX) -> ca.MX | int:
         """Hessian of weight . values of a term."""
         curved = term.weighted_hessian_triplets(self.w, self.p, weight)
         return 0 if curved is None else sparse_matrix_summing_duplicates(*curved, self.w.numel())

@@ -75,7 +75,7 @@ class LocalVariableFunction:
 
 
 @dataclass(frozen=True)
-class ProgramTerm:
+class MappedFunctionTerm:
     """Function of a few unknowns that a nonlinear program evaluates at K places, for example at every time step."""
 
     name: str
@@ -126,7 +126,7 @@ class ProgramTerm:
 class ResidualTerm:
     """Residual term of a program's objective: r = weight (combination values - target)."""
 
-    term: ProgramTerm
+    term: MappedFunctionTerm
     combination: ca.DM | None = None  # shape (nr, ny K); None takes the values as they are
     weight_indices: IntArray | None = None  # among the parameters, shape (nr,); None for weights of one
     target_indices: IntArray | None = None  # among the parameters, shape (nr,); None for targets of zero
@@ -160,7 +160,7 @@ class ResidualTerm:
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Jacobian (nr, nw) of the residuals r with respect to the program's unknowns w, sparse."""
         entries, shape = self.term.jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
-        placed = sparse_matrix_from_entries(entries, *self.term.jacobian_nonzero_indices(), shape)
+        placed = sparse_mx_from_entries(entries, *self.term.jacobian_nonzero_indices(), shape)
         matrix = self.residual_jacobian_by_term_values(p)
         return placed if matrix is None else ca.mtimes(matrix, placed)
 
@@ -207,7 +207,7 @@ def _nonzero_values(matrix: ca.MX) -> ca.MX:
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
 
 
-def sparse_matrix_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
+def sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
     """Assemble a sparse matrix from entries at distinct positions."""
     order = np.lexsort((row, column))
     start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])

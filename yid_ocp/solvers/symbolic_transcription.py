@@ -27,11 +27,11 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.discrete import NlpStepConstraints, nlp_step_constraints
-from yid_ocp.integrator.statics import driven_joint_holding_stiffness
+from yid_ocp.integrator.statics import measured_angle_holding_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.unknown_vector import SOFT_LOGARITHM_MIN_RATIO
 from yid_ocp.sensors import Sensor, sensor_reading_function
 from yid_ocp.solvers.initial_guess import (
@@ -40,7 +40,12 @@ from yid_ocp.solvers.initial_guess import (
     mean_square_residual_without_efforts,
 )
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram, ProgramVectorLayout
-from yid_ocp.solvers.program_terms import GaussNewtonHessianRidge, LocalVariableFunction, ProgramTerm, ResidualTerm
+from yid_ocp.solvers.program_terms import (
+    GaussNewtonHessianRidge,
+    LocalVariableFunction,
+    MappedFunctionTerm,
+    ResidualTerm,
+)
 
 # Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
 MIN_RIDGE_FACTOR = 0.1
@@ -93,7 +98,7 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
     """Raise `SolverError` if an effect changes recorded inputs or times; solvers with node states do not support it."""
-    if not problem.uses_inputs_as_recorded:
+    if not problem.has_no_input_corrections:
         message = "an effect changes recorded inputs, times or what the tracking filter follows"
         allowed = "effects of the mechanics and of what sensors read"
         raise SolverError(message, where=where, allowed=allowed, hint="use gauss_newton")
@@ -121,14 +126,14 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
     rows = list(problem.predictor.estimated_initial_state_indices)
     for i, episode in enumerate(problem.episodes):
-        columns = problem.unknowns.unknown_indices_of_recording(i)[shared:]
+        columns = problem.unknowns.unknown_indices_affecting_recording(i)[shared:]
         if own:
             x[columns[:own]] = w[program.variables[f"local[{episode.name}]"].index.ravel()]
         if rows:
             blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
             first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
-            theta, _ = problem.theta_and_initial_state_offset(x, i)
-            begin = problem.initial_state(episode, theta, guess=first[: problem.step.sizes["n"]])
+            theta, _ = problem.theta_and_initial_state_deviation(x, i)
+            begin = problem.initial_state_of_episode(episode, theta, guess=first[: problem.step.sizes["n"]])
             x[columns[own:]] = (first - begin.state)[rows]
     return x
 
@@ -257,11 +262,13 @@ class _Maker:
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.append_values(x[:shared], low[:shared], high[:shared])
         self._w.register_block("theta", theta[:, None], problem.shared_parameters)
-        constraints: list[ProgramTerm] = []
+        constraints: list[MappedFunctionTerm] = []
         residuals: list[ResidualTerm] = []
         at_ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
         for i, episode in enumerate(problem.episodes):
-            at = problem.unknowns.unknown_indices_of_recording(i)[shared : shared + len(problem.local_parameters)]
+            at = problem.unknowns.unknown_indices_affecting_recording(i)[
+                shared : shared + len(problem.local_parameters)
+            ]
             local = self._w.append_values(x[at], low[at], high[at])
             self._w.register_block(f"local[{episode.name}]", local[:, None], problem.local_parameters)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
@@ -269,7 +276,7 @@ class _Maker:
             places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
             begun, prior = self._begun(episode, places)
             named, at_steps = self._stage.residual_names, (places.stages(), places.inputs(), places.theta)
-            stages = ProgramTerm(f"step[{episode.name}]", named, self._driven(episode).function, *at_steps)
+            stages = MappedFunctionTerm(f"step[{episode.name}]", named, self._driven(episode).function, *at_steps)
             constraints += [begun, stages]
             used = [samples for samples in episode.measurements if samples.n_residuals]
             residuals += [*(self._sampled(episode, samples, places) for samples in used), *prior, *errors]
@@ -287,14 +294,14 @@ class _Maker:
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
-        shared, _ = problem.theta_and_initial_state_offset(found.x, i)
+        shared, _ = problem.theta_and_initial_state_deviation(found.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, shared)
         rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (known := begin.equilibrium) is not None:
             rest = np.concatenate([known.state[sought], known.state[2 * n :], known.constraint_reactions])
         joints = system.mechanism.joint_names
         grasped = [name for grasp in system.grasps for name in grasp.constraint_equation_names]
-        at_rest = [*(joints[k] for k in sought), *system.internal_coordinate_symbols, *grasped]
+        at_rest = [*(joints[k] for k in sought), *system.effect_internal_coordinate_symbols, *grasped]
         rest_at = self._w.append_values(rest)
         self._w.register_block(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
         table = np.zeros((3, len(state), nx + m))
@@ -308,7 +315,7 @@ class _Maker:
         states, multipliers = index[:, :nx], index[:-1, nx:]
         for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
             self._w.register_block(f"{label}[{name}]", part.T, rows)
-        self._w.register_block(f"z[{name}]", states[:, 2 * n :].T, tuple(system.internal_coordinate_symbols))
+        self._w.register_block(f"z[{name}]", states[:, 2 * n :].T, tuple(system.effect_internal_coordinate_symbols))
         self._w.register_block(f"lam[{name}]", multipliers.T, grasped)
         theta_at = self._p.append_block(f"theta[{name}]", theta, system.parameters.names)
         torque = self._p.append_block(f"torque[{name}]", episode.torque.T, system.driven, "N m")
@@ -332,7 +339,7 @@ class _Maker:
         """The stage as a recording drives it."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
-            feedback, shift = episode.tracking_feedback, self._problem.model_functions.reference_momentum_shift
+            feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_shift
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
             made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
@@ -360,7 +367,7 @@ class _Maker:
             self._w.register_block(f"{label}[{name}]", places[label].T, driven)
             weight = self._p.append_block(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
             data = np.zeros((count, 0), np.int64)
-            term = ProgramTerm(f"{label}[{name}]", driven, itself, places[label], data, weight[:0, 0])
+            term = MappedFunctionTerm(f"{label}[{name}]", driven, itself, places[label], data, weight[:0, 0])
             priors.append(ResidualTerm(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
         offset = np.broadcast_to(places["torque_offset"], (steps, nu))
         per_step = [places["torque_error"][of_step.ravel()], offset]
@@ -368,13 +375,16 @@ class _Maker:
         first = places.get("first_angle_error", np.zeros((1, 0), np.int64))[0]
         return np.hstack(per_step), first, priors
 
-    def _begun(self, episode: Episode, places: _Places) -> tuple[ProgramTerm, list[ResidualTerm]]:
+    def _begun(self, episode: Episode, places: _Places) -> tuple[MappedFunctionTerm, list[ResidualTerm]]:
         """What fixes the first state, and the prior of what is free of it."""
         problem, name, nx = self._problem, episode.name, self._sizes["nx"]
         loose = list(problem.predictor.estimated_initial_state_indices)
         fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_coordinate_indices, *loose}]
         joints = problem.system.mechanism.joint_names
-        rows = [*(f"{part}.{joint}" for part in "qp" for joint in joints), *problem.system.internal_coordinate_symbols]
+        rows = [
+            *(f"{part}.{joint}" for part in "qp" for joint in joints),
+            *problem.system.effect_internal_coordinate_symbols,
+        ]
         first = ca.SX.sym("x0", nx)
         if episode.fixed_initial_state is not None:
             given = self._p.append_block(f"start[{name}]", episode.fixed_initial_state.state, rows)
@@ -383,9 +393,9 @@ class _Maker:
             at, data, shared = places.state[:1], given.T, np.zeros(0, np.int64)
         else:
             statics = problem.model_functions.equilibrium_solver
-            rest = statics.equations
+            rest = statics.symbolic_equations
             sought, held = rest.inputs[0], rest.inputs[2]
-            stiffness = driven_joint_holding_stiffness(problem.system, bool(problem.system.driven))
+            stiffness = measured_angle_holding_stiffness(problem.system, bool(problem.system.driven))
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()
@@ -405,17 +415,17 @@ class _Maker:
         labels = (*(f"rest.{k}" for k in range(balance.numel())), *(f"start.{rows[k]}" for k in fixed))
         value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
         function = LocalVariableFunction("start", inputs, value)
-        term = ProgramTerm(f"start[{name}]", labels, function, at, data, shared)
+        term = MappedFunctionTerm(f"start[{name}]", labels, function, at, data, shared)
         if not loose:
             return term, []
         offset = LocalVariableFunction("offset", inputs, ca.densify((first - state)[loose]))
         weights = 1.0 / problem.initial_state_prior_std
         weight = self._p.append_block(f"weight.start[{name}]", weights, [rows[k] for k in loose])
         named = tuple(f"offset.{rows[k]}" for k in loose)
-        free = ProgramTerm(f"offset[{name}]", named, offset, at, data, shared)
+        free = MappedFunctionTerm(f"offset[{name}]", named, offset, at, data, shared)
         return term, [ResidualTerm(free, ca.DM.eye(len(loose)), weight[:, 0])]
 
-    def _sampled(self, episode: Episode, samples: Measurements, places: _Places) -> ResidualTerm:
+    def _sampled(self, episode: Episode, samples: SensorMeasurements, places: _Places) -> ResidualTerm:
         """Samples of one sensor, predicted linearly between the two nodes beside them."""
         sensor, nodes, n = samples.sensor, samples.evaluation_nodes, self._sizes["n"]
         (read, loaded), smooth = self._reading(sensor, episode), None
@@ -434,8 +444,8 @@ class _Maker:
             states = places.state[nodes]
             at, data = np.hstack([free, states[:, :n], states[:, 2 * n :]]), np.zeros((len(nodes), 0), np.int64)
         rows = sensor.output_names
-        term = ProgramTerm(f"{sensor.group_name}[{episode.name}]", rows, read, at, data, places.theta)
-        seen, between = samples.used_output_mask, _between(samples, nodes if smooth is None else smooth.nodes)
+        term = MappedFunctionTerm(f"{sensor.group_name}[{episode.name}]", rows, read, at, data, places.theta)
+        seen, between = samples.positive_weight_mask, _between(samples, nodes if smooth is None else smooth.nodes)
         if smooth is not None:
             between = between @ scipy.sparse.kron(smooth.matrix, scipy.sparse.eye_array(seen.shape[1]))
         threshold = self._problem.options.huber_threshold
@@ -519,7 +529,7 @@ class _Maker:
             weights = self._p.append_block(f"{name}.weight", weight, rows)
             local = LocalVariableFunction(name, [v, about, ca.SX(0, 1)], value)
             at = np.array([[columns[int(k)]] for k in unknown])
-            term = ProgramTerm(name, (name,), local, at, start, np.zeros(0, np.int64))
+            term = MappedFunctionTerm(name, (name,), local, at, start, np.zeros(0, np.int64))
             found.append(ResidualTerm(term, mixed, weights[:, 0]))
         return found
 
@@ -536,10 +546,10 @@ def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
     return ca.DM(columns)
 
 
-def _between(samples: Measurements, nodes: IntArray) -> scipy.sparse.csc_matrix:
+def _between(samples: SensorMeasurements, nodes: IntArray) -> scipy.sparse.csc_matrix:
     """What makes predictions of samples, those that count, from readings at nodes, node by node."""
     width = samples.value.shape[1]
-    sample, column = np.nonzero(samples.used_output_mask)
+    sample, column = np.nonzero(samples.positive_weight_mask)
     row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
     fraction = samples.fraction[sample]
     after = np.minimum(before + 1, len(nodes) - 1)

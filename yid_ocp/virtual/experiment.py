@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.effects.base import joint_names_by_arm
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.objects.foam_y import foam_y_object
@@ -89,7 +89,7 @@ class PointCamera:
 
 
 @dataclass(frozen=True)
-class VirtualExperiment:
+class VirtualExperimentSettings:
     """Settings of a virtual experiment: motion, simulation, sensors and noise.
 
     Each sensor's noise has its own stream of the `seed`, so that leaving one out changes no other.
@@ -108,7 +108,7 @@ class VirtualExperiment:
 
 
 def run_virtual_experiment(
-    system: System, values: Mapping[str, float] | None = None, experiment: VirtualExperiment | None = None
+    system: System, values: Mapping[str, float] | None = None, experiment: VirtualExperimentSettings | None = None
 ) -> Recording:
     """Simulate a robot moving the object and return the recording of encoders, torques, points and camera.
 
@@ -116,7 +116,7 @@ def run_virtual_experiment(
     stiffness, damping and mass parameters: `values`, nominal where absent. `ConfigError` of noise of other joints'
     torques, else as `simulate_in_mujoco`.
     """
-    chosen = experiment or VirtualExperiment()
+    chosen = experiment or VirtualExperimentSettings()
     duration = chosen.simulation.duration
     posture = chosen.initial_joint_angles
     posture = grasping_joint_angles(system, values) if posture is None else posture
@@ -133,7 +133,7 @@ def run_virtual_experiment(
 
 
 def record_simulation(
-    system: System, values: Mapping[str, float] | None, experiment: VirtualExperiment, run: SimulationResult
+    system: System, values: Mapping[str, float] | None, experiment: VirtualExperimentSettings, run: SimulationResult
 ) -> Recording:
     """Return the recording of a finished simulation `run` with the experiment's sensors and noise."""
     chosen, streams = experiment, _random_generators(experiment.seed)
@@ -146,7 +146,7 @@ def record_simulation(
     made = _how_it_was_made(chosen, system, seen=len(run.frame_times) > 0)
     joints = _joints(system, run, chosen, streams)
     about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name
-    return validate_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
+    return validated_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
 
 
 def _random_generators(seed: int) -> _Generators:
@@ -161,7 +161,9 @@ def _held_and_visible_points(system: System) -> tuple[tuple[str, ...], tuple[str
     return held, tuple(point for point in system.point_frames if point not in held)
 
 
-def _joints(system: System, run: SimulationResult, experiment: VirtualExperiment, streams: _Generators) -> JointGroup:
+def _joints(
+    system: System, run: SimulationResult, experiment: VirtualExperimentSettings, streams: _Generators
+) -> JointGroup:
     driven, noise = list(system.driven_coordinate_indices), experiment.arm_noise
     names = ("effort_std", "effort_bias_std")
     white, bias = (_by_joint(getattr(noise, name), len(driven), f"ArmSensorNoise.{name}") for name in names)
@@ -205,7 +207,7 @@ def _camera_points(
     return PointGroup("points_camera", visible, run.frame_times, position, std, "camera", pose=pose)
 
 
-def _how_it_was_made(experiment: VirtualExperiment, system: System, seen: bool) -> str:
+def _how_it_was_made(experiment: VirtualExperimentSettings, system: System, seen: bool) -> str:
     simulation, noise, camera = experiment.simulation, experiment.arm_noise, experiment.camera
     sampled = 1e3 / simulation.sample_rate
     held = 1e3 / (simulation.sample_rate * simulation.controller_periods_per_sample)

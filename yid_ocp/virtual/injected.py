@@ -21,9 +21,9 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import object_joint_names
-from yid_ocp.errors import ConfigError, ModelError, unknown_name_details
+from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import VirtualExperiment, recording_with_sensor_error, run_virtual_experiment
+from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error, run_virtual_experiment
 from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
 
 _ForceCallback = Callable[[Any, Any], None]  # of MuJoCo's model and data; adds to `qfrc_passive`
@@ -373,7 +373,7 @@ def _slipping_grasp(scene: _EffectContext, model: Any, grasp: str, size: float) 
     return push
 
 
-OUT_OF_LIBRARY_EFFECTS: Mapping[str, _ForceBuilder] = {
+OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
     "torque_ripple": _joint_law(lambda size, q, v, t: size * math.sin(60.0 * q)),  # with the joint's angle [N m]
     "cross_stiffness": _bend_law(lambda size, q: -size * np.roll(q, len(q) // 2)),  # couples the two [N m/rad]
     "quadratic_stiffness": _bend_law(lambda size, q: -size * q**2),  # stiffer one way than the other [N m/rad^2]
@@ -427,7 +427,7 @@ def run_experiment_with_effects(
     system: System,
     values: Mapping[str, float],
     effects: Sequence[InjectedEffect],
-    experiment: VirtualExperiment | None = None,
+    experiment: VirtualExperimentSettings | None = None,
 ) -> Recording:
     """Return the recording of a virtual experiment with effects that the system's description lacks.
 
@@ -435,10 +435,11 @@ def run_experiment_with_effects(
     own `injected_terms` are replaced. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that
     is too far off or takes away what is not there, else as `run_virtual_experiment`.
     """
-    known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_EFFECTS)
+    known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_FORCE_BUILDERS)
     for effect in effects:
         if effect.kind not in known:
-            what, details = f"{effect.kind} cannot be done in MuJoCo here", unknown_name_details(effect.kind, known)
+            what = f"{effect.kind} cannot be done in MuJoCo here"
+            details = unknown_name_error_arguments(effect.kind, known)
             raise ConfigError(what, where=effect.label, **details)
     described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in _DESCRIPTION_KINDS]
     changed = system.with_effects(described) if described else system
@@ -446,7 +447,7 @@ def run_experiment_with_effects(
     play = {e.location: e.values["width"] for e in effects if e.kind == "backlash" and e.location in system.servos}
     inner = [e for e in effects if e.kind not in _DESCRIPTION_KINDS and e.kind not in _SENSOR_ERROR_KINDS]
     injected = _InjectedTerms(changed, values, inner) if inner else None
-    chosen = replace(experiment or VirtualExperiment(), injected_terms=injected, gear_play=play)
+    chosen = replace(experiment or VirtualExperimentSettings(), injected_terms=injected, gear_play=play)
     made = run_virtual_experiment(changed, values, chosen)
     for effect in effects:
         if effect.kind in _SENSOR_ERROR_KINDS and effect.location not in play:
@@ -455,7 +456,7 @@ def run_experiment_with_effects(
 
 
 class _InjectedTerms:
-    """Effects of `_MUJOCO_MODEL_KINDS`, `_FORCES` or `OUT_OF_LIBRARY_EFFECTS` as `InjectedSimulatorTerms`."""
+    """Effects of `_MUJOCO_MODEL_KINDS`, `_FORCES` or `OUT_OF_LIBRARY_FORCE_BUILDERS` as `InjectedSimulatorTerms`."""
 
     def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
         self._effects, self._forces = tuple(effects), list[_ForceCallback]()
@@ -476,7 +477,7 @@ class _InjectedTerms:
             elif effect.kind in _FORCES:
                 self._forces.append(_FORCES[effect.kind](scene, model, place, size))
             else:
-                self._forces.append(OUT_OF_LIBRARY_EFFECTS[effect.kind](scene, model, place, size["size"]))
+                self._forces.append(OUT_OF_LIBRARY_FORCE_BUILDERS[effect.kind](scene, model, place, size["size"]))
 
     def start_motion(self, data: Any) -> None:
         self._scene.has_motion_begun = True

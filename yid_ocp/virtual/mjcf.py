@@ -162,7 +162,7 @@ def effect_joint_terms_and_changed_aspects(
     return terms, aspects or {"reading"}
 
 
-def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
+def system_joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
     """Springs, dampers, rotor inertia and friction by joint, from the description and from effects at one joint."""
     found: dict[str, JointDynamicsTerms] = {}
 
@@ -311,7 +311,7 @@ def mujoco_xml(
     stops = {"solreflimit": format_xml_numbers([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
     ranges = {name: format_xml_numbers([-width / 2, width / 2]) for name, width in (gear_play or {}).items()}
     gears = {name: {"limited": "true", "range": ends, **stops} for name, ends in ranges.items()}
-    elements = _bodies(tree, weights, joint_dynamics_terms(system, value), sites, base, gears)
+    elements = _bodies(tree, weights, system_joint_dynamics_terms(system, value), sites, base, gears)
     for name, frame in sites:
         SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
@@ -462,7 +462,7 @@ def import_mujoco() -> ModuleType:
     return mujoco
 
 
-def compile_mjcf(text: str) -> Any:
+def mujoco_model_from_mjcf(text: str) -> Any:
     """A `mujoco.MjModel` compiled from MJCF text; `ModelError` if MuJoCo rejects it."""
     try:
         return import_mujoco().MjModel.from_xml_string(text)

@@ -14,7 +14,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ModelError
 from yid_ocp.model.system import System
-from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco
+from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf
 from yid_ocp.virtual.mujoco_simulation import (
     MujocoScene,
     TrackingController,
@@ -31,7 +31,7 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 
 @dataclass(frozen=True)
-class ReplayMismatch:
+class ReplayErrorAgainstRecording:
     """RMS error of a replayed model against the recording in one channel or group; for points, of the distance.
 
     `noise_rms` is expected from sensor noise alone, zero if the recording does not state it.
@@ -47,7 +47,9 @@ class ReplayMismatch:
         return float(np.sqrt(max(self.rmse**2 - self.noise_rms**2, 0.0)))
 
 
-def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[str, ReplayMismatch]:
+def replay_mismatch_by_channel(
+    text: str, system: System, recording: Recording
+) -> dict[str, ReplayErrorAgainstRecording]:
     """Replay a recording with a system's MJCF text (`mujoco_xml` with actuators) and return the deviations by channel.
 
     Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
@@ -59,7 +61,7 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
     and `GROUP.POINT` of every point of the model [m]. `ModelError` where nothing moves the model as recorded, it does
     not come to rest, or it diverges; `DataError` where MuJoCo is not installed.
     """
-    mujoco, model = import_mujoco(), compile_mjcf(text)
+    mujoco, model = import_mujoco(), mujoco_model_from_mjcf(text)
     moved = system.driven or system.prescribed
     joints = recording.joints
     if joints is None or not moved or not set(moved) <= set(joints.names):
@@ -177,10 +179,10 @@ def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
 
 def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
-) -> dict[str, ReplayMismatch]:
+) -> dict[str, ReplayErrorAgainstRecording]:
     if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
         raise ModelError("the replay diverged", where=recording.name, hint="take a shorter time step")
-    found: dict[str, ReplayMismatch] = {}
+    found: dict[str, ReplayErrorAgainstRecording] = {}
     t = joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9
     if not system.driven:
@@ -191,7 +193,7 @@ def _errors(
         model = _at(t[inside], played.t, played.values)
         error = float(np.sqrt(np.mean((model - said[inside][:, columns]) ** 2)))
         level = np.zeros(1) if noise is None else np.broadcast_to(noise, (len(joints.names),))[columns]
-        found[name] = ReplayMismatch(error, float(np.sqrt(np.mean(level**2))), unit)
+        found[name] = ReplayErrorAgainstRecording(error, float(np.sqrt(np.mean(level**2))), unit)
     for group in recording.points:
         for i, point in enumerate(group.names):
             if point in system.point_frames:
@@ -200,7 +202,9 @@ def _errors(
     return found
 
 
-def _point_error(group: PointGroup, i: int, start: float, played: _Played, column: int) -> ReplayMismatch | None:
+def _point_error(
+    group: PointGroup, i: int, start: float, played: _Played, column: int
+) -> ReplayErrorAgainstRecording | None:
     t = group.t - start
     seen = (t >= 0) & (t <= played.t[-1]) & np.isfinite(group.position[:, i]).all(axis=1)
     if not seen.any():
@@ -208,7 +212,7 @@ def _point_error(group: PointGroup, i: int, start: float, played: _Played, colum
     model = _at(t[seen], played.t, played.points[:, column])
     square = np.sum((model - group.position[seen, i]) ** 2, axis=1)
     noise = 0.0 if group.std is None else float(np.sqrt(np.nanmean(np.sum(group.std[seen, i] ** 2, axis=1))))
-    return ReplayMismatch(float(np.sqrt(square.mean())), noise, "m")
+    return ReplayErrorAgainstRecording(float(np.sqrt(square.mean())), noise, "m")
 
 
 def _at(t: Array, known: Array, values: Array) -> Array:

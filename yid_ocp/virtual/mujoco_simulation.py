@@ -22,7 +22,7 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
-from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
+from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf, mujoco_xml
 
 DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
 _TRACKING_BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
@@ -148,7 +148,7 @@ def simulate_in_mujoco(
         where = f"motion of {', '.join(motion.joints) or 'nothing'}"
         raise ModelError("the motion is not one of the driven joints", where=where, allowed=allowed)
     mujoco = import_mujoco()
-    model = compile_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
+    model = mujoco_model_from_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
     with _at_work(mujoco, model, injected):
         scene = MujocoScene.from_compiled_model(system, mujoco, model)

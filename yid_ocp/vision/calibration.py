@@ -30,11 +30,11 @@ from yid_ocp.vision.camera_registration import (
     ArmSurface,
     CalibrationFrame,
     CameraState,
-    RobustCostGradientAndHessian,
-    SurfaceVisibility,
+    RobustCostDerivatives,
+    SurfaceVisibilityFractions,
     initial_camera_states,
     robust_gradient_and_hessian,
-    surface_visibility,
+    surface_visibility_in_frames,
 )
 from yid_ocp.vision.point_cloud import weighted_median
 
@@ -154,7 +154,7 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
     return [i for i, good in zip(known, near, strict=True) if good], float(np.median(square))
 
 
-def is_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
+def is_frame_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
     """Whether a frame's time stamp is significantly late or early, beyond the offset common to all frames."""
     return abs(own.delay) > max(options.max_frame_offset_deviation, _STAMP_ERROR_STDS * own.std)
 
@@ -196,7 +196,7 @@ class CameraCalibrationOptions:
     depth_offset_prior_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of an offset of its depth", "m")
     ] = 0.01
-    min_visible_fraction: Annotated[
+    min_visible_arm_fraction: Annotated[
         float,
         Gt(0),
         Le(1),
@@ -220,7 +220,7 @@ class CameraCalibration:
     # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero where nothing was estimated
     state_covariance: Array
     estimate_minus_used: Array  # (10,), what the arm says less what is used: of a pose that was to be kept
-    arm_visibility: SurfaceVisibility | None  # how much of the arm was seen where it is
+    arm_visibility: SurfaceVisibilityFractions | None  # how much of the arm was seen where it is
     n_frames: int  # from which it was estimated
     message: str  # in words
 
@@ -326,9 +326,9 @@ class _Calibrator:
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = surface_visibility(self.arm, chosen, state, _RAY_REACH)
+        presence = surface_visibility_in_frames(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
-        if not presence.there >= self.options.min_visible_fraction * free:
+        if not presence.there >= self.options.min_visible_arm_fraction * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
             hint = "check the told pose, the robot's description and which recording belongs to the frames"
             raise _UntoldError(f"{seen}, wherever camera and clock are put", hint)
@@ -373,7 +373,7 @@ class _Calibrator:
         for trial in tried:
             for reach in _STAGE_REACHES:
                 trial = self._rounds(trial, few, reach, False, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
-            presence = surface_visibility(self.arm, few, trial, 0.5 * _RAY_REACH)
+            presence = surface_visibility_in_frames(self.arm, few, trial, 0.5 * _RAY_REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
             if most > _GOOD_START_FRACTION:
@@ -382,7 +382,7 @@ class _Calibrator:
 
     def _rounds(
         self, state: CameraState, frames: Sequence[CalibrationFrame], reach: float, along: bool, most: int, rounds: int
-    ) -> tuple[CameraState, RobustCostGradientAndHessian, list[CalibrationFrame]]:
+    ) -> tuple[CameraState, RobustCostDerivatives, list[CalibrationFrame]]:
         """The state after some steps on at most so many points of each frame, the sum there, and those points."""
         chosen = []
         for glimpse in frames:
@@ -397,12 +397,12 @@ class _Calibrator:
             hint = "check the told pose and the unit of the clouds"
             raise _UntoldError("what the camera sees does not lie on it", hint)
 
-        def cost(state: CameraState) -> RobustCostGradientAndHessian:
+        def cost(state: CameraState) -> RobustCostDerivatives:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
             return robust_gradient_and_hessian(rows, reach)
 
         for _ in range(rounds):
-            hessian, gradient, _ = cost(state).weighted_normal_equations(self.precision)
+            hessian, gradient, _ = cost(state).data_normal_equations_and_weight(self.precision)
             pull = gradient + self.precision @ state.difference_from(self.told)
             step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
             state = state.with_state_increment(step)

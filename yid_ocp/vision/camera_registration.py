@@ -157,14 +157,14 @@ class ArmSurface:
     def _moving(self) -> BoolArray:
         return np.array([joint >= 0 for joint in self.robot_surfaces.part_joints])
 
-    def part_poses_at(self, t: float) -> Array:
+    def part_poses_at_time(self, t: float) -> Array:
         """World poses of the robot's surface parts at a time [s], shape (parts, 4, 4)."""
-        return self.robot_surfaces.part_poses_at(self.configuration_at(t))
+        return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
     def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
         """World points of moving surfaces that an unobstructed camera sees, and the surface part of each."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
-        depth, cosine, part = self.robot_surfaces.render_depth_image(_START_INTRINSICS, state.pose, q)
+        depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _MIN_INCIDENCE_COSINE) & (part >= 0) & self._moving[part]
         points = _START_INTRINSICS.pixel_rays_at_unit_depth[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
@@ -190,11 +190,11 @@ class ArmSurface:
                 error = (distance - 1.0) * square  # n . (P - (origin + d (P - origin)))
             kept = (square > _MIN_INCIDENCE_COSINE * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
         else:
-            error, normal, part = self.robot_surfaces.moving_surface_distance(points, q, reach)
+            error, normal, part = self.robot_surfaces.nearest_moving_surface(points, q, reach)
             kept = np.ones(len(points), bool)
         chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
         behind, now, later = (
-            self.part_poses_at(t + d)[part[chosen]] for d in (-_VELOCITY_TIME_STEP, 0.0, _VELOCITY_TIME_STEP)
+            self.part_poses_at_time(t + d)[part[chosen]] for d in (-_VELOCITY_TIME_STEP, 0.0, _VELOCITY_TIME_STEP)
         )
         local = np.einsum("nji,nj->ni", now[:, :3, :3], points[chosen] - now[:, :3, 3])
         moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
@@ -230,7 +230,7 @@ class _SurfaceMatches(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RobustCostGradientAndHessian:
+class RobustCostDerivatives:
     """Gradient and Hessian of the robust cost at a camera state, and the covariance of its gradient."""
 
     gradient: Array  # (10,)
@@ -240,7 +240,7 @@ class RobustCostGradientAndHessian:
     # frame, which both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
 
-    def weighted_normal_equations(self, precision: Array) -> tuple[Array, Array, float]:
+    def data_normal_equations_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
         """Weighted Hessian and gradient of the data, and the weight; `precision`: inverse covariance of the prior."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
@@ -250,12 +250,12 @@ class RobustCostGradientAndHessian:
 
     def state_covariance(self, precision: Array) -> Array:
         """Covariance of the minimum of data and prior, shape (10, 10)."""
-        hessian, _, weight = self.weighted_normal_equations(precision)
+        hessian, _, weight = self.data_normal_equations_and_weight(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
 
-def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostGradientAndHessian:
+def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostDerivatives:
     """Gradient and Hessian of the robust cost over all points of all frames, scaled by their median error."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     sigma = max(_MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
@@ -275,7 +275,7 @@ def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: fl
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
     curvature = max(bent / max(float(weight.sum()), 1e-12), _MIN_CURVATURE_FRACTION)
     hessian = jacobian.T @ (weight[:, None] * jacobian)
-    return RobustCostGradientAndHessian(scores.sum(axis=0), hessian, curvature, blocks)
+    return RobustCostDerivatives(scores.sum(axis=0), hessian, curvature, blocks)
 
 
 def _at_least(least: Array, matrix: Array) -> Array:
@@ -351,18 +351,18 @@ def _add_costs(
     distance = np.minimum(distance_transform_edt(empty, sampling=_GRID_CELL_SIZE), _MAX_START_DISTANCE)
     flat = np.where(outside, _HIDDEN_SAMPLE_COST, (distance / _MAX_START_DISTANCE) ** 2).astype(np.float32).ravel()
     t = float(told.stamps_to_joint_clock(glimpse.stamp))
-    before = arm.part_poses_at(t)[part]
+    before = arm.part_poses_at_time(t)[part]
     local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     for row, delay in zip(total, delays, strict=True):
-        then = arm.part_poses_at(t - delay)[part]
+        then = arm.part_poses_at_time(t - delay)[part]
         own = told.world_to_measured_points(np.einsum("nij,nj->ni", then[:, :3, :3], local) + then[:, :3, 3])
         index = np.clip(np.floor((own - low) / _GRID_CELL_SIZE).astype(np.int64), edge, shape - 1 - edge)
         row += flat[(index @ strides)[None, :] + (cells @ strides)[:, None]].mean(axis=1)
 
 
 @dataclass(frozen=True)
-class SurfaceVisibility:
+class SurfaceVisibilityFractions:
     """Shares of the arm's surface in view that a cloud contains, that are occluded, or that are seen through."""
 
     there: float  # a cloud has it
@@ -371,9 +371,9 @@ class SurfaceVisibility:
     samples: int
 
 
-def surface_visibility(
+def surface_visibility_in_frames(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
-) -> SurfaceVisibility:
+) -> SurfaceVisibilityFractions:
     """Shares of the arm's surface in view that clouds contain within `within` [m], occlude, or see through."""
     counts = np.zeros(4)
     for glimpse in glimpses:
@@ -388,4 +388,4 @@ def surface_visibility(
         covered = known & ~near & (depth < own[:, 2] - within)
         counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
     there, covered, through = (float(share) for share in counts[:3] / max(counts[3], 1.0))
-    return SurfaceVisibility(there, covered, through, int(counts[3]))
+    return SurfaceVisibilityFractions(there, covered, through, int(counts[3]))

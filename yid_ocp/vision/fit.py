@@ -34,7 +34,7 @@ from yid_ocp.vision.shape_evidence import (
     FrameTubeDimensionCost,
     ProcessedFrameCloud,
     ShapeFitQuality,
-    ShapePointClassification,
+    ShapeFitQualityAndPointClasses,
     TubeLinks,
     tube_link_projections,
 )
@@ -203,7 +203,9 @@ class ShapeFitter:
             # a part of the object is not where this has it: something like it stood nearer to where the search began
             if left[0].any() and left[1].any():
                 other = self._attempt(sight, [self._rested(best.q, failed), *begun], left)
-                if other[1].length_weighted_coverage(self._lengths) > evidence.length_weighted_coverage(self._lengths):
+                if other[1].length_weighted_visible_coverage(self._lengths) > evidence.length_weighted_visible_coverage(
+                    self._lengths
+                ):
                     best, evidence = other
         return self._judged(best, evidence, self._rivals(best, evidence, sight), sight)
 
@@ -222,11 +224,13 @@ class ShapeFitter:
     def _links_of(self, tubes: Collection[str]) -> BoolArray:
         return np.array([owner in tubes for owner in self.link_segments])
 
-    def _rivals(self, best: _Minimum, evidence: ShapePointClassification, sight: ProcessedFrameCloud) -> list[Array]:
+    def _rivals(
+        self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud
+    ) -> list[Array]:
         """Other shapes that the cloud speaks for as much, where a thing touches a tube."""
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
-        tubes = self.tube_links_at(best.q)
+        tubes = self.tube_links_at_configuration(best.q)
         touched = tube_link_projections(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
         found = []
         for name in dict.fromkeys(self.link_segments[k] for k in sorted(set(touched.tolist()))):
@@ -239,21 +243,21 @@ class ShapeFitter:
                     found.append(rival.q)
         return found
 
-    def _failed(self, evidence: ShapePointClassification) -> set[str]:
+    def _failed(self, evidence: ShapeFitQualityAndPointClasses) -> set[str]:
         """Tubes of which too much is seen to be empty."""
         own = {name: self._lengths * self._links_of({name}) for name in self.link_segments}
         return {
             name
             for name, mine in own.items()
             if mine @ evidence.visibly_empty_fraction > 0
-            and evidence.length_weighted_coverage(mine) < self.options.min_tube_length_coverage
+            and evidence.length_weighted_visible_coverage(mine) < self.options.min_tube_length_coverage
         }
 
     def _without(
-        self, best: _Minimum, evidence: ShapePointClassification, sight: ProcessedFrameCloud, links: BoolArray
+        self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud, links: BoolArray
     ) -> _Left:
         """All nodes and points but those on which some links lie."""
-        tubes, nodes = self.tube_links_at(best.q), sight.skeleton_nodes
+        tubes, nodes = self.tube_links_at_configuration(best.q), sight.skeleton_nodes
         link = tube_link_projections(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (evidence.is_own | evidence.is_contested)
         node_link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
@@ -261,18 +265,20 @@ class ShapeFitter:
 
     def _attempt(
         self, sight: ProcessedFrameCloud, starts: Sequence[Array], left: _Left
-    ) -> tuple[_Minimum, ShapePointClassification]:
+    ) -> tuple[_Minimum, ShapeFitQualityAndPointClasses]:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
         tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
         last = self._minimise(min(tried, key=lambda minimum: minimum.cost), on_points)
         near = self.max_informative_surface_distance
-        evidence = shape_evidence.assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
+        evidence = shape_evidence.fit_quality_and_point_classes(self.tube_links_at_configuration(last.q), sight, near)
         keep = ~(evidence.is_contested | evidence.is_foreign)
         if on_points and keep.any():
             last = self._minimise(last, self._tasks(sight, left[0], keep)[1])
-            evidence = shape_evidence.assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
+            evidence = shape_evidence.fit_quality_and_point_classes(
+                self.tube_links_at_configuration(last.q), sight, near
+            )
         return last, evidence
 
     @property
@@ -314,7 +320,11 @@ class ShapeFitter:
         return end
 
     def _judged(
-        self, best: _Minimum, evidence: ShapePointClassification, rivals: Sequence[Array], sight: ProcessedFrameCloud
+        self,
+        best: _Minimum,
+        evidence: ShapeFitQualityAndPointClasses,
+        rivals: Sequence[Array],
+        sight: ProcessedFrameCloud,
     ) -> FrameShapeFit:
         """The shape with its standard deviations, and what speaks for and against it."""
         q, on_shape = best.q, evidence.is_own | evidence.is_contested
@@ -329,7 +339,7 @@ class ShapeFitter:
             every = self._tasks(sight, none, ~evidence.is_foreign)[1][-1]
             moved = (jacobian @ self._quadratic(q, every).damped_step(0.0)).reshape(-1, 3)
         for rival in rivals:
-            moved = np.maximum(np.abs(moved), np.abs(self.points_at(rival) - places))
+            moved = np.maximum(np.abs(moved), np.abs(self.points_at_configuration(rival) - places))
         corners = self._links_at(q)
         touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING_DISTANCE
         # the spread across the links about each point
@@ -397,7 +407,9 @@ class ShapeFitter:
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
         return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
 
-    def _size_rows(self, q: Array, task: _Task | None, evidence: ShapePointClassification) -> FrameTubeDimensionCost:
+    def _size_rows(
+        self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
+    ) -> FrameTubeDimensionCost:
         """What a frame's points say of lengths and radii at its shape."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
@@ -440,15 +452,15 @@ class ShapeFitter:
         moved = moved - np.array(self._seen(q)[1]) @ follow[:, 1:]
         return FrameTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
-    def tube_links_at(self, q: Array) -> TubeLinks:
+    def tube_links_at_configuration(self, q: Array) -> TubeLinks:
         """Tube links in the world at a configuration."""
         return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
-    def gripper_positions_at(self, q: ArrayLike) -> Array:
+    def gripper_positions_at_configuration(self, q: ArrayLike) -> Array:
         """Gripper positions at a configuration, shape (grasps, 3) [m]."""
         return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
 
-    def points_at(self, q: ArrayLike) -> Array:
+    def points_at_configuration(self, q: ArrayLike) -> Array:
         """Positions of the system's points at a configuration, shape (np, 3) [m]."""
         return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
 
@@ -482,7 +494,7 @@ def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOption
             corners += [start, kinematics.frame_position(f"{segment.name}_{i}_tip")]
     rows, gaps = [ca.SX(0, 1)], [ca.SX(0, 1)]
     for grasp in system.grasps:
-        residual, alignment = grasp.constraint_residual(kinematics), grasp.far_start_orientation_error(kinematics)
+        residual, alignment = grasp.constraint_residual(kinematics), grasp.holder_minus_held_axes(kinematics)
         gaps.append(residual[:3])
         rows.append(residual[:3] / options.grasp_position_std)
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown

@@ -22,8 +22,14 @@ from numpy.typing import ArrayLike
 
 from yid_ocp import files
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, OutputError, unknown_name_details
-from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
+from yid_ocp.errors import DataError, OutputError, unknown_name_error_arguments
+from yid_ocp.vision.frames import (
+    CameraIntrinsics,
+    FrameSequence,
+    PointColourArray,
+    import_open3d,
+    validated_camera_pose,
+)
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
 _DEPTH_IMAGE_SUFFIX = ".png"
@@ -34,7 +40,7 @@ _MAX_FRAME_BYTES = 1 << 28  # of one cloud or image
 _COPY_AGAIN_HINT = "copy or record it again"
 
 
-_Cloud = tuple[Array, ColourArray | None]
+_Cloud = tuple[Array, PointColourArray | None]
 """Points in the file's unit, and their red, green and blue where it has them, both (N, 3)."""
 
 
@@ -55,7 +61,7 @@ def _read_npz(path: Path) -> _Cloud:
     allowed += " to 255 if wanted"
     try:
         with zipfile.ZipFile(path) as packed:
-            files.check_number_count(sum(entry.file_size for entry in packed.infolist()), str(path))
+            files.check_max_input_numbers(sum(entry.file_size for entry in packed.infolist()), str(path))
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
@@ -107,7 +113,7 @@ def _read_depth_image(path: Path) -> Array:
     o3d = import_open3d()
     with files.check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
         head = file.read(24)  # whose last eight bytes are a PNG's width and height
-    files.check_number_count(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
+    files.check_max_input_numbers(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
@@ -241,7 +247,7 @@ def read_frame_folder(
         points = _read_cloud(file)[0] * scale
         return (points - camera[:3, 3]) @ camera[:3, :3] if frame == "world" else points
 
-    def colours(index: int) -> ColourArray | None:
+    def colours(index: int) -> PointColourArray | None:
         return None if names[index].lower().endswith(_DEPTH_IMAGE_SUFFIX) else _read_cloud(path / names[index], True)[1]
 
     return FrameSequence(times, names, camera, load, intrinsics, str(path), colours)
@@ -272,7 +278,7 @@ def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) 
 def metres_per_unit(unit: str, where: str) -> float:
     """Size of a cloud's length unit [m]; `DataError` for an unknown one."""
     if unit not in _METRES_PER_UNIT:
-        raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_details(unit, _METRES_PER_UNIT))
+        raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_error_arguments(unit, _METRES_PER_UNIT))
     return _METRES_PER_UNIT[unit]
 
 
@@ -283,7 +289,7 @@ def _read_camera(path: Path) -> dict[str, Any]:
     if not isinstance(head, dict):
         raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')
     for key in (key for key in head if key not in _CAMERA_FILE_KEYS):
-        raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_details(key, _CAMERA_FILE_KEYS))
+        raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_error_arguments(key, _CAMERA_FILE_KEYS))
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
         raise DataError(f"the format of the frames is '{head['format']}'", where=str(path), allowed=_FRAMES_FORMAT)
     return head

@@ -22,7 +22,13 @@ from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, Open
 from yid_ocp.errors import DataError
 from yid_ocp.files import check_input_file
 from yid_ocp.vision.frame_folder import STAMP_FILE, metres_per_unit, read_frame_folder
-from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
+from yid_ocp.vision.frames import (
+    CameraIntrinsics,
+    FrameSequence,
+    PointColourArray,
+    import_open3d,
+    validated_camera_pose,
+)
 
 _CLOUD_MESSAGE, _IMAGE_MESSAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
 _CAMERA_INFO_MESSAGE = "sensor_msgs/msg/CameraInfo"
@@ -51,7 +57,7 @@ def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str |
             return _points(content, where) * scale
         return lens.points_from_depth(_depth(content, per_metre, where))
 
-    def colours(index: int) -> ColourArray | None:
+    def colours(index: int) -> PointColourArray | None:
         return None if lens is not None else _colours(_decoded(bag, messages[index]), where)
 
     names = tuple(f"{name} {i}" for i in range(len(messages)))
@@ -192,7 +198,7 @@ def _points(content: Any, where: str) -> Array:
     return np.stack([axis.astype(np.float64) for axis in axes], axis=1)
 
 
-def _colours(content: Any, where: str) -> ColourArray | None:
+def _colours(content: Any, where: str) -> PointColourArray | None:
     for name in ("rgb", "rgba"):
         found = _cloud_columns(content, (name,), where)
         if found is not None and found[0].itemsize == 4:
@@ -298,9 +304,9 @@ def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
     def depth(index: int) -> Array:
         return 1e-3 * np.asarray(film.frame(index).depth, float)
 
-    def colours(index: int) -> ColourArray | None:
+    def colours(index: int) -> PointColourArray | None:
         image = np.asarray(film.frame(index).color)
-        seen = lens.is_depth_measured(depth(index))
+        seen = lens.measured_depth_mask(depth(index))
         return None if image.shape[:2] != seen.shape else np.asarray(image[seen][:, :3], np.uint8)
 
     names = tuple(f"frame {i}" for i in range(count))

@@ -51,7 +51,7 @@ class TrackOptions:
         Literal["none", "frames"],
         OptionInfo(
             "frames: what stands still in most frames, away from every shape that was fitted, is "
-            "left out; beside it track.background_frames"
+            "left out; beside it track.background_frames_path"
         ),
     ] = "none"
     estimated_dimensions: Annotated[
@@ -60,17 +60,17 @@ class TrackOptions:
             "sizes of the tubes that are estimated from the clouds, where these tell them; all are checked anyway"
         ),
     ] = ()
-    max_distance_in_radii: Annotated[
+    max_mean_distance_in_radii: Annotated[
         PositiveFloat,
         OptionInfo(
             "a frame whose points are further from the fitted shape on average, beyond their "
             "noise, is dropped; in radii of the tubes"
         ),
     ] = 0.5
-    max_bend_angle: Annotated[
+    max_frame_bend_angle: Annotated[
         PositiveFloat, OptionInfo("a frame whose shape has a joint that is bent further is dropped", "rad")
     ] = 1.2
-    max_distance_ratio: Annotated[
+    max_distance_over_median: Annotated[
         PositiveFloat, OptionInfo("a frame whose distance is so many times the median of all good frames is dropped")
     ] = 1.7
     max_grasp_gap_change: Annotated[
@@ -81,7 +81,7 @@ class TrackOptions:
             "m",
         ),
     ] = 0.008
-    min_visible_coverage: Annotated[
+    min_visible_length_coverage: Annotated[
         UnitIntervalFloat,
         OptionInfo("a frame with points on a smaller share of the object's visible length is dropped"),
     ] = 0.6
@@ -133,22 +133,22 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
-    widest, noise = options.max_distance_in_radii * float(shape.link_radii.mean()), shape.options.surface_noise_std
+    widest, noise = options.max_mean_distance_in_radii * float(shape.link_radii.mean()), shape.options.surface_noise_std
     limit = math.hypot(widest, _MEAN_ABS_DEVIATION * noise)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
-        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_distance_in_radii allows {1e3 * limit:.1f} mm"
+        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_mean_distance_in_radii allows {1e3 * limit:.1f} mm"
         return f"{_NO_FIT}: {off}"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
-    if bend > options.max_bend_angle:
+    if bend > options.max_frame_bend_angle:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-    if fit.visible_length_coverage < options.min_visible_coverage:
+    if fit.visible_length_coverage < options.min_visible_length_coverage:
         return f"{_NO_FIT}: only {100 * fit.visible_length_coverage:.0f} % of its visible length has points of its own"
     return ""
 
 
-def drop_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
+def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
     """All frames; those that deviate from the other good frames are marked as dropped."""
     fits = _good_fits(frames)
     if not fits:
@@ -159,7 +159,7 @@ def drop_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -
     for k, fit in fits.items():
         reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
-        if fit.mean_distance > options.max_distance_ratio * usual:
+        if fit.mean_distance > options.max_distance_over_median * usual:
             off = f"{1e3 * fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
             reason = f"the shape fits worse than in other frames: {off}"
         elif apart > options.max_grasp_gap_change:
@@ -192,7 +192,7 @@ def tracked_states_and_points(
     fits, of = list(good.values()), list(columns)
     t = np.array([frames[k].joint_time for k in good])
     position = np.array([fit.point_positions[of] for fit in fits])
-    by_sizes = np.array([sizes.point_std(fit.dimension_equations.point_jacobian[of]) for fit in fits])
+    by_sizes = np.array([sizes.point_std_from_dimensions(fit.dimension_equations.point_jacobian[of]) for fit in fits])
     std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), options.min_point_std), by_sizes)
     velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
     # a point is where it was at some time of the exposure, which is uniform over that

@@ -27,10 +27,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.errors import DataError, unknown_name_details
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.model.rotations import homogeneous_transform
 
-ColourArray = NDArray[np.uint8]
+PointColourArray = NDArray[np.uint8]
 
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Models of distortion, and how many coefficients each may have: k1, k2, p1, p2, k3 (k4, k5, k6), or k1 to k4."""
@@ -56,7 +56,7 @@ class CameraIntrinsics:
 
     def __post_init__(self) -> None:
         if self.has_distortion and self.model not in _DISTORTION_COEFFICIENT_COUNTS:
-            known = unknown_name_details(self.model, _DISTORTION_COEFFICIENT_COUNTS)
+            known = unknown_name_error_arguments(self.model, _DISTORTION_COEFFICIENT_COUNTS)
             raise DataError(f"the distortion is '{self.model}'", where="intrinsics", **known)
         count = _DISTORTION_COEFFICIENT_COUNTS.get(self.model, ())
         if self.has_distortion and (len(self.coefficients) not in count or not np.isfinite(self.coefficients).all()):
@@ -82,16 +82,16 @@ class CameraIntrinsics:
     def points_from_depth(self, depth: ArrayLike) -> Array:
         """Points (N, 3) in the camera's frame, row by row, of a depth image (height, width) along the optical axis [m].
 
-        Zero or NaN is where nothing was measured; errors as `is_depth_measured`.
+        Zero or NaN is where nothing was measured; errors as `measured_depth_mask`.
         """
         image = np.asarray(depth, float)
-        seen = np.flatnonzero(self.is_depth_measured(image))
+        seen = np.flatnonzero(self.measured_depth_mask(image))
         # a third of the time that a mask over rows takes
         points = self.pixel_rays_at_unit_depth.reshape(-1, 3).take(seen, axis=0)
         points *= image.ravel().take(seen)[:, None]
         return points
 
-    def is_depth_measured(self, depth: Array) -> BoolArray:
+    def measured_depth_mask(self, depth: Array) -> BoolArray:
         """Whether each pixel of a depth image is measured, shape (height, width); `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
@@ -175,7 +175,7 @@ class FrameSequence:
     intrinsics: CameraIntrinsics | None = None
     source: str = "sequence"  # where the frames come from, for messages
     # from a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none
-    load_colours: Callable[[int], ColourArray | None] | None = None
+    load_colours: Callable[[int], PointColourArray | None] | None = None
 
     def __len__(self) -> int:
         return len(self.frame_names)

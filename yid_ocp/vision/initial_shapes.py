@@ -27,7 +27,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import DataError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
-from yid_ocp.model.system import System, floating_clamp
+from yid_ocp.model.system import System, floating_joint_mechanism
 from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
 
 _N_NEIGHBOURS = 10
@@ -223,7 +223,7 @@ def system_with_free_root(system: System, values: Mapping[str, float] | None = N
     place = ca.Function("root", [q], [forward_kinematics(tree, q).joint_origins[base]])(np.zeros(system.n_coordinates))
     under = np.eye(4)
     under[:3, 3] = -np.array(place).ravel()
-    carrier = floating_clamp(_FREE_ROOT_PREFIX)
+    carrier = floating_joint_mechanism(_FREE_ROOT_PREFIX)
     carried = carrier.with_attached_mechanism(system.mechanism, _FREE_ROOT_PREFIX, under)
     return replace(system, mechanism=carried, grasps=()), carrier.joint_names
 
@@ -244,7 +244,7 @@ class InitialShapeFinder:
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]
     ) -> None:
         self._rest, self._bends = rest, frozenset(bends)
-        self._root = [tree.joint_index(name) for name in floating_clamp(_FREE_ROOT_PREFIX).joint_names]
+        self._root = [tree.joint_index(name) for name in floating_joint_mechanism(_FREE_ROOT_PREFIX).joint_names]
         self._parent = [joint.parent_index for joint in tree.joints]
         self._axis = [np.array(joint.axis, float) for joint in tree.joints]
         self._turns = [joint.kind == "revolute" for joint in tree.joints]
@@ -270,7 +270,7 @@ class InitialShapeFinder:
         self._end_distances = to_tips[:, None] + to_tips - 2 * np.pad(np.array(shared), ((1, 0), (1, 0)))
         np.fill_diagonal(self._end_distances, 0.0)
 
-    def find_initial_shapes(self, trace: _Centerline) -> list[_InitialShape]:
+    def initial_shapes_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
         """Initial shapes that follow a centerline whose ends are as far apart as the object's.
 
         `DataError` where it has other ends than the object, or is not as long: part of the object is hidden, or

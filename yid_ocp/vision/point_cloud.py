@@ -68,7 +68,7 @@ class CloudFilterOptions:
         ),
     ] = None
     floor_margin_above_object_foot: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
-    reach_margin: Annotated[
+    object_reach_margin: Annotated[
         PositiveFloat,
         OptionInfo(
             "points further from the object's root than its longest branch reaches, plus this, are left out", "m"
@@ -132,7 +132,7 @@ class ReachableObjectRegion:
             reach[segment.name] = float(sizes[segment.name][0].sum()) + reach[segment.parent_segment or ""]
         radius = max(own for _, own in sizes.values())
         first = next(s for s in system.segment_layouts if s.parent_segment is None)
-        self._radius = np.inf if anywhere else max(reach.values()) + radius + options.reach_margin
+        self._radius = np.inf if anywhere else max(reach.values()) + radius + options.object_reach_margin
         base = tree.joint_index(first.link_joints[0][0])
         q = ca.SX.sym("q", system.n_coordinates)
         kinematics = forward_kinematics(tree, q)

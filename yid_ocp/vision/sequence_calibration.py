@@ -61,7 +61,7 @@ class BackgroundPoints:
         return BackgroundPoints(points, max(self.match_distance, other.match_distance))
 
     @staticmethod
-    def from_static_points(
+    def from_point_clouds(
         clouds: Sequence[Array], voxel: float, noise: float, shapes: Sequence[TubeLinks] | None = None, near: float = 0
     ) -> BackgroundPoints:
         """Background: world points (N, 3) of an empty scene, or points static in most frames and off fitted shapes.
@@ -138,7 +138,7 @@ def group_foreign_clusters(
             text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
         else:
             text += "" if background else "set track.options.background_estimation: frames, or "
-            text += "film the scene without object and robot for track.background_frames"
+            text += "film the scene without object and robot for track.background_frames_path"
             text += f"; or {boxed}" if beside else ""
             text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if poses[0] else ""
         found.append(ForeignObject(centre, size, len(group), moving, link, text))
@@ -184,7 +184,7 @@ class TubeDimensionEstimates:
     model_values: Array  # (2 s,), the model's values [m]
     log_ratio: Array  # (2 s,), logarithm of the value that fits over the model's
     covariance: Array  # (2 s, 2 s), of `log_ratio`
-    is_estimated: tuple[bool, ...]  # which of them the fit uses in place of the model's
+    estimated_dimension_mask: tuple[bool, ...]  # which of them the fit uses in place of the model's
     n_frames: int  # that were asked; 0 where nothing could be said
 
     @property
@@ -193,15 +193,15 @@ class TubeDimensionEstimates:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def is_dimension_determined(self) -> BoolArray:
+    def determined_dimension_mask(self) -> BoolArray:
         """Mask of the dimensions that the frames determine, shape (2 s,) for s tubes."""
         return np.asarray((self.dimension_log_ratio_std < _MAX_KNOWN_LOG_STD) & (self.n_frames > 0))
 
     @property
-    def is_model_value_contradicted(self) -> BoolArray:
+    def contradicted_model_value_mask(self) -> BoolArray:
         """Mask of the model's values that contradict the frames, shape (2 s,) for s tubes."""
         off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
-        return np.asarray(self.is_dimension_determined & off)
+        return np.asarray(self.determined_dimension_mask & off)
 
     @property
     def contradiction_message(self) -> str:
@@ -209,7 +209,7 @@ class TubeDimensionEstimates:
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
             f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
-            for i in np.flatnonzero(self.is_model_value_contradicted & ~np.array(self.is_estimated))
+            for i in np.flatnonzero(self.contradicted_model_value_mask & ~np.array(self.estimated_dimension_mask))
         ]
         return f"the object seems to be other than the model says ({', '.join(wrong)})" if wrong else ""
 
@@ -222,27 +222,27 @@ class TubeDimensionEstimates:
             two = 2 * value * self.dimension_log_ratio_std[i]
             found = f"{value:.4g} mm ± {two:.2g} mm (two standard deviations) fits {self.n_frames} frames"
             said = f"the model says {1e3 * self.model_values[i]:.4g} mm"
-            if self.is_estimated[i]:
+            if self.estimated_dimension_mask[i]:
                 lines.append(f"{name} is estimated: {found}; {said}")
-            elif self.is_model_value_contradicted[i]:
+            elif self.contradicted_model_value_mask[i]:
                 remedy = f"estimate it: track.options.estimated_dimensions: [{name.rpartition('.')[2]}]"
                 lines.append(f"{name} seems to be wrong: {found}, {said}. Measure it again, or {remedy}")
         return tuple(lines)
 
-    def point_std(self, points: Array) -> Array:
+    def point_std_from_dimensions(self, points: Array) -> Array:
         """Stds (np, 3) [m] of points due to wrong or uncertain tube dimensions; `points`: derivatives (np, 3, 2 s).
 
         The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.
         """
-        used = np.array(self.is_estimated)
-        wrong = np.where(self.is_model_value_contradicted & ~used, self.log_ratio, 0.0)
+        used = np.array(self.estimated_dimension_mask)
+        wrong = np.where(self.contradicted_model_value_mask & ~used, self.log_ratio, 0.0)
         chosen = points[..., used]
         spread = np.einsum("ijk,kl,ijl->ij", chosen, self.covariance[np.ix_(used, used)], chosen)
         return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
 
     def parameter_values(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
         """Parameter values with the estimated sizes in place of the model's."""
-        return _changed(system, given, np.where(self.is_estimated, self.log_ratio, 0.0))
+        return _changed(system, given, np.where(self.estimated_dimension_mask, self.log_ratio, 0.0))
 
 
 def estimate_and_check_dimensions(

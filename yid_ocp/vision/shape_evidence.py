@@ -108,14 +108,14 @@ class ShapeFitQuality:
     end_offsets: Array
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
-    def length_weighted_coverage(self, lengths: Array) -> float:
+    def length_weighted_visible_coverage(self, lengths: Array) -> float:
         """Share of the visible length of links, lengths (K,) [m], with points of their own; 0 if none is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ShapePointClassification(ShapeFitQuality):
+class ShapeFitQualityAndPointClasses(ShapeFitQuality):
     """Fit quality of a shape, and which of the frame's points are its own, contested or foreign."""
 
     # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
@@ -156,7 +156,9 @@ class ProcessedFrameCloud:
         return hidden if self.is_filtered_out is None else hidden | self.is_filtered_out(places)
 
 
-def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near: float) -> ShapePointClassification:
+def fit_quality_and_point_classes(
+    tubes: TubeLinks, seen: ProcessedFrameCloud, near: float
+) -> ShapeFitQualityAndPointClasses:
     """Classify a frame's points by a fitted shape and assess its coverage; points beyond `near` [m] are ignored."""
     link, along, normal, distance = tube_link_projections(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
@@ -196,7 +198,7 @@ def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near
     counted = close & ~foreign
     mean = float(np.average(size[counted], weights=seen.point_weights[counted])) if counted.any() else math.inf
     clusters = [seen.points[part == number] for number in range(min(_MAX_THINGS, int(part.max(initial=-1)) + 1))]
-    return ShapePointClassification(
+    return ShapeFitQualityAndPointClasses(
         is_own=own,
         is_contested=contested,
         is_foreign=foreign,
@@ -393,4 +395,6 @@ class FrameShapeFit(ShapeFitQuality):
     @property
     def visible_length_coverage(self) -> float:
         """Fraction of the shape's visible length that has points."""
-        return self.length_weighted_coverage(np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1))
+        return self.length_weighted_visible_coverage(
+            np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
+        )

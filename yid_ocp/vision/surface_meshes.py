@@ -56,20 +56,20 @@ class ExtraMesh:
 
     parent_frame: Annotated[str | None, OptionInfo("link of the robot that carries it; null for the world")] = None
     mesh: Annotated[str | None, OptionInfo("file that trimesh reads, in metres: STL, OBJ, DAE", is_path=True)] = None
-    box: Annotated[
+    box_size: Annotated[
         tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None,
         OptionInfo("in place of a file: edges along x, y, z", "m"),
     ] = None
-    cylinder: Annotated[
+    cylinder_radius_and_length: Annotated[
         tuple[PositiveFloat, PositiveFloat] | None, OptionInfo("the same: radius and length along z", "m")
     ] = None
-    sphere: Annotated[float | None, Gt(0), OptionInfo("the same: radius", "m")] = None
+    sphere_radius: Annotated[float | None, Gt(0), OptionInfo("the same: radius", "m")] = None
     xyz: Annotated[_Triple, OptionInfo("of its middle in the link", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[_Triple, OptionInfo("roll, pitch and yaw in the link", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class CameraScene:
+class ObservedScene:
     """Robot and object that a camera looks at."""
 
     system: System
@@ -151,7 +151,7 @@ class ArticulatedSurfaces:
                 pose[:3, :] = ca.horzcat(kinematics.joint_rotations[joint], kinematics.joint_origins[joint])
         self._poses = ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))])
 
-    def part_poses_at(self, q: ArrayLike) -> Array:
+    def part_poses_at_configuration(self, q: ArrayLike) -> Array:
         """Pose of every part in the world at a configuration, shape (parts, 4, 4)."""
         stacked = np.array(self._poses(np.asarray(q, float)))
         return np.asarray(stacked.reshape(4, len(self.part_joints), 4).transpose(1, 0, 2))
@@ -170,7 +170,7 @@ class ArticulatedSurfaces:
     ) -> BoolArray:
         """Whether world points (N, 3) are within `reach` [m] of any, or any moving, surface at a configuration."""
         result = np.zeros(len(points), bool)
-        for part, pose in enumerate(self.part_poses_at(q)):
+        for part, pose in enumerate(self.part_poses_at_configuration(q)):
             asked = np.flatnonzero(~result)
             near, local = self._near(points[asked], part, pose, reach)
             if len(near) and not (moving_only and self.part_joints[part] < 0):
@@ -178,11 +178,11 @@ class ArticulatedSurfaces:
                 result[asked[near]] = distance.astype(np.float64) <= reach
         return result
 
-    def moving_surface_distance(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
+    def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
         """Distance [m] to the nearest moving surface, normal towards the point, part; inf, 0, -1 beyond `within`."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
-        for part, pose in enumerate(self.part_poses_at(q)):
+        for part, pose in enumerate(self.part_poses_at_configuration(q)):
             near, local = self._near(points, part, pose, within)
             if self.part_joints[part] < 0 or not len(near):
                 continue
@@ -200,7 +200,7 @@ class ArticulatedSurfaces:
             normal[chosen] = unit[better] @ pose[:3, :3].T
         return distance, normal, owner
 
-    def render_depth_image(
+    def render_depth_incidence_and_part(
         self, pinhole: CameraIntrinsics, pose: ArrayLike, q: ArrayLike
     ) -> tuple[Array, Array, IntArray]:
         """Noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
@@ -210,7 +210,7 @@ class ArticulatedSurfaces:
         rays, camera = pinhole.pixel_rays_at_unit_depth, np.asarray(pose, float)
         size = rays.shape[:2]
         depth, cosine, owner = np.full(size, np.inf), np.zeros(size), np.full(size, -1)
-        for part, placed in enumerate(self.part_poses_at(q)):
+        for part, placed in enumerate(self.part_poses_at_configuration(q)):
             rotation = placed[:3, :3].T @ camera[:3, :3]
             origin = placed[:3, :3].T @ (camera[:3, 3] - placed[:3, 3])
             window = self._window(pinhole, rotation, origin, part)
@@ -232,7 +232,7 @@ class ArticulatedSurfaces:
         """
         distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
         owner = np.full(len(directions), -1)
-        for part, pose in enumerate(self.part_poses_at(q)):
+        for part, pose in enumerate(self.part_poses_at_configuration(q)):
             hit, normals = self._cast(part, (origin - pose[:3, 3]) @ pose[:3, :3], directions @ pose[:3, :3])
             nearer = hit < distance
             distance[nearer], owner[nearer] = hit[nearer], part
@@ -266,7 +266,9 @@ def _tensor(values: NDArray[Any]) -> Any:
     return import_open3d().core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual") -> dict[int, TriangleMesh]:
+def load_robot_meshes_by_joint(
+    urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual"
+) -> dict[int, TriangleMesh]:
     """Meshes of a robot's links by the joint that carries them (-1: immobile), in that joint's frame.
 
     The numeric mechanism was read from the URDF file, or `package:baxter`, alone or joined with others. `ModelError`
@@ -323,11 +325,19 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
         where = f"model: extra_meshes: {number}"
-        given = [kind for kind in ("mesh", "box", "cylinder", "sphere") if getattr(entry, kind) is not None]
+        given = [
+            kind
+            for kind in ("mesh", "box_size", "cylinder_radius_and_length", "sphere_radius")
+            if getattr(entry, kind) is not None
+        ]
         if len(given) != 1:
             found = " and ".join(given) or "no shape"
-            raise ConfigError(f"there is {found}", where=where, allowed="one of mesh, box, cylinder, sphere")
-        mesh = _solid(entry.box, entry.cylinder, entry.sphere)
+            raise ConfigError(
+                f"there is {found}",
+                where=where,
+                allowed="one of mesh, box_size, cylinder_radius_and_length, sphere_radius",
+            )
+        mesh = _solid(entry.box_size, entry.cylinder_radius_and_length, entry.sphere_radius)
         if entry.mesh is not None:
             if not is_file(Path(entry.mesh)):
                 hint = "give a file that trimesh reads: STL, OBJ, DAE"
@@ -470,7 +480,7 @@ class DepthSensorModel:
 
 
 @dataclass(frozen=True)
-class FrameTiming:
+class CameraTimingModel:
     """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
 
     mean_rate: float = 3.0  # [Hz]
@@ -499,16 +509,18 @@ class VirtualFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class VirtualCamera:
+class VirtualCameraSetup:
     """Virtual depth camera: sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # an Asus Xtion Pro Live where absent
-    timing: FrameTiming = field(default_factory=FrameTiming)
+    timing: CameraTimingModel = field(default_factory=CameraTimingModel)
     seed: int = 0  # of all that is drawn at random
 
 
-def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
+def render_virtual_frames(
+    scene: ObservedScene, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
+) -> VirtualFrames:
     """Frames that a virtual camera takes of a motion; each is rendered on loading, the same every time.
 
     Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
@@ -522,13 +534,13 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     configuration = np.asarray(course(taken))
     tree = scene.system.numeric_mechanism(scene.parameter_values)
     meshes = tube_meshes_by_joint(scene.system, scene.parameter_values)
-    robot = load_robot_meshes(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
+    robot = load_robot_meshes_by_joint(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
     around = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in _FLOOR_AND_WALL]
     still = [*(around if robot else []), *([robot.pop(-1)] if -1 in robot else [])]
     surfaces = ArticulatedSurfaces(tree, meshes | robot | ({-1: TriangleMesh.concatenate(still)} if still else {}))
 
     def cloud(index: int) -> Array:
-        depth, cosine, _ = surfaces.render_depth_image(lens, pose, configuration[index])
+        depth, cosine, _ = surfaces.render_depth_incidence_and_part(lens, pose, configuration[index])
         rng = np.random.default_rng([camera.seed, index])
         return lens.points_from_depth(camera.sensor_model._simulate_depth_image(depth, cosine, rng))
 

@@ -24,7 +24,7 @@ from yid_ocp.vision.calibration import (
     CameraCalibration,
     calibrate_camera,
     calibration_without_estimation,
-    is_stamp_delay_significant,
+    is_frame_stamp_delay_significant,
     stamp_delay_beyond_clock_offset,
 )
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
@@ -40,7 +40,7 @@ from yid_ocp.vision.sequence_calibration import (
     TubeDimensionEstimates,
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, CameraScene, TriangleMesh
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, ObservedScene, TriangleMesh
 from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
 
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
@@ -54,7 +54,7 @@ _GRASP_MARGIN = 0.06  # about a grasp, beyond the tube's radius, a point may be 
 
 
 def track_object(
-    scene: CameraScene,
+    scene: ObservedScene,
     recording: Recording | None,
     sequence: FrameSequence,
     options: TrackOptions | None = None,
@@ -75,9 +75,9 @@ def track_object(
         A point that the system does not have; meshes that cannot be read.
     """
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
-    common = tracker.calibrate_sequence()
+    common = tracker.estimate_sequence_calibration()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
-    return tracker.to_track_result(*tracker.assign_root_and_drop_outliers(frames), common)
+    return tracker.track_result_from_frames(*tracker.select_root_end_and_frames(frames), common)
 
 
 @dataclass(eq=False)
@@ -108,7 +108,7 @@ class FrameTracker:
 
     def __init__(
         self,
-        scene: CameraScene,
+        scene: ObservedScene,
         recording: Recording | None,
         sequence: FrameSequence,
         options: TrackOptions,
@@ -134,7 +134,7 @@ class FrameTracker:
         tree = system.numeric_mechanism(values)
         meshes = surface_meshes.extra_meshes_by_joint(scene.extra_meshes, tree)
         if scene.robot_urdf is not None:
-            robot = surface_meshes.load_robot_meshes(scene.robot_urdf, tree, options.robot_mesh_kind)
+            robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in robot):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.robot_urdf))
             meshes |= {joint: [mesh, *meshes.get(joint, ())] for joint, mesh in robot.items()}
@@ -143,7 +143,7 @@ class FrameTracker:
         self.arm_surface: ArmSurface | None = None
         self._widest = float(self.shape_fitter.link_radii.max())
         if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
-            held = self.shape_fitter.gripper_positions_at, self._widest + _GRASP_MARGIN
+            held = self.shape_fitter.gripper_positions_at_configuration, self._widest + _GRASP_MARGIN
             self.arm_surface = ArmSurface(self.robot_surfaces, self._configuration_at_rest, *held)
         self.frame_order, self._reasons = _by_stamp(sequence.stamps)
         usable = [i for i in self.frame_order if i not in self._reasons]
@@ -163,7 +163,7 @@ class FrameTracker:
             q[index] = self.joint_angles_at(t)
         return q
 
-    def calibrate_sequence(self) -> SequenceCalibration:
+    def estimate_sequence_calibration(self) -> SequenceCalibration:
         """Calibration shared by the sequence, estimated from some of its frames."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
@@ -173,7 +173,7 @@ class FrameTracker:
             else (self._finite(self.empty_scene, i)[0] for i in range(len(self.empty_scene)))
         )
         clouds = [calibration.camera_state.measured_to_world_points(points) for points in seen]
-        background = BackgroundPoints.from_static_points(clouds, filters.voxel_size, noise)
+        background = BackgroundPoints.from_point_clouds(clouds, filters.voxel_size, noise)
         looks = [look for i in self._asked if (look := self._look(i, calibration, background)[1]) is not None]
         last: list[tuple[ShapeFitter, FrameShapeFit]] = []
 
@@ -186,16 +186,16 @@ class FrameTracker:
 
         shared = 0.0
         if looks:
-            places = self.shape_fitter.points_at(looks[0].q)
+            places = self.shape_fitter.points_at_configuration(looks[0].q)
             shared = float(calibration.point_std_from_calibration(places, 0 * places, np.zeros(len(places))).max())
         of = self.system, self.parameter_values, self.options.estimated_dimensions
         sizes = sequence_calibration.estimate_and_check_dimensions(*of, (noise, shared), fitted)
         if self.options.background_estimation == "frames":
             good = (pair for pair in last if not frame_selection.frame_rejection_reason(pair[1], pair[0], self.options))
-            shapes = [shape.tube_links_at(fit.q) for shape, fit in good]
+            shapes = [shape.tube_links_at_configuration(fit.q) for shape, fit in good]
             clouds = [look.sights[0].points for look in looks]
             near = self.shape_fitter.max_informative_surface_distance
-            found = BackgroundPoints.from_static_points(clouds, 2 * filters.voxel_size, noise, shapes, near)
+            found = BackgroundPoints.from_point_clouds(clouds, 2 * filters.voxel_size, noise, shapes, near)
             background = found.merged_with(background)
         return SequenceCalibration(calibration, sizes, background)
 
@@ -229,7 +229,11 @@ class FrameTracker:
 
     def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
         """The object with the sizes that were estimated."""
-        key = tuple(np.where(sizes.is_estimated, sizes.log_ratio, 0.0).tolist()) if any(sizes.is_estimated) else ()
+        key = (
+            tuple(np.where(sizes.estimated_dimension_mask, sizes.log_ratio, 0.0).tolist())
+            if any(sizes.estimated_dimension_mask)
+            else ()
+        )
         if key not in self._shapes:
             self._shapes[key] = self._shape_of(sizes.parameter_values(self.system, self.parameter_values))
         return self._shapes[key]
@@ -315,24 +319,26 @@ class FrameTracker:
         filtered = None if work.filtered is None else work.filtered.points
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
-    def initial_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
+    def unprocessed_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Report of a frame before processing, with the reason if it is dropped."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def assign_root_and_drop_outliers(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+    def select_root_end_and_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Frames with outlying ones dropped, and how the root end was chosen."""
         rooted, note = frame_selection.with_consistent_root_end(frames, self.options)
-        return frame_selection.drop_outlying_frames(rooted, self.options), note
+        return frame_selection.mark_outlying_frames(rooted, self.options), note
 
-    def to_track_result(self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration) -> TrackResult:
+    def track_result_from_frames(
+        self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration
+    ) -> TrackResult:
         """Tracking result of the frames; `DataError` if none is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
         of = common, things, self.options, self.sequence.source
         measured = frame_selection.tracked_states_and_points(frames, columns, *of)
-        place = self._shape(common.dimensions).points_at
+        place = self._shape(common.dimensions).points_at_configuration
         return TrackResult(
             self.point_names,
             *measured,
@@ -359,7 +365,7 @@ class FrameTracker:
         """Poses of what moves with the robot at a time, by the names of the links."""
         if self.robot_surfaces is None:
             return {}
-        poses = self.robot_surfaces.part_poses_at(self._configuration_at_rest(t))
+        poses = self.robot_surfaces.part_poses_at_configuration(self._configuration_at_rest(t))
         tree, found = self.system.mechanism, {}
         for joint, pose in zip(self.robot_surfaces.part_joints, poses, strict=True):
             if joint >= 0:  # a frame beside the joint's moving side has its link's name, as far as the model has it
@@ -371,7 +377,7 @@ class FrameTracker:
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
         """What a frame shows of the object, None with the reason in its report."""
-        work = _Work(self.initial_frame_report(index, calibration, self._reasons.get(index, "")))
+        work = _Work(self.unprocessed_frame_report(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:
@@ -392,7 +398,7 @@ class FrameTracker:
             own = stamp_delay_beyond_clock_offset(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
-                if is_stamp_delay_significant(own, options.clock):
+                if is_frame_stamp_delay_significant(own, options.clock):
                     raise DataError(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
@@ -439,7 +445,7 @@ class FrameTracker:
         work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):
             raise DataError("the object crosses or touches itself: its cloud closes a loop")
-        found = starts.find_initial_shapes(course)
+        found = starts.initial_shapes_along_centerline(course)
         if options.approximate_root_position is not None:
             place = np.array(options.approximate_root_position)
             near = min(found, key=lambda start: float(np.linalg.norm(start.root_position - place))).root_position

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.recording import PointGroup, Recording, validate_recording
+from yid_ocp.data.recording import PointGroup, Recording, validated_recording
 from yid_ocp.files import atomic_write, make_folder
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import CloudSkeleton
@@ -107,7 +107,7 @@ class TrackResult:
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
-        """A recording (None: an empty one) with these points as `points_camera`; errors as `validate_recording`."""
+        """A recording (None: an empty one) with these points as `points_camera`; errors as `validated_recording`."""
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
         count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
@@ -116,7 +116,7 @@ class TrackResult:
         # the positions of a straight object belong to the group that a file lists first
         if not others or others[0] is not recording.points[0] or others[0].name > _CAMERA_POINT_GROUP:
             made = replace(made, marker_reference_pose=None)
-        return validate_recording(made)
+        return validated_recording(made)
 
 
 _MAX_DRAWN_POINTS = 12000  # points in one picture: more hide each other
@@ -195,7 +195,7 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
         figure.savefig(temporary, format="png", dpi=110)
 
 
-def draw_tracked_points(track: TrackResult, file: str | os.PathLike[str]) -> None:
+def write_tracked_points_plot(track: TrackResult, file: str | os.PathLike[str]) -> None:
     """Write a picture of the points over time, two standard deviations and the spline; errors as `atomic_write`."""
     from matplotlib.figure import Figure
 

@@ -25,7 +25,7 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, run_command_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_folder import local_time_text
 from yid_ocp.workflow.run_history import estimate_history_to_dict, read_estimates, require_same_model
@@ -49,7 +49,7 @@ class _BatchRun:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command `batch` and return its exit code."""
     members = batch_runs_from_configs(arguments.configs, arguments.recordings, arguments.overrides)
-    workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG
+    workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
     words = ["yid-ocp", "batch", *map(str, arguments.configs)]
     words += ["--recordings", arguments.recordings] if arguments.recordings else []
@@ -103,7 +103,7 @@ def run_batch(
     workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
-) -> CommandResultAndOutput[None]:
+) -> CommandOutcome[None]:
     """Run `solve` or `diagnose` for every run of `batch_runs_from_configs`; finished runs in the folder are reused.
 
     Successful where all runs were; those that failed say why. The folder `out` then holds `runs/NAME/` (a run folder
@@ -149,7 +149,7 @@ def run_batch(
     progress.begin_stage("writing the report")
     about = f"{len(entries)} runs of {command} side by side."
     write_report(folder / "report.html", ReportData(folder.name, about, written))
-    return CommandResultAndOutput(folder, written, None, all(entry["ok"] for entry in entries))
+    return CommandOutcome(folder, written, None, all(entry["ok"] for entry in entries))
 
 
 def _run_batch_task(

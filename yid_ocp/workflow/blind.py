@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.config.reader import DEFAULT_CONFIG_FILE, DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
+from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
-from yid_ocp.diagnosis.diagnosis_result import decision_statistics_to_dict
+from yid_ocp.diagnosis.diagnosis_result import diagnosis_decision_statistics
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
@@ -38,7 +38,7 @@ from yid_ocp.virtual.experiment import ArmSensorNoise
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, run_command_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import local_time_text
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
@@ -52,12 +52,13 @@ log = logging.getLogger(__name__)
 def run(arguments: argparse.Namespace) -> int:
     """Run the command `blind` and return its exit code."""
     runs = [
-        load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE) for path in arguments.configs or [None]
+        load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
+        for path in arguments.configs or [None]
     ]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
-        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG_FILE))
-    workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG
-    purpose = blind.ENSEMBLE_PURPOSES[int(arguments.calibration)]
+        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG_FILE_NAME))
+    workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
+    purpose = blind.ALLOWED_ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
     asked = (runs, out, arguments.cases, arguments.seed)
     return run_command_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose))
@@ -70,8 +71,8 @@ def run_blind(
     seed: int = 1,
     progress: Progress = NULL_PROGRESS,
     workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
-    purpose: str = blind.ENSEMBLE_PURPOSES[0],
-) -> CommandResultAndOutput[None]:
+    purpose: str = blind.ALLOWED_ENSEMBLE_PURPOSES[0],
+) -> CommandOutcome[None]:
     """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
 
     Models, postures and sensors are those of the runs' first recordings, varied (`EXPERIMENT_VARIATIONS`) as far as
@@ -110,7 +111,13 @@ def run_blind(
         blind_scores.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in zip(labels, answers, strict=True)
     ]
-    flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == blind.ENSEMBLE_PURPOSES[1] else [])]
+    flags = [
+        "--cases",
+        count,
+        "--seed",
+        seed,
+        *(["--calibration"] if purpose == blind.ALLOWED_ENSEMBLE_PURPOSES[1] else []),
+    ]
     result = blind_scores.detection_and_false_alarm_rates(marks) | {
         "seed": seed,
         "purpose": purpose,
@@ -122,7 +129,7 @@ def run_blind(
         "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
         "variations": {name: varied.description for name, varied in EXPERIMENT_VARIATIONS.items()},
     }
-    if purpose == blind.ENSEMBLE_PURPOSES[1]:
+    if purpose == blind.ALLOWED_ENSEMBLE_PURPOSES[1]:
         found = blind_scores.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
@@ -135,7 +142,7 @@ def run_blind(
         progress.begin_stage("writing the report")
         said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
         write_report(folder / "report.html", ReportData(folder.name, said, written))
-    return CommandResultAndOutput(folder, written, None)
+    return CommandOutcome(folder, written, None)
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------
@@ -188,7 +195,7 @@ class _Proof:
         for name, text in configs.items():
             write_text(self.config_file(name), text)
         files = {name: self.config_file(name) for name in configs}
-        experiments, chains = blind_experiments_by_name(files, self.seed, self.purpose)
+        experiments, chains = blind_experiments_and_divisible_names(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
         plan = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
@@ -278,11 +285,11 @@ def diagnose_case_from_recordings_task(
     except YidError as error:
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
-    if experiment["purpose"] == blind.ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
+    if experiment["purpose"] == blind.ALLOWED_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
         wide = blind_scores.permissive_thresholds(run.diagnosis)
         try:
             anything = blind.diagnose_blind_case(ensemble, case, candidates, wide)
-            found["open"] = to_json_types(decision_statistics_to_dict(anything))
+            found["open"] = to_json_types(diagnosis_decision_statistics(anything))
         except YidError as error:
             found["open"] = {"message": str(error)}
     return found
@@ -362,13 +369,13 @@ class BlindExperiment:
         """Settings of the model that simulates the recordings."""
         return load_config(self.config_file, EXPERIMENT_VARIATIONS[self.variation].simulation_overrides())
 
-    def _recording_conditions(self) -> blind.SyntheticRecordingConditions:
+    def _recording_conditions(self) -> blind.SyntheticMeasurementConditions:
         varied = EXPERIMENT_VARIATIONS[self.variation]
         noise = ArmSensorNoise()
         if varied.has_torque_noise:
             noise = ArmSensorNoise(effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)
         simulation = SimulationOptions(time_step=DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor)
-        return blind.SyntheticRecordingConditions(varied.n_recordings, noise, simulation, purpose=self.purpose)
+        return blind.SyntheticMeasurementConditions(varied.n_recordings, noise, simulation, purpose=self.purpose)
 
     def _write_first_recording(self, file: Path) -> None:
         """Write the first recording, which fixes initial configuration and sensors."""
@@ -383,7 +390,7 @@ class BlindExperiment:
         conditions = replace(self._recording_conditions(), has_camera=vision)
         posture = blind.first_recorded_driven_joint_positions(system, first[0])
         for attempt in range(blind.MAX_CASE_DRAWS):
-            rng = np.random.default_rng([self.seed, blind.ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
+            rng = np.random.default_rng([self.seed, blind.ALLOWED_ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:
                 made = blind.simulate_random_motion(system, system, posture, values, values, (), rng, conditions)
             except ModelError:
@@ -428,7 +435,7 @@ def _require_compatible(run: RunSettings) -> None:
         raise run.config_error("a blind proof moves driven arms", "model", "arms", "mode", allowed=allowed)
 
 
-def blind_experiments_by_name(
+def blind_experiments_and_divisible_names(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, BlindExperiment], frozenset[str]]:
     """Virtual experiments by name, and the names of those whose object's links can be divided further.

@@ -17,7 +17,7 @@ from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.effects.friction import FRICTION_LAW_EFFECT_KINDS
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
@@ -26,7 +26,7 @@ from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.workflow import run_inputs
@@ -160,7 +160,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 
 
 def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
-    for key in ("robot", "grasp", "springs", "clamps", "frames"):
+    for key in ("robot", "grasp", "springs", "moving_clamps", "frames"):
         if getattr(run.model, key):
             what = f"a {kind} takes no {key}: its clamps hold it"
             raise run.config_error(what, "model", key, hint=f"remove {key}")
@@ -177,7 +177,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
     for joint in friction_joints(run, system):
         assert run.model.friction is not None
-        kinds = FRICTION_LAW_EFFECT_KINDS[run.model.friction.law]
+        kinds = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law]
         system = system.with_effects([make_effect(k, joint, system) for k in kinds if f"{k}@{joint}" not in named])
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
@@ -241,7 +241,9 @@ def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[s
     wanted = run.model.friction.joints
     arms = {name.rpartition(".")[0] for name in parameters.names if name.endswith(".damping")}
     joints = arms if wanted is None else arms & set(wanted)
-    starts = tuple(f"{kind}@{joint}." for kind in FRICTION_LAW_EFFECT_KINDS[run.model.friction.law] for joint in joints)
+    starts = tuple(
+        f"{kind}@{joint}." for kind in EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law] for joint in joints
+    )
     dampings = {f"{joint}.damping" for joint in joints}
     return [name for name in parameters.names if name in dampings or name.startswith(starts)]
 
@@ -309,22 +311,26 @@ def system_with_second_arm_holding_object(run: RunSettings, system: System) -> S
 def _clamp_mechanism(run: RunSettings) -> Mechanism | None:
     model, arms = run.model, run.model.arms
     if model.robot is not None:
-        if model.clamps:
-            hint = "remove model.clamps, or set model.robot: null; a robot holds by model.grasp or by the mount"
+        if model.moving_clamps:
+            hint = "remove model.moving_clamps, or set model.robot: null; a robot holds by model.grasp or by the mount"
             what = "clamps hold an object without a robot, and the model has one"
-            raise run.config_error(what, "model", "clamps", hint=hint)
+            raise run.config_error(what, "model", "moving_clamps", hint=hint)
         return None
     for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
         if given:
-            hint = "set model.robot to its URDF file, or remove model.arms; the world or model.clamps hold an object"
+            hint = "set model.robot to its URDF file, or remove model.arms; the world or moving_clamps hold an object"
             what = "the settings name joints, but the model has no robot"
             raise run.config_error(what, "model", "arms", key, hint=hint)
     found: Mechanism | None = None
-    for name, clamp in model.clamps.items():
-        if clamp.origin_point == clamp.z_axis_point:
+    for name, clamp in model.moving_clamps.items():
+        if clamp.origin_point_name == clamp.z_axis_point_name:
             what = f"clamp '{name}' has one point for both ends"
-            raise run.config_error(what, "model", "clamps", name, allowed="two different points")
-        found = floating_clamp(name) if found is None else found.with_attached_mechanism(floating_clamp(name))
+            raise run.config_error(what, "model", "moving_clamps", name, allowed="two different points")
+        found = (
+            floating_joint_mechanism(name)
+            if found is None
+            else found.with_attached_mechanism(floating_joint_mechanism(name))
+        )
     return found
 
 

@@ -22,7 +22,7 @@ from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, unknown_name_details
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step
 from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
@@ -58,9 +58,11 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     """
     parameters = system.parameters
     chosen = build.settings_by_parameter_name(run, parameters)
-    for name in run.problem.start_fit_parameters:
+    for name in run.problem.initial_state_fit_parameters:
         if name not in parameters:
-            raise unknown_name_error(run, "parameter", name, parameters.names, "problem", "start_fit_parameters")
+            raise unknown_name_error(
+                run, "parameter", name, parameters.names, "problem", "initial_state_fit_parameters"
+            )
     sensors = dict(run.sensors)
     groups = [group for recording in recordings for group in recording.points]
     if build.arms_are_estimated_states(run):
@@ -75,11 +77,11 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
     clamps = tuple(
-        ClampPoseDefinition(name, s.origin_point, s.z_axis_point, s.roll_convention)
-        for name, s in run.model.clamps.items()
+        ClampPoseDefinition(name, s.origin_point_name, s.z_axis_point_name, s.roll_convention)
+        for name, s in run.model.moving_clamps.items()
     )
     if cable is not None and isinstance(run.model.object, ClampedObject):
-        clamps = cable.clamp_pose_definitions
+        clamps = cable.clamp_poses_from_points
         for name in {group.name for group in groups}:
             said = sensors.get(name, SensorOptions())
             sensors[name] = said if said.points is not None else replace(said, points=cable.free_vertex_names)
@@ -90,7 +92,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     return replace(
         run.problem,
         sensors=sensors,
-        clamp_pose_definitions=clamps,
+        clamp_poses_from_points=clamps,
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
@@ -135,7 +137,7 @@ def build_problem(
     return problem
 
 
-def initial_closure_error_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+def min_initial_closure_error_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
     """Least possible distance [m] between each grasp's two frames at a recording's first arm angles, by name."""
     system = problem.system
     if not system.grasps:
@@ -153,7 +155,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
         hint = f"first look at what is in doubt: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in initial_closure_error_by_grasp(problem, episode).items():
+        for name, gap in min_initial_closure_error_by_grasp(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
                 where, allowed = run.describe_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
@@ -164,7 +166,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
     known = {key for recording in recordings for key in recording.sensor_setting_keys}
     for name, said in run.sensors.items():
         if name not in known:
-            what, details = f"no recording has a group '{name}'", unknown_name_details(name, sorted(known))
+            what, details = f"no recording has a group '{name}'", unknown_name_error_arguments(name, sorted(known))
             raise run.config_error(what, "sensors", name, **details)
         if said.effort_sampling_kind is not None and name != JOINT_EFFORT_GROUP_NAME:
             hint = f"say it of {JOINT_EFFORT_GROUP_NAME}, or leave it out"
@@ -173,7 +175,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
         constants = next((c.constants for c in channel_kinds_for_group_name(group) if c.quantity == quantity), {})
         for constant in said.constants:
             if constant not in constants:
-                details = unknown_name_details(constant, constants)
+                details = unknown_name_error_arguments(constant, constants)
                 what = f"'{name}' has no constant '{constant}'"
                 raise run.config_error(what, "sensors", name, "constants", **details)
 
@@ -214,7 +216,7 @@ def _check_recordings(
     return *kept, tuple(doubts)
 
 
-def single_recording_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
+def all_recording_quality_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
     """All data quality issues of one uncut recording; errors as `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
@@ -309,14 +311,14 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
     lengths = ca.vertcat(ca.SX(0), *(length for segment in system.segment_layouts for length in segment.link_lengths))
     size = float(ca.Function("size", [system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))
     wanted = any(samples.sensor.point_names for episode in problem.episodes for samples in episode.measurements)
-    if not size or not wanted or problem.options.clamp_pose_definitions:
+    if not size or not wanted or problem.options.clamp_poses_from_points:
         return []
     found: list[Issue] = []
     for i, episode in enumerate(problem.episodes):
-        own = problem.theta_and_initial_state_offset(problem.initial_unknowns, i)
+        own = problem.theta_and_initial_state_deviation(problem.initial_unknowns, i)
         result = problem.predictor.predict_episode(episode, *own, False, None)
         if isinstance(result, EpisodePrediction):
-            found += point_checks.check_object_points_by_rollout(episode, result, size)
+            found += point_checks.check_object_points_against_rollout(episode, result, size)
     return found
 
 

@@ -24,12 +24,12 @@ from yid_ocp.report.animation import Animation, animation_of_trajectories, recor
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
-from yid_ocp.workflow.build_problem import build_problem, initial_closure_error_by_grasp, issues_to_plain_data
-from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_initial_closure_error_by_grasp
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
-from yid_ocp.workflow.solve import discretisation_shift_results, measure_discretisation_shifts
+from yid_ocp.workflow.solve import discretisation_shifts_to_dict, measure_discretisation_shifts
 
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
 _N_MODES = 3
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 
-def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
+def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     with atomic_run_folder(run, out, "check") as folder:
         folder.record_run_start(run, "check")
         warnings: list[str] = []
@@ -77,7 +77,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    return CommandResultAndOutput(folder.path, written, None, not (run.recordings.strict and warnings))
+    return CommandOutcome(folder.path, written, None, not (run.recordings.strict and warnings))
 
 
 def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -139,7 +139,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
-    entry["grasp_gaps"] = initial_closure_error_by_grasp(problem, episode)
+    entry["grasp_gaps"] = min_initial_closure_error_by_grasp(problem, episode)
     return entry
 
 
@@ -171,7 +171,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
     """What the initial parameters make of every recording that is estimated on, or what was recorded alone."""
     scenes = []
     for i, episode in enumerate(problem.episodes):
-        shared = problem.theta_and_initial_state_offset(problem.initial_unknowns, i)[0]
+        shared = problem.theta_and_initial_state_deviation(problem.initial_unknowns, i)[0]
         if first.ok:
             prediction = first.episode_predictions[i]
             told = predicted_configuration_trajectory("with the initial values", problem, episode, prediction, shared)
@@ -200,7 +200,7 @@ def _moves(
     # how poorly initial values fit says nothing of how sure the data will be of what fits
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
-    return discretisation_shift_results(shifts, {name: std[name].std for name in shifts})
+    return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -231,7 +231,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)
     rows: list[dict[str, Any]] = []
-    count = None if run.model.object is None else run.model.object.links_per_segment_or_total
+    count = None if run.model.object is None else run.model.object.n_links_per_segment_or_total
     if count is not None:
         other = build_system(run, link_division=2)
         known = zip(system.parameters.names, theta, strict=True)

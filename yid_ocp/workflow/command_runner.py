@@ -20,7 +20,7 @@ from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report import diagnosis_summaries, summaries  # noqa: F401, they register
-from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, aligned_table_lines, summary_terminal_lines
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, aligned_table_lines, summary_terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress
@@ -33,7 +33,7 @@ _CommandOutput = TypeVar("_CommandOutput")
 
 
 @dataclass(frozen=True)
-class CommandResultAndOutput(Generic[_CommandOutput]):
+class CommandOutcome(Generic[_CommandOutput]):
     """Run folder of a command, contents of its result.json, what it computed, and whether it reached its goal."""
 
     folder: Path
@@ -42,9 +42,7 @@ class CommandResultAndOutput(Generic[_CommandOutput]):
     is_successful: bool = True
 
 
-def command_with_settings(
-    work: Callable[..., CommandResultAndOutput[Any]], *names: str
-) -> Callable[[argparse.Namespace], int]:
+def command_with_settings(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
     """Return a command that calls `work(settings, out, progress, ...)`, where `...` are the arguments `names`."""
 
     def run(arguments: argparse.Namespace) -> int:
@@ -55,15 +53,13 @@ def command_with_settings(
     return run
 
 
-def run_command_and_print(
-    arguments: argparse.Namespace, work: Callable[[Progress], CommandResultAndOutput[Any]]
-) -> int:
+def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progress], CommandOutcome[Any]]) -> int:
     """Run a command's function, print the summary of its result and its run folder, and return its exit code."""
     with stderr_progress_display(arguments) as progress:
         outcome = work(progress)
     path, near, result = str(outcome.folder), os.path.relpath(outcome.folder), outcome.result
     place = path if near.startswith("..") else f"run folder: {near}"
-    summary = SUMMARY_BY_FORMAT[result["format"]]
+    summary = SUMMARY_BY_RESULT_FORMAT[result["format"]]
     print_result(arguments, result, lambda: summary_terminal_lines(summary(result)), place, path)
     return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
@@ -85,12 +81,12 @@ def print_result(
         print("\n".join([*texts(), place]))
 
 
-def workers_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:
+def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:
     """Available workers from `--workers` or `--scheduler`, None where neither is given; errors as `WorkerConfig`."""
     if arguments.workers is None and not arguments.scheduler:
         return None
     workers = WorkerConfig(arguments.workers, arguments.scheduler)
-    workers.check_available()
+    workers.check_scheduler_available()
     return workers
 
 

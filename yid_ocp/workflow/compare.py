@@ -13,19 +13,19 @@ from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_method_convergence
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.solve import solution_and_fit_issues, solve_result
+from yid_ocp.workflow.solve import checked_solution_and_issues, solution_to_result_dict
 
 
-def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
+def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Run every method, compare, and write the run folder; successful where any method converged."""
-    solvers, experiment = list(run.compare.methods.values()), run.compare.reference_paper_experiment
+    solvers, experiment = list(run.compare.methods.values()), run.compare.reference_paper_experiment_name
     if not solvers:
         raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
     if experiment is not None and experiment not in PAPER_ESTIMATES:
         what = f"the paper has no experiment '{experiment}'"
-        raise run.config_error(what, "compare", "reference_paper_experiment", allowed=", ".join(PAPER_ESTIMATES))
+        raise run.config_error(what, "compare", "reference_paper_experiment_name", allowed=", ".join(PAPER_ESTIMATES))
     with atomic_run_folder(run, out, "compare") as folder:
         folder.record_run_start(run, "compare")
         progress.begin_stage("building the model and its compiled step")
@@ -46,7 +46,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
         draw_method_convergence(folder.path / "convergence.png", comparison)
         own = comparison.verdict_solution.problem or problem
         held_out = tuple(comparison.verdict_held_out_predictions)
-        judged, doubts = solution_and_fit_issues(own, comparison.verdict_solution, held_out)
+        judged, doubts = checked_solution_and_issues(own, comparison.verdict_solution, held_out)
         comparison = replace(comparison, verdict_solution=judged)
         explained = explain_paper_estimates(experiment, judged.parameters, truth) if experiment else ()
         about = {
@@ -54,12 +54,12 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             "published": PAPER_ESTIMATES[experiment] if experiment else {},
             "published_explained": list(explained),
             "truth": truth,
-            "judged": solve_result(own, judged, held_out),
+            "judged": solution_to_result_dict(own, judged, held_out),
         }
         known = {"problem": own, "solution": judged, "held_out": held_out, "section_data": {"comparison": comparison}}
         written = folder.write_result_and_report(run, progress, _compare_result(problem, comparison) | about, **known)
     done = any(run.solution.status == Status.CONVERGED for run in comparison.method_results)
-    return CommandResultAndOutput(folder.path, written, None, done)
+    return CommandOutcome(folder.path, written, None, done)
 
 
 def _compare_result(problem: EstimationProblem, comparison: MethodComparison) -> dict[str, Any]:
@@ -67,7 +67,7 @@ def _compare_result(problem: EstimationProblem, comparison: MethodComparison) ->
     for run in comparison.method_results:
         own = {key: getattr(run, key) for key in ("whitened_cost", "wall_seconds", "cpu_seconds", "peak_memory_mib")}
         own["disagreements"] = comparison.disagreements[run.method]
-        methods[run.method] = solve_result(problem, run.solution, run.held_out_predictions) | own
+        methods[run.method] = solution_to_result_dict(problem, run.solution, run.held_out_predictions) | own
     return {
         "format": "yid-compare/1",
         "methods": methods,

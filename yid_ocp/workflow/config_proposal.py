@@ -20,7 +20,7 @@ from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.sensors.base import ChannelKind, channel_kinds_for_group_name
+from yid_ocp.sensors.base import ChannelSpecification, channel_kinds_for_group_name
 from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
@@ -203,7 +203,7 @@ def _motor_and_gain(robot: str, mode: str, recordings: Sequence[Recording]) -> t
 
 def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
     for j in range(len(tree.joints)):
-        if j not in tree.parent_indices:
+        if j not in tree.parent_joint_indices:
             own = [name for name, frame in tree.frames.items() if frame.joint_index == j]
             joints = tuple(tree.joint_names[i] for i in tree.ancestor_joint_indices(j))
             yield _ArmChain(joints, tuple(sorted(own, key=_tool_rank)))
@@ -380,7 +380,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     return found
 
 
-def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, ChannelKind]]:
+def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, ChannelSpecification]]:
     for group in recording.channel_groups:
         for kind in channel_kinds_for_group_name(group.name):
             if kind.components and kind.quantity in group.values_by_quantity:
@@ -419,7 +419,7 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
     found: dict[str, _GroupNoise] = {}
     at = [recorded.names.index(name) for name in joints]
     for channel, unit, least in (("position", "rad", 1e-6), ("effort", "N m", 1e-3)):
-        values = recorded.channels.get(channel)
+        values = recorded.values_by_channel.get(channel)
         if values is not None:
             noise = _GroupNoise(None, unit, _STATED_NOISE)
             if not is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions()):

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.estimate_history import pool_estimates
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
-from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
+from yid_ocp.diagnosis.baseline import BaselineRunData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.errors import DataError, OutputError
@@ -37,7 +37,7 @@ from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
 from yid_ocp.workflow import prediction_outputs, run_history
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, run_command_and_print
+from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.plan import discrimination_plan_settings
 from yid_ocp.workflow.prediction_outputs import HeldOutPredictionPair
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder, software_and_plugin_versions
@@ -48,7 +48,7 @@ _STORE_FORMAT = "yid-refits/1"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command `diagnose` and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE)
+    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResultAndOutput[DiagnosisResult]:
+) -> CommandOutcome[DiagnosisResult]:
     """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
         folder.record_run_start(run, "diagnose", _flags(run))
@@ -87,7 +87,7 @@ def run_diagnose(
                 thresholds=run.diagnosis,
                 progress=logged,
                 known_fits=NominalSolutionAndRefitStore(nominal, refits),
-                baseline=BaselineData.from_runs(runs, without),
+                baseline=BaselineRunData.from_runs(runs, without),
                 exclude=run.diagnosis.exclude,
             )
         except KeyboardInterrupt:
@@ -99,7 +99,7 @@ def run_diagnose(
         prediction_outputs.write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
-        moving = not last.problem.options.clamp_pose_definitions and bool(system.driven or system.prescribed)
+        moving = not last.problem.options.clamp_poses_from_points and bool(system.driven or system.prescribed)
         x = last.problem.vector(last.values)
         own = {
             "model": final_model_to_dict(finding),
@@ -111,7 +111,7 @@ def run_diagnose(
         more = {"finding": finding, "predictions": predicted}
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
     refits.delete_file()
-    return CommandResultAndOutput(folder.path, written, finding)
+    return CommandOutcome(folder.path, written, finding)
 
 
 @dataclass(frozen=True)
@@ -165,11 +165,11 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
             prior_stds={name: share * std for name, std in options.prior_stds.items()},
             multivariate_prior=prior.with_parameters_scaled_by(dict.fromkeys(prior.parameter_names, share)),
             huber_threshold=options.huber_threshold / share,
-            weak_prior_std_as_factor=options.weak_prior_std_as_factor**share
-            if options.weak_prior_std_as_factor > 0
+            weak_prior_geometric_std=options.weak_prior_geometric_std**share
+            if options.weak_prior_geometric_std > 0
             else 0.0,
-            start_configuration_std=share * options.start_configuration_std,
-            start_velocity_std=share * options.start_velocity_std,
+            initial_configuration_std=share * options.initial_configuration_std,
+            initial_velocity_std=share * options.initial_velocity_std,
         )
     )
 
@@ -214,7 +214,7 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
     for episode, *outcomes in predicted:
         told = []
         for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
-            theta = fit.problem.theta_and_initial_state_offset(fit.problem.vector(fit.values), 0)[0]
+            theta = fit.problem.theta_and_initial_state_deviation(fit.problem.vector(fit.values), 0)[0]
             told.append(
                 prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
             )

@@ -19,15 +19,24 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.export import models
-from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FormatSupport
-from yid_ocp.export.signals import RosTopicTimeSeries, export_csv, export_mcap, ros_signals_from_recording
+from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FeatureExportSupport
+from yid_ocp.export.signals import (
+    RosTopicTimeSeries,
+    export_mcap,
+    export_recording_csv_files,
+    ros_signals_from_recording,
+)
 from yid_ocp.files import file_sha256, named_attributes, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.virtual.mjcf import mujoco_xml
-from yid_ocp.virtual.mujoco_replay import REPLAY_FEEDBACK_BANDWIDTH, ReplayMismatch, replay_in_mujoco
+from yid_ocp.virtual.mujoco_replay import (
+    REPLAY_FEEDBACK_BANDWIDTH,
+    ReplayErrorAgainstRecording,
+    replay_mismatch_by_channel,
+)
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
@@ -72,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
             files = [Path(out) / f"{source.stem}.mcap"]
             notes = _shift_notes("", export_mcap(ros_signals_from_recording(recording), files[0]))
         else:
-            files = list(export_csv(recording, out))
+            files = list(export_recording_csv_files(recording, out))
     paths = [str(file) for file in files]
     own = {"format": EXPORT_MANIFEST_FORMAT, "file": paths, "kind": form or "csv"}
     own |= {"notes": [*contents["notes"], *notes]}
@@ -128,7 +137,7 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         raise DataError("the result has no parameters", where=where, hint="run it again") from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
-    whole = run_history.settings_with_effect_values(nominal, run_history.effect_parameter_values_by_label(values))
+    whole = run_history.settings_with_added_effects(nominal, run_history.parameter_values_by_effect_label(values))
     return _CalibratedModel(whole, nominal, values, std)
 
 
@@ -151,9 +160,9 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
         return head | {"effects": {}, "parameters": {}, "gate": None}
     system, supports = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
-    grasp = FormatSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
+    grasp = FeatureExportSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
     if form == "mjcf":
-        grasp = FormatSupport("native", "equality constraints between sites, or a tendon where it gives way")
+        grasp = FeatureExportSupport("native", "equality constraints between sites, or a tendon where it gives way")
     parameters = {}
     for name, entry in models.format_support_by_parameter(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
@@ -184,7 +193,9 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
     return manifest
 
 
-def _expressible(calibrated: _CalibratedModel, full: System, form: str) -> tuple[System, dict[str, FormatSupport]]:
+def _expressible(
+    calibrated: _CalibratedModel, full: System, form: str
+) -> tuple[System, dict[str, FeatureExportSupport]]:
     """The system without the effects that a format cannot tell, and what it makes of each."""
     said = models.format_support_by_effect(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
@@ -199,7 +210,7 @@ def _expressible(calibrated: _CalibratedModel, full: System, form: str) -> tuple
                 try:
                     calibrated.text(form, calibrated.system([label]))
                 except ModelError as own:
-                    said[label] = FormatSupport("not representable", own.what)
+                    said[label] = FeatureExportSupport("not representable", own.what)
                     break
             else:
                 what = f"the model cannot be written as {form.upper()}: {error.what}"
@@ -236,20 +247,20 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
 
 def _replayed(
     text: str, system: System, recordings: Sequence[Recording], progress: Progress, round_: int = 0
-) -> dict[str, ReplayMismatch]:
-    found: dict[str, list[ReplayMismatch]] = {}
+) -> dict[str, ReplayErrorAgainstRecording]:
+    found: dict[str, list[ReplayErrorAgainstRecording]] = {}
     for i, recording in enumerate(recordings):
         progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), recording.name)
-        for name, error in replay_in_mujoco(text, system, recording).items():
+        for name, error in replay_mismatch_by_channel(text, system, recording).items():
             found.setdefault(name, []).append(error)
     together = {}
     for name, errors in found.items():
         rmse, noise = np.sqrt(np.mean([(error.rmse**2, error.noise_rms**2) for error in errors], axis=0))
-        together[name] = ReplayMismatch(float(rmse), float(noise), errors[0].unit)
+        together[name] = ReplayErrorAgainstRecording(float(rmse), float(noise), errors[0].unit)
     return together
 
 
-def _fall(pairs: Sequence[tuple[ReplayMismatch, ReplayMismatch]]) -> float | None:
+def _fall(pairs: Sequence[tuple[ReplayErrorAgainstRecording, ReplayErrorAgainstRecording]]) -> float | None:
     """Mean part by which errors beyond the noise fall, of pairs before and after; None if there was none before."""
     parts = [1 - a.rmse_beyond_noise / b.rmse_beyond_noise for b, a in pairs if b.rmse_beyond_noise > 0]
     return sum(parts) / len(parts) if parts else None

@@ -7,20 +7,20 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis import friction_ladder
-from yid_ocp.analysis.friction_ladder import FrictionLawFit, left_out_error_mean_and_std_error
-from yid_ocp.config.settings import FrictionSettings, RunSettings
-from yid_ocp.effects.friction import FRICTION_LAW_EFFECT_KINDS
+from yid_ocp.analysis.friction_ladder import FrictionLawFit, motion_kind_mean_and_std_error
+from yid_ocp.config.settings import FrictionLawSettings, RunSettings
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.solvers import Solution, Status, solve
 from yid_ocp.workflow.build import friction_joints, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
-def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
+def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Fit every friction law to all recordings but one kind of motion in turn, and write the run folder.
 
     Successful where the warranted law's fit to all recordings converged. `DataError` for fewer than two motions that
@@ -31,9 +31,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         folder.record_run_start(run, "friction")
         fits: list[FrictionLawFit] = []
         solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
-        for law in FRICTION_LAW_EFFECT_KINDS:
+        for law in EFFECT_KINDS_BY_FRICTION_LAW:
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
-            settings = replace(run, model=replace(run.model, friction=FrictionSettings(law=law, joints=joints)))
+            settings = replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
             problem = friction_ladder.problem_estimating_on_held_out_too(build_problem(settings))
             kinds = friction_ladder.recording_names_by_name_stem(problem)
             if len(kinds) < 2:
@@ -49,7 +49,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             solved[law] = (settings, problem, solution)
         if not fits:
             raise DataError("no friction law could be fitted", hint="look at `yid-ocp check` of this configuration")
-        best = friction_ladder.warranted_law(fits, kinds)
+        best = friction_ladder.simplest_fit_within_std_error(fits, kinds)
         settings, problem, solution = solved[best.law]
         names = friction_parameter_names(settings, problem.system.parameters)
         more = {"friction_clouds": friction_ladder.friction_torque_clouds(problem, solution, names)}
@@ -64,13 +64,13 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         folder.log_event("end", warranted=best.law)
         known = {"problem": problem, "solution": solution, "section_data": more}
         written = folder.write_result_and_report(run, progress, result, **known)
-    return CommandResultAndOutput(folder.path, written, None, best.is_converged)
+    return CommandOutcome(folder.path, written, None, best.is_converged)
 
 
 def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-    mean, error = left_out_error_mean_and_std_error(fit.left_out_errors, kinds)
+    mean, error = motion_kind_mean_and_std_error(fit.left_out_errors, kinds)
     beyond = {name: own - best.left_out_errors[name] for name, own in fit.left_out_errors.items()}
-    difference, paired = left_out_error_mean_and_std_error(beyond, kinds)
+    difference, paired = motion_kind_mean_and_std_error(beyond, kinds)
     return {
         "mean_error": mean,
         "standard_error": error,

@@ -32,7 +32,7 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm_holding_object
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import solve_and_decide_cable_memory
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         interval_parameters={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
         rank_changes=arguments.what_if,
     )
-    work = partial(run_identifiability, options=asked, workers=workers_from_arguments(arguments))
+    work = partial(run_identifiability, options=asked, workers=worker_config_from_arguments(arguments))
     return command_with_settings(work)(arguments)
 
 
@@ -87,7 +87,7 @@ def run_identifiability(
     progress: Progress = NULL_PROGRESS,
     options: IdentifiabilityOptions | None = None,
     workers: WorkerConfig | Executor | None = None,
-) -> CommandResultAndOutput[IdentifiabilityResult | None]:
+) -> CommandOutcome[IdentifiabilityResult | None]:
     """Solve, analyse identifiability and write the run folder.
 
     Where the solver failed there is no analysis, and the run folder holds the reason. `workers` work out intervals, one
@@ -137,7 +137,7 @@ def run_identifiability(
                 other = system_with_second_arm_holding_object(run, system)
                 known: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
                 known["two_arm_system"] = None if other is None else system_with_grasp_offset_effects(other)
-                known["evaluate_changes"] = None if tasks is None else tasks.evaluate_change_sets
+                known["evaluate_changes"] = None if tasks is None else tasks.evaluate_experiment_change_sets
                 ranking = what_if.what_if(problem, solution, progress=progress, **known)
         result = _identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log_event("end", status=result["status"], message=result["message"])
@@ -146,7 +146,7 @@ def run_identifiability(
         with contextlib.suppress(OSError):
             shutil.rmtree(tasks.results_folder)
             tasks.results_folder.parent.rmdir()
-    return CommandResultAndOutput(folder.path, written, information, information is not None)
+    return CommandOutcome(folder.path, written, information, information is not None)
 
 
 def _identifiability_result(
@@ -220,7 +220,7 @@ class _IdentifiabilityTasks:
             profiles[name] = dataclass_from_plain_data(ParameterProfileLikelihood, told["profile"])
         return replace(analysis, parameters=parameters, profiles=profiles)
 
-    def evaluate_change_sets(
+    def evaluate_experiment_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
         """What sets of changes of the experiment would tell, one task per changed mechanics; a `ChangeSetEvaluator`."""
@@ -261,7 +261,7 @@ def _change_set_outcomes(
     two_arms = None if other is None else system_with_grasp_offset_effects(other)
     x = fisher.unknowns_from_solution(problem, common["x"])
     setting = RecordedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
-    return list(to_lossless_plain_data(what_if.evaluate_change_sets(setting, sets, inflation)))
+    return list(to_lossless_plain_data(what_if.evaluate_experiment_change_sets(setting, sets, inflation)))
 
 
 def _problem(common: Mapping[str, Any]) -> tuple[RunSettings, EstimationProblem]:

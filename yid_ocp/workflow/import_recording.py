@@ -30,7 +30,7 @@ _SINGLE = (
     "delimiter",
     "episode",
     "clock",
-    "sensor_description",
+    "point_sensor_name",
     "frame",
 )
 _FLAGS = {"joint_topics": "--joint-topic"}  # of options whose flag is not their name

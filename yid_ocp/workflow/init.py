@@ -14,9 +14,9 @@ from typing import Any, cast
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
-from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_details
+from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitObjectConfiguration, comma_separated_numbers, init_object_templates
+from yid_ocp.model.objects.base import InitCommandObject, comma_separated_numbers, init_command_object_templates
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
@@ -66,9 +66,9 @@ def run(arguments: argparse.Namespace) -> int:
 # -- what was asked ---------------------------------------------------------------------------------------------------
 
 
-def _object_from_arguments(arguments: argparse.Namespace) -> InitObjectConfiguration | None:
+def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject | None:
     """The described object, if any; `ConfigError` for a number that is missing or impossible, and names its option."""
-    templates, word = init_object_templates(), arguments.object
+    templates, word = init_command_object_templates(), arguments.object
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
             if getattr(arguments, name):
@@ -76,7 +76,7 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitObjectConfigura
                 raise ConfigError(what, where="--object", allowed=", ".join(templates), hint=hint)
         return None
     if word not in templates:
-        said = unknown_name_details(word, templates)
+        said = unknown_name_error_arguments(word, templates)
         raise ConfigError(f"there is no choice of --object '{word}'", where="yid-ocp init", **said)
     template = templates[word]
     links = template.default_links if arguments.links is None else arguments.links
@@ -186,7 +186,7 @@ _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 def _config_lines(
     robot: str,
     about: str,
-    item: InitObjectConfiguration | None,
+    item: InitCommandObject | None,
     proposal: ProposedConfigChoices,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
@@ -286,7 +286,7 @@ def _arms(proposal: ProposedConfigChoices) -> Iterator[str]:
         )
 
 
-def _object(item: InitObjectConfiguration, proposal: ProposedConfigChoices) -> Iterator[str]:
+def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterator[str]:
     holder, grasps = proposal.holder_frame, proposal.grasps
     yield "  object:"
     if item.stands_in_world:
@@ -397,7 +397,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
         yield f"  # {group} come at {clock}"
 
 
-def _parameters(item: InitObjectConfiguration | None, proposal: ProposedConfigChoices) -> Iterator[str]:
+def _parameters(item: InitCommandObject | None, proposal: ProposedConfigChoices) -> Iterator[str]:
     free, preset = "{free: true}", proposal.motor_preset
     if item is None:
         yield _line("", "parameters", "", "`yid-ocp inspect` lists all that there are")

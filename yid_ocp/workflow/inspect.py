@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from yid_ocp.analysis import step_diagnostics
-from yid_ocp.analysis.step_symbols import EquationOrDerivativeFormula, StepSymbols
+from yid_ocp.analysis.step_symbols import EquationOrDerivativeFormula, NamedStepEquations
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
@@ -29,7 +29,7 @@ from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.mounted import MountedSensor
 from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 _SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
@@ -55,7 +55,7 @@ class _LinearisationPoint:
 
 def _run_inspect(
     run: RunSettings, out: str | Path | None, progress: Progress, entries: Sequence[str], export: str | None
-) -> CommandResultAndOutput[None]:
+) -> CommandOutcome[None]:
     """Write result.json, equations.txt, sparsity.png, kkt.png and linearisation.h5, and what is asked for beside."""
     with atomic_run_folder(run, out, "inspect") as folder:
         folder.record_run_start(run, "inspect", [part for name in entries for part in ("--entry", name)])
@@ -63,7 +63,7 @@ def _run_inspect(
         begun = time.perf_counter()
         step = build_step(run)
         seconds = time.perf_counter() - begun
-        symbols, parameters = StepSymbols.from_equations(step.equations), step.system.parameters
+        symbols, parameters = NamedStepEquations.from_equations(step.equations), step.system.parameters
         # a wrong name is told before anything takes time; parameters are single names without brackets
         asked = [text.strip() for text in entries]
         named = [text for text in asked if text and not set(text) & set("[,")]
@@ -105,7 +105,7 @@ def _run_inspect(
                 entry.name: {key: getattr(entry, key) for key in _PARAMETER_KEYS} | {"free": entry.name in free}
                 for entry in parameters
             },
-            "equations": step_diagnostics.step_size_summary(step),
+            "equations": step_diagnostics.step_complexity_summary(step),
             "blocks": {
                 kind: [named_attributes(block, "name meaning names=full_names") for block in own if block.labels]
                 for kind, own in blocks.items()
@@ -124,7 +124,7 @@ def _run_inspect(
         }
         shown = {"pictures": [path for path in pictures if path.exists()]}
         written = folder.write_result_and_report(run, progress, result, section_data=shown)
-    return CommandResultAndOutput(folder.path, written, None)
+    return CommandOutcome(folder.path, written, None)
 
 
 run = command_with_settings(_run_inspect, "entries", "export")
@@ -158,7 +158,7 @@ def _linearised(
 ) -> tuple[step_diagnostics.CheckedStepLinearisation, StepEquationLinearizations]:
     at = point.state, point.torque, point.theta, point.prescribed_positions
     try:
-        found = step_diagnostics.linearise_and_check(step, *at)
+        found = step_diagnostics.checked_step_linearisation(step, *at)
     except np.linalg.LinAlgError as error:
         what = "the step cannot be linearised: its equations are singular"
         raise ModelError(what, where=point.description) from error
@@ -174,7 +174,10 @@ def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
 
 
 def _patterns(
-    symbols: StepSymbols, matrices: Mapping[str, Array], rows: StepEquationLinearizations, point: _LinearisationPoint
+    symbols: NamedStepEquations,
+    matrices: Mapping[str, Array],
+    rows: StepEquationLinearizations,
+    point: _LinearisationPoint,
 ) -> dict[str, step_diagnostics.SparsityPattern]:
     prescribed = list(symbols.equations.system.prescribed_coordinate_indices)
     kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), prescribed)
@@ -188,7 +191,7 @@ def _patterns(
     return {name: entry.with_numerical_nonzeros_marked(values[name], where) for name, entry in found.items()}
 
 
-def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dict[str, Any]:
+def _nlp(symbols: NamedStepEquations, problem: EstimationProblem, picture: Path) -> dict[str, Any]:
     """Size of the NLP with a node at every step and what it leaves out; draws the picture of its first steps."""
     episode = problem.episodes[0]
     sensors, feedback = [samples.sensor for samples in episode.measurements], episode.tracking_feedback
@@ -213,14 +216,14 @@ def _is_left_out(sensor: Sensor) -> bool:
 
 def _dependence(
     step: Step,
-    symbols: StepSymbols,
+    symbols: NamedStepEquations,
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepEquationLinearizations,
 ) -> tuple[step_diagnostics.ParameterDetectability, ...]:
     """Where every parameter enters and who sees it; along the recordings where the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
-    found = step_diagnostics.parameter_rows_and_sensor_responses(step, symbols, episode, point.state, point.theta, rows)
+    found = step_diagnostics.parameter_detectabilities(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found
@@ -239,7 +242,7 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
     }
 
 
-def _entry_result(entry: EquationOrDerivativeFormula, symbols: StepSymbols, at: Array) -> dict[str, Any]:
+def _entry_result(entry: EquationOrDerivativeFormula, symbols: NamedStepEquations, at: Array) -> dict[str, Any]:
     names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
     value = entry.numeric_value(symbols.column_symbols, at)
     return named_attributes(entry, names) | {"operations": entry.formula.n_operations, "value": value}

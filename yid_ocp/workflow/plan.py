@@ -13,22 +13,22 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_recording
 from yid_ocp.errors import DataError
-from yid_ocp.export.signals import export_csv, joint_trajectory_message
+from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
 from yid_ocp.files import named_attributes
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import ParameterCovariance, TargetMotionPlan, plan_motion_to_target
-from yid_ocp.problem.measurements import make_time_grid
-from yid_ocp.problem.recorded_inputs import prescribed_path
+from yid_ocp.problem.measurements import recording_time_grid
+from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_file
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role
@@ -40,7 +40,7 @@ _Plan = TargetMotionPlan | InformativeMotionPlan
 
 def run_plan(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResultAndOutput[_Plan]:
+) -> CommandOutcome[_Plan]:
     """Plan the motion of a run's goal; write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
     Successful where the goal was reached within all limits; the run folder says why not.
@@ -59,7 +59,7 @@ def run_plan(
                 found = plan_motion_to_target(step, options, theta, known, progress)
         recording = _plan_as_recording(run, found)
         write_recording(recording, folder.path / "recording.h5")
-        export_csv(recording, folder.path / "csv")
+        export_recording_csv_files(recording, folder.path / "csv")
         rates = (found.joint_velocities, found.joint_accelerations, found.joint_efforts)
         trajectory = joint_trajectory_message(found.joint_names, found.t, found.joint_positions, *rates)
         folder.write_text_file("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
@@ -72,7 +72,7 @@ def run_plan(
         more = {"plan" if isinstance(found, TargetMotionPlan) else "information": found}
         result = _motion_result(run, found, source) | told
         written = folder.write_result_and_report(run, progress, result, animations=[scene], section_data=more)
-    return CommandResultAndOutput(folder.path, written, found, found.is_successful)
+    return CommandOutcome(folder.path, written, found, found.is_successful)
 
 
 run = command_with_settings(run_plan)
@@ -94,10 +94,10 @@ def configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapp
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
     [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system
-    clamps = () if cable is None else cable.clamp_pose_definitions
-    grid = make_time_grid(recording, step.time_step, run.problem.duration)
+    clamps = () if cable is None else cable.clamp_poses_from_points
+    grid = recording_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = prescribed_path(recording, system, grid, LowPassFilter(run.problem.path_cutoff), clamps)
+        path = prescribed_coordinates_at_nodes(recording, system, grid, LowPassFilter(run.problem.path_cutoff), clamps)
     return dict(zip(system.prescribed, map(float, path[0]), strict=True))
 
 
@@ -137,7 +137,7 @@ def _plan_as_recording(run: RunSettings, found: _Plan) -> Recording:
         points = (PointGroup("points_planned", names, found.t, position, std, sensor="plan"),)
     truth = dict(zip(found.simulator.step.system.parameters.names, map(float, found.simulator.theta), strict=True))
     text = f"{run.description} Planned motion, goal {run.plan.goal}.".strip()
-    return validate_recording(Recording(joints, points, text, "yid_ocp plan", "recording", true_parameters=truth))
+    return validated_recording(Recording(joints, points, text, "yid_ocp plan", "recording", true_parameters=truth))
 
 
 def _motion_result(run: RunSettings, found: _Plan, source: dict[str, Any]) -> dict[str, Any]:

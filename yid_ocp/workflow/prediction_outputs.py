@@ -20,7 +20,7 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem import EstimationProblem, predictions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.report.terminal import channel_or_group_unit
 from yid_ocp.solvers import Solution
@@ -40,7 +40,11 @@ def prediction_error_entry(
     """
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
     options = problem.options
-    fixed = options.start_fit_window / problem.step.time_step if options.initial_state == "fitted_to_points" else -1.0
+    fixed = (
+        options.initial_state_fit_window / problem.step.time_step
+        if options.initial_state == "fitted_to_points"
+        else -1.0
+    )
     if isinstance(outcome, str):
         entry["message"] = outcome
     else:
@@ -104,7 +108,7 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
     return found
 
 
-def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, float]:
+def _errors(samples: SensorMeasurements, predicted: Array, fixed: float) -> dict[str, float]:
     sensor = samples.sensor
     shape = (len(predicted), len(sensor.channel_names), sensor.outputs_per_channel)
     square = np.sum((predicted - samples.value).reshape(shape) ** 2, axis=2)
@@ -120,19 +124,21 @@ def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, 
     return result
 
 
-def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | None) -> dict[str, Array]:
+def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableTopology | None) -> dict[str, Array]:
     sensor = samples.sensor
     if sensor.naive_prediction == "zero":
         return {"zero": np.zeros_like(samples.value)}
-    if cable is not None and sensor.point_names and set(sensor.point_names) <= set(cable.vertices):
+    if cable is not None and sensor.point_names and set(sensor.point_names) <= set(cable.vertex_names):
         recording, held, points = episode.recording, cable.clamped_vertex_names, sensor.point_names
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
-        parents, children = cable.points_along_parent_branch, cable.points_along_child_branches
-        carried = predictions.interpolated_displacement_baseline
+        parents, children = cable.parent_branch_point_names, cable.child_branch_point_names
+        carried = predictions.interpolated_displacement_position_baseline
         arrays = {
             "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),
-            "moves_with_clamps": predictions.mean_clamp_displacement_baseline(recording, points, held, _START_FRAMES),
+            "moves_with_clamps": predictions.mean_clamp_displacement_baseline_prediction(
+                recording, points, held, _START_FRAMES
+            ),
             "linear_carry": carried(recording, points, parents, children, given=_START_FRAMES),
         }
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
@@ -276,7 +282,9 @@ def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, pairs: Se
             _store(group, {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.allowed_model_error})
 
 
-def _store_sensor(parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, Array]) -> None:
+def _store_sensor(
+    parent: h5py.Group, episode: Episode, samples: SensorMeasurements, predicted: Mapping[str, Array]
+) -> None:
     group = parent.create_group(samples.sensor.group_name)
     _store_texts(group, {"channels": samples.sensor.channel_names})
     group.attrs["unit"] = samples.sensor.unit

@@ -25,15 +25,15 @@ from yid_ocp.files import file_sha256, is_file, named_attributes, read_input_jso
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, run_command_and_print
+from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import given_or_shipped_recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
 _OLD_FORMATS = ("yid-diagnosis/1",)  # of earlier versions, which had other keys
 _RENAMED_KEYS_HINT = "CHANGELOG.md has the table old -> new under Unreleased"
-_COMPARED_MODEL_SECTIONS = ("robot", "arms", "clamps", "object", "grasp", "springs", "gravity")
+_COMPARED_MODEL_SECTIONS = ("robot", "arms", "moving_clamps", "object", "grasp", "springs", "gravity")
 """Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
 _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 
@@ -54,7 +54,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         units = {name: str(parameters[name]["unit"]) for name in names}
         explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
-        effects = effect_parameter_values_by_label(all_values)
+        effects = parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
         what = "the result does not say how sure its parameters are together"
         allowed = "keys parameters and covariance, as this version writes them"
@@ -67,7 +67,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
 
 
-def effect_parameter_values_by_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """Values of the parameters of effects, by the effect's label and the parameter's own name."""
     found: dict[str, dict[str, float]] = {}
     for name, value in parameters.items():
@@ -77,7 +77,7 @@ def effect_parameter_values_by_label(parameters: Mapping[str, float]) -> dict[st
     return found
 
 
-def settings_with_effect_values(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
+def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
     """Settings with the given effects (by label) added to the model at their values; existing effects are kept."""
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
@@ -188,7 +188,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
         return run
     known, _, _ = pool_estimates(runs)
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
-    estimated = effect_parameter_values_by_label(dict(zip(known.parameter_names, known.values, strict=True)))
+    estimated = parameter_values_by_effect_label(dict(zip(known.parameter_names, known.values, strict=True)))
     added = {label: {**said, **estimated.get(label, {})} for label, said in known.effects.items()}
     freed = {
         f"{label}.{quantity}": ParameterSettings(free=True)
@@ -196,14 +196,14 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
         for quantity in estimated.get(label, ())
         if label not in present
     }
-    return replace(settings_with_effect_values(run, added), parameters={**run.parameters, **freed})
+    return replace(settings_with_added_effects(run, added), parameters={**run.parameters, **freed})
 
 
 def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
     """Recordings without the sought effect, from settings or baseline, and a text on why there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
-        file = given_or_shipped_recording_path(path)
+        file = resolve_recording_path(path)
         if not is_file(file):
             where = ("recordings", "reference_recordings", i)
             raise run.config_error(f"there is no such recording: {file}", *where, hint="check the path")
@@ -212,7 +212,7 @@ def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recor
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
-                found.append(read_recording(given_or_shipped_recording_path(path)))
+                found.append(read_recording(resolve_recording_path(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
     return tuple(replace(recording, name=f"{recording.name} (without)") for recording in found), ""
@@ -239,7 +239,7 @@ def run(arguments: argparse.Namespace) -> int:
     return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown))
 
 
-def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
+def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Compare runs of one model, given in the order of time, and write `history.json` and report.html."""
     if len(paths) < 2:
         hint = "add the runs of other days"
@@ -256,7 +256,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
         folder.log_command_start(["report", *map(str, paths)])
         written = folder.write_result_and_report(settings, progress, estimate_history_to_dict(found), "history.json")
-    return CommandResultAndOutput(folder.path, written, None)
+    return CommandOutcome(folder.path, written, None)
 
 
 def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed)
     except (Exception, SystemExit) as error:
         for registry, names in zip(_REGISTRIES, before, strict=True):
-            registry.unregister(set(registry) - names)
+            registry.unregister_names(set(registry) - names)
         if isinstance(error, YidError):
             what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
             raise ConfigError(what, where=where, allowed=error.allowed, hint=error.hint or hint) from error
@@ -141,7 +141,7 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
         files[name] = _existing(run, Path(name), "file", "model", "object", key)
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
-            files[path] = _existing(run, given_or_shipped_recording_path(path), "recording", "recordings", which, i)
+            files[path] = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
     return files
 
 
@@ -154,7 +154,7 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     raise run.config_error(f"there is no such {noun}: {file}", *key, hint=hint)
 
 
-def given_or_shipped_recording_path(path: str) -> Path:
+def resolve_recording_path(path: str) -> Path:
     """Path of a recording named in the settings; `default:NAME` is one shipped with the package."""
     if not path.startswith("default:"):
         return Path(path)
@@ -169,7 +169,7 @@ def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: in
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
     for i, path in enumerate(paths[:count]):
-        file = _existing(run, given_or_shipped_recording_path(path), "recording", "recordings", which, i)
+        file = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
         with add_setting_location_to_errors(run, "recordings", which, i):
             recording = read_recording(file)
         if recording.name in [entry.name for entry in result]:

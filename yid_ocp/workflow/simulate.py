@@ -18,7 +18,7 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, animation_of_trajectories, recording_animation
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
@@ -33,7 +33,7 @@ def run_simulate(
     progress: Progress = NULL_PROGRESS,
     seed: int = 0,
     noise: bool = False,
-) -> CommandResultAndOutput[Recording | None]:
+) -> CommandOutcome[Recording | None]:
     """Write `recording.h5`: the model moved by the inputs of the first recording, or a virtual experiment without one.
 
     With a recording under `recordings.estimate`, its torques or prescribed motion drive the model with the parameters'
@@ -61,14 +61,14 @@ def run_simulate(
             result |= {"groups": groups, "truth": truth}
         more = {"recordings": [] if recording is None else [recording], "system": system}
         written = folder.write_result_and_report(run, progress, result, animations=scenes, section_data=more)
-    return CommandResultAndOutput(folder.path, written, recording, recording is not None)
+    return CommandOutcome(folder.path, written, recording, recording is not None)
 
 
 run = command_with_settings(run_simulate, "seed", "noise")
 
 
 def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) -> _Made:
-    from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
+    from yid_ocp.virtual.experiment import VirtualExperimentSettings, run_virtual_experiment
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
     if run.model.robot is None:
@@ -78,7 +78,7 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint=hint)
     progress.begin_stage("simulating a virtual experiment in MuJoCo")
     simulation = SimulationOptions(run.problem.duration or _DEFAULT_DURATION)
-    experiment = VirtualExperiment(simulation=simulation, seed=seed, recording_name=run.name)
+    experiment = VirtualExperimentSettings(simulation=simulation, seed=seed, recording_name=run.name)
     made = run_virtual_experiment(system, None, replace(experiment, description=run.description))
     alone = recording_animation("recorded", system, system.parameters.vector(), made)
     return made, [] if alone is None else [alone]

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from yid_ocp.analysis import discretisation
-from yid_ocp.analysis.clock_checks import check_fit_for_drift_and_noise
-from yid_ocp.analysis.compare import ChosenCableMemoryFit, decide_cable_memory
+from yid_ocp.analysis.clock_checks import drift_and_overstated_noise_issues
+from yid_ocp.analysis.compare import ChosenCableMemoryFit, choose_cable_memory_fit
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth, EstimateShiftByLinksAndTimeStep
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
@@ -19,7 +19,11 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
 from yid_ocp.errors import YidError
 from yid_ocp.files import named_attributes
-from yid_ocp.inference.uncertainty import covariance_to_dict, estimates_marked_not_trusted, typical_parameter_magnitudes
+from yid_ocp.inference.uncertainty import (
+    all_estimates_marked_not_trusted,
+    covariance_to_dict,
+    typical_parameter_magnitudes,
+)
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -29,7 +33,7 @@ from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, divided_link_parameter_scale
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.prediction_outputs import EpisodeAndPrediction
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
@@ -41,7 +45,7 @@ _RESULT_FORMAT = "yid-solve/1"
 
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResultAndOutput[Solution]:
+) -> CommandOutcome[Solution]:
     """Estimate, validate and write the run folder; successful where the solver converged.
 
     Where it failed the run folder holds the reason and the best point.
@@ -66,7 +70,7 @@ def run_solve(
         progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
         held_out = problem.predict_held_out(solution.x)
         cable = cable_topology_between_clamps(run)
-        solution, doubts = solution_and_fit_issues(problem, solution, held_out, cable)
+        solution, doubts = checked_solution_and_issues(problem, solution, held_out, cable)
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
         folder.log_event("end", **end)
         prediction_outputs.write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
@@ -75,15 +79,15 @@ def run_solve(
             "doubts": issues_to_plain_data(doubts),
             "safeguard": safe.message,
             "covariance": _covariance_result(solution, data_std),
-            "discretisation": discretisation_shift_results(shifts, data_std),
+            "discretisation": discretisation_shifts_to_dict(shifts, data_std),
             "discretisation_notes": notes,
             "stability": stability,
             "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
-        result = solve_result(problem, solution, held_out, cable) | more
+        result = solution_to_result_dict(problem, solution, held_out, cable) | more
         known = {"problem": problem, "solution": solution, "held_out": tuple(held_out)}
         written = folder.write_result_and_report(run, progress, result, **known)
-    return CommandResultAndOutput(folder.path, written, solution, solution.status == Status.CONVERGED)
+    return CommandOutcome(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 
 run = command_with_settings(run_solve)
@@ -104,10 +108,12 @@ def solve_and_decide_cable_memory(
         progress.report_iterate(entry)
 
     limits = run.diagnosis.null_test_residual_limits
-    return decide_cable_memory(problem, run.solver, solve(problem, run.solver, callback=iterate, limits=limits), limits)
+    return choose_cable_memory_fit(
+        problem, run.solver, solve(problem, run.solver, callback=iterate, limits=limits), limits
+    )
 
 
-def solution_and_fit_issues(
+def checked_solution_and_issues(
     problem: EstimationProblem,
     solution: Solution,
     held_out: Sequence[EpisodeAndPrediction],
@@ -120,11 +126,11 @@ def solution_and_fit_issues(
     if solution.evaluation is None:
         return solution, problem.options.data_issues
     errors, units, _ = _prediction_errors(problem, solution, held_out, cable)
-    found = check_fit_for_drift_and_noise(problem, solution.x, solution.evaluation)
+    found = drift_and_overstated_noise_issues(problem, solution.x, solution.evaluation)
     found += prediction_outputs.worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
-        marked = estimates_marked_not_trusted(solution.parameters)
+        marked = all_estimates_marked_not_trusted(solution.parameters)
         solution = replace(solution, goodness_of_fit=believed, parameters=marked)
     return solution, (*problem.options.data_issues, *found)
 
@@ -137,7 +143,7 @@ def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dic
     return covariance_to_dict(names, solution.covariance[np.ix_(at, at)], [data_std[name] for name in names])
 
 
-def solve_result(
+def solution_to_result_dict(
     problem: EstimationProblem,
     solution: Solution,
     held_out: Sequence[EpisodeAndPrediction],
@@ -179,7 +185,7 @@ def _prediction_errors(
     return [prediction_outputs.prediction_error_entry(problem, *pair, cable) for pair in pairs], units, residuals
 
 
-def discretisation_shift_results(
+def discretisation_shifts_to_dict(
     shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
     """Discretisation shifts of estimates for result.json, with each parameter's standard deviation from the data."""
@@ -188,7 +194,7 @@ def discretisation_shift_results(
 
 def _requested_refinements(run: RunSettings) -> tuple[_Refinement, ...]:
     """Refinements that a run's settings request after a solve, by default those that matter for its object."""
-    said, item = run.output.discretisation_check, run.model.object
+    said, item = run.output.discretisation_check_mode, run.model.object
     if said is None:
         said = "both" if item is not None and item.default_link_refinement else "time_step"
     return {"none": (), "time_step": ("time_step",), "both": ("links", "time_step")}[said]  # type: ignore[return-value]
@@ -213,7 +219,7 @@ def measure_discretisation_shifts(
     notes: list[str] = []
     for key in what:
         words = "twice the links" if key == "links" else "half the time step"
-        if key == "links" and (run.model.object is None or run.model.object.links_per_segment_or_total is None):
+        if key == "links" and (run.model.object is None or run.model.object.n_links_per_segment_or_total is None):
             continue
         progress.begin_stage(f"trying {words}", 2.5, 2.7)
         try:

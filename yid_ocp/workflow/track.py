@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettings, config_yaml_with_defaults
+from yid_ocp.config.settings import OutputSettings, RecordingsSettings, RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
@@ -42,26 +42,26 @@ from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-from yid_ocp.vision.surface_meshes import CameraScene, VirtualFrames
+from yid_ocp.vision.surface_meshes import ObservedScene, VirtualFrames
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import issues_to_plain_data, single_recording_issues
-from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings, workers_from_arguments
+from yid_ocp.workflow.build_problem import all_recording_quality_issues, issues_to_plain_data
+from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, given_or_shipped_recording_path
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command `track` and return its exit code."""
-    return command_with_settings(partial(_run_track, workers=workers_from_arguments(arguments)))(arguments)
+    return command_with_settings(partial(_run_track, workers=worker_config_from_arguments(arguments)))(arguments)
 
 
 def _run_track(
     run: RunSettings, out: str | Path | None, progress: Progress, workers: WorkerConfig | None
-) -> CommandResultAndOutput[None]:
+) -> CommandOutcome[None]:
     """Track the frames of `track.frames_path`, or of a virtual camera; what an interrupted run did is used again.
 
     Where not one frame is good, the run folder says why when the error is raised.
@@ -75,14 +75,14 @@ def _run_track(
         try:
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.settings, system)
-                doubts = [] if recording is None else single_recording_issues(run, system, recording)
+                doubts = [] if recording is None else all_recording_quality_issues(run, system, recording)
                 progress.begin_stage("finding what is common to the frames")
-                common = tasks.calibrate_sequence()
+                common = tasks.estimate_sequence_calibration()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
-                frames, note = tracker.assign_root_and_drop_outliers(done)
+                frames, note = tracker.select_root_end_and_frames(done)
                 try:
-                    found = tracker.to_track_result(frames, note, common)
+                    found = tracker.track_result_from_frames(frames, note, common)
                 except DataError as error:
                     refused = error
         except YidError:
@@ -96,12 +96,12 @@ def _run_track(
         result = _track_result(frames, common, tracker.foreign_objects(frames), found) | {"root": note}
         told = []
         if found is not None:
-            track_result.draw_tracked_points(found, folder.path / "track.png")
+            track_result.write_tracked_points_plot(found, folder.path / "track.png")
             tracked = found.recording_with_points(recording)
             write_recording(tracked, folder.path / "recording.h5")
             # what was tracked may be elsewhere than the object reaches, where the model says where it stands
             if settings.options.root_placement == "model":
-                own = single_recording_issues(run, system, tracked)
+                own = all_recording_quality_issues(run, system, tracked)
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
             theta = system.parameters.vector()
             shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
@@ -115,7 +115,7 @@ def _run_track(
     if refused is not None:
         hint = f"{refused.hint}; {folder.path} has the reason of every frame and pictures"
         raise DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
-    return CommandResultAndOutput(folder.path, written, None)
+    return CommandOutcome(folder.path, written, None)
 
 
 def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
@@ -169,10 +169,10 @@ def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:
         "of": {
             name: {
                 "model": sizes.model_values[i],
-                "fits": fits[i] if sizes.is_dimension_determined[i] else None,
-                "std": fits[i] * sizes.dimension_log_ratio_std[i] if sizes.is_dimension_determined[i] else None,
-                "doubted": bool(sizes.is_model_value_contradicted[i]),
-                "used": sizes.is_estimated[i],
+                "fits": fits[i] if sizes.determined_dimension_mask[i] else None,
+                "std": fits[i] * sizes.dimension_log_ratio_std[i] if sizes.determined_dimension_mask[i] else None,
+                "doubted": bool(sizes.contradicted_model_value_mask[i]),
+                "used": sizes.estimated_dimension_mask[i],
             }
             for i, name in enumerate(sizes.names)
         },
@@ -213,7 +213,7 @@ def _points(found: TrackResult) -> dict[str, Any]:
 def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Mapping[str, Mapping[str, float]]:
     shape = ShapeFitter(system)
     columns = [system.point_frames.index(name) for name in found.point_names]
-    truth = np.array([shape.points_at(made.true_configuration_at(t))[columns] for t in found.t])
+    truth = np.array([shape.points_at_configuration(made.true_configuration_at(t))[columns] for t in found.t])
     apart = np.linalg.norm(found.position - truth, axis=2)
     return {
         name: {"median": float(np.nanmedian(apart[:, i])), "largest": float(np.nanmax(apart[:, i]))}
@@ -227,40 +227,40 @@ def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Ma
 
 def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFrames]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
-    from yid_ocp.virtual.experiment import VirtualExperiment, record_simulation
+    from yid_ocp.virtual.experiment import VirtualExperimentSettings, record_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
-    for name in settings.grasp_start_offsets:
+    for name in settings.gripper_start_offsets:
         if name not in grasps:
-            where = ("track", "virtual_frames", "grasp_start_offsets", name)
+            where = ("track", "virtual_frames", "gripper_start_offsets", name)
             raise run.config_error(f"there is no grasp '{name}'", *where, allowed=", ".join(grasps))
     with add_setting_location_to_errors(run, "track", "virtual_frames"):
-        posture = grasping_joint_angles(system, offsets=settings.grasp_start_offsets)
+        posture = grasping_joint_angles(system, offsets=settings.gripper_start_offsets)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
         seed = settings.seed
         motion = random_multisine_motion(system, seed=seed, initial_joint_angles=posture, excitation=excitation)
         named: dict[str, Any] = {"recording_name": run.name, "description": run.description}
-        experiment = VirtualExperiment(simulation=simulation, camera=None, seed=seed, **named)
+        experiment = VirtualExperimentSettings(simulation=simulation, camera=None, seed=seed, **named)
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = record_simulation(system, None, experiment, truth)
         rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
-        timing = surface_meshes.FrameTiming(rate, settings.dropped_fraction, *latency)
+        timing = surface_meshes.CameraTimingModel(rate, settings.dropped_fraction, *latency)
         depth = surface_meshes.DepthSensorModel(outlier_probability=settings.outlier_fraction)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
-        camera = surface_meshes.VirtualCamera(pose, depth, timing, seed=seed)
+        camera = surface_meshes.VirtualCameraSetup(pose, depth, timing, seed=seed)
         made = surface_meshes.render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
 
-def camera_scene(run: RunSettings, system: System) -> CameraScene:
+def camera_scene(run: RunSettings, system: System) -> ObservedScene:
     """The scene seen by the camera: system, robot meshes and extra meshes."""
-    return CameraScene(system, run.model.robot, extra_meshes=run.model.extra_meshes)
+    return ObservedScene(system, run.model.robot, extra_meshes=run.model.extra_meshes)
 
 
-def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames"]) -> FrameSequence:
+def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames_path"]) -> FrameSequence:
     said = run.track
     with add_setting_location_to_errors(run, "track", key):
         return read_frames(getattr(said, key), pose=said.camera_pose, unit=said.length_unit, topic=said.frame_topic)
@@ -270,7 +270,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
     if not run.recordings.estimate:
         return None
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = given_or_shipped_recording_path(run.recordings.estimate[0])
+        path = resolve_recording_path(run.recordings.estimate[0])
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
@@ -278,7 +278,7 @@ def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Reco
     """The tracker of the frames in files, and the recording with the joints, None where none is listed."""
     recording = _read_joints(run)
     sequence, scene = _read_frames(run, "frames_path"), camera_scene(run, system)
-    background = None if run.track.background_frames is None else _read_frames(run, "background_frames")
+    background = None if run.track.background_frames_path is None else _read_frames(run, "background_frames_path")
     return FrameTracker(scene, recording, sequence, run.track.options, background), recording
 
 
@@ -294,7 +294,7 @@ class _FrameTasks:
     input_hashes: dict[str, str]
     own_files: tuple[Path, ...] = ()
 
-    def calibrate_sequence(self) -> SequenceCalibration:
+    def estimate_sequence_calibration(self) -> SequenceCalibration:
         [found] = require_task_values(self._run(_calibrate_sequence_task, {"what is common": {}}, InlineExecutor()))
         if "refused" in found:
             raise DataError(**found["refused"])
@@ -308,7 +308,7 @@ class _FrameTasks:
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
         require_task_values([result for result in results if "abruptly" not in result.error])
         return [
-            tracker.initial_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
+            tracker.unprocessed_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
             if "abruptly" in result.error
             else dataclass_from_plain_data(FrameReport, result.value)
             for i, result in zip(tracker.frame_order, results, strict=True)
@@ -337,7 +337,7 @@ def _frame_tasks(
 ) -> tuple[_FrameTasks, VirtualFrames | None]:
     """Tracking tasks of frames in files, written before where a virtual camera sees them; and the latter's truth."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
-    joints = given_or_shipped_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
+    joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
         _read_joints(run)
         _read_frames(run, "frames_path")  # says in words of the settings what is wrong with the files
@@ -350,12 +350,12 @@ def _frame_tasks(
         frames, joints = own_files = work / "frames", work / f"{run.name}.h5"
         write_frame_folder(made.sequence, frames)
         write_recording(recording, joints)
-        if said.keep_frames:
+        if said.write_virtual_frames:
             shutil.copytree(frames, folder.path / "frames")
-    recordings = RecordingSettings(estimate=() if joints is None else (str(joints),))
-    track = replace(said, frames_path=str(frames), n_drawn_frames=0, keep_frames=False)
+    recordings = RecordingsSettings(estimate=() if joints is None else (str(joints),))
+    track = replace(said, frames_path=str(frames), n_drawn_frames=0, write_virtual_frames=False)
     own = replace(run, track=track, recordings=recordings, output=OutputSettings(), name="", description="")
-    files = {"frames": frames, "joints": joints, "background": said.background_frames}
+    files = {"frames": frames, "joints": joints, "background": said.background_frames_path}
     with add_setting_location_to_errors(run, "track", "frames_path"):
         inputs = {key: file_sha256(Path(path)) for key, path in files.items() if path is not None}
         text = config_yaml_with_defaults(own)
@@ -371,7 +371,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # they belong to what the result depends on
     try:
-        return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).calibrate_sequence()))
+        return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).estimate_sequence_calibration()))
     except DataError as error:
         return {"refused": named_attributes(error, "what where allowed hint")}
 

@@ -13,10 +13,10 @@ from typing import Any
 
 from yid_ocp.data.readers.base import FILE_PREVIEWERS as FILE_PREVIEWERS
 from yid_ocp.data.readers.base import READERS as READERS
-from yid_ocp.data.readers.base import FileDataSourceSummary, FilePreview, mean_sample_rate
+from yid_ocp.data.readers.base import FilePreview, TopicOrColumnSummary, mean_sample_rate
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 for _suffix in (".h5", ".hdf5"):
@@ -43,7 +43,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     for name in options:
         if name not in known:
             what = f"the reader of '{known_as}' files has no option '{name}'"
-            raise DataError(what, where=str(path), **unknown_name_details(name, known))
+            raise DataError(what, where=str(path), **unknown_name_error_arguments(name, known))
     given = {"options": replace(default, **options)} if default else options
     return reader(path, **given, **_told(reader, progress))
 
@@ -56,7 +56,7 @@ def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         return FILE_PREVIEWERS[known_as](path, **_told(FILE_PREVIEWERS[known_as], progress))
     recording = read_any(path)
     sources = (
-        FileDataSourceSummary(g.name, "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names))
+        TopicOrColumnSummary(g.name, "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names))
         for g in recording.all_groups
     )
     return FilePreview(tuple(sources), {}, ("a recording already", *recording.notes))
@@ -77,5 +77,7 @@ def _format_of(path: Path) -> str:
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        raise DataError(f"there is no reader for '{key}' files", where=str(path), **unknown_name_details(key, READERS))
+        raise DataError(
+            f"there is no reader for '{key}' files", where=str(path), **unknown_name_error_arguments(key, READERS)
+        )
     return key

@@ -17,7 +17,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limited_memory
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
@@ -101,7 +101,7 @@ class OpenBag:
         """Raise `DataError` if the topic `name` is not in `known`; `noun` says what the topic should provide."""
         if name not in known:
             what = f"there are no {noun} on the topic '{name}'"
-            raise DataError(what, where=str(self.path), **unknown_name_details(name, known))
+            raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known))
 
     def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
         """The `DataError` to raise for a bag without usable topics; it lists the topics that the bag holds."""
@@ -151,7 +151,7 @@ class BagOptions(base.SelectionAndUnitOptions):
     command_topic: str | None = None
     # distance from a pose's origin at which NAME_x, NAME_y and NAME_z on its axes become points too [m]
     pose_axis_point_distance: float | None = None
-    sensor_description: str = "unknown"  # what saw the points
+    point_sensor_name: str = "unknown"  # what saw the points
     description: str = ""  # what was recorded
 
 
@@ -170,7 +170,7 @@ def read_bag(
     empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
 
     `DataError` where `rosbags` is not installed, the bag cannot be read, holds no such topic or leaves a choice open,
-    and as `validate_recording`.
+    and as `validated_recording`.
     """
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
@@ -191,7 +191,7 @@ def read_bag(
     for frame, entries in seen.items():
         position = _positions(_with_axes(entries, distance), seconds, str(path))
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
-        points.append(PointGroup(name, *position, None, options.sensor_description, frame))
+        points.append(PointGroup(name, *position, None, options.point_sensor_name, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     channels = _mounted_sensors(bag, seconds)
     used |= {message.source for message in bag.mounted}
@@ -497,7 +497,7 @@ def _positions(
 # -- preview ----------------------------------------------------------------------------------------------------------
 
 
-def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> base.FileDataSourceSummary:
+def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> base.TopicOrColumnSummary:
     messages = (*bag.states, *bag.places, *bag.mounted)
     own = [m for m in messages if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
@@ -516,7 +516,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
         note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"
-    return base.FileDataSourceSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
+    return base.TopicOrColumnSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
 
 
 def _for_guess(bag: _Contents) -> Recording:

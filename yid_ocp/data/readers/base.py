@@ -15,15 +15,15 @@ import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.issues import median_sample_period
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validate_recording
-from yid_ocp.errors import DataError, unknown_name_details
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.registry import Registry
 
 _RecordingReader = Callable[..., Recording]
 
 
 @dataclass(frozen=True)
-class FileDataSourceSummary:
+class TopicOrColumnSummary:
     """One data source (topic, column or marker) of a file to import, with sample count, rate and imported name."""
 
     # what the file calls it, and its type
@@ -39,7 +39,7 @@ class FileDataSourceSummary:
 class FilePreview:
     """Preview of a file to import: summaries of its data sources, suggested reader options, and notes."""
 
-    sources: tuple[FileDataSourceSummary, ...]
+    sources: tuple[TopicOrColumnSummary, ...]
     reader_options: Mapping[str, Any] = field(default_factory=dict)  # named options of the reader
     notes: tuple[str, ...] = ()  # remarks for the user, such as guesses of units
 
@@ -77,7 +77,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
             raise DataError(
-                f"'{word}' is no unit", where="units", **unknown_name_details(word, chain(*_TO_SI.values()))
+                f"'{word}' is no unit", where="units", **unknown_name_error_arguments(word, chain(*_TO_SI.values()))
             )
         for quantity in (quantity for quantity, si in _QUANTITIES.items() if si == of):
             _set_unit(units, quantity, word)
@@ -100,11 +100,11 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
             what = f"a unit is given for '{quantity}', which is no quantity"
-            raise DataError(what, where=where, **unknown_name_details(quantity, _QUANTITIES))
+            raise DataError(what, where=where, **unknown_name_error_arguments(quantity, _QUANTITIES))
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
             what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
-            raise DataError(what, where=where, **unknown_name_details(unit, names))
+            raise DataError(what, where=where, **unknown_name_error_arguments(unit, names))
         factors[quantity] = known[_spaceless(unit)]
     return factors
 
@@ -140,7 +140,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
     """Convert a recording from the units of its file to SI units, select joints and points, and validate the result.
 
     `DataError` for a joint, point, quantity or unit that is not known, a current without torque constants, and as
-    `validate_recording`.
+    `validated_recording`.
     """
     factors = _factors(options.units or {}, where)
     group = raw.joints
@@ -150,7 +150,9 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
             names = parse_renamings(options.joints, "joint", where)
             _check_known(names, group.names, "joint", where)
         at = [group.names.index(name) for name in names]
-        channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in group.channels.items()}
+        channels: dict[str, Any] = {
+            name: factors[name] * values[:, at] for name, values in group.values_by_channel.items()
+        }
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
@@ -160,7 +162,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
         t, position = factors["t"] * entry.t, factors["points"] * entry.position
         seen.append(replace(entry, t=t, position=position, std=std))
     others = tuple(replace(entry, t=factors["t"] * entry.t) for entry in raw.channel_groups)
-    return validate_recording(replace(raw, joints=group, points=tuple(seen), channel_groups=others), where=where)
+    return validated_recording(replace(raw, joints=group, points=tuple(seen), channel_groups=others), where=where)
 
 
 def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:
@@ -180,7 +182,7 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
 def _check_known(chosen: Iterable[str], known: Sequence[str], noun: str, where: str) -> None:
     for name in chosen:
         if name not in known:
-            raise DataError(f"there is no {noun} '{name}'", where=where, **unknown_name_details(name, known))
+            raise DataError(f"there is no {noun} '{name}'", where=where, **unknown_name_error_arguments(name, known))
 
 
 def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
@@ -199,7 +201,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
                 what = f"{word} is given for '{pattern}', which is no joint"
-                raise DataError(what, where=where, **unknown_name_details(pattern, names))
+                raise DataError(what, where=where, **unknown_name_error_arguments(pattern, names))
             if not (math.isfinite(value) and value != 0):
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed="a number that is not zero")
     if _spaceless((options.units or {}).get("effort", "")) not in _CURRENTS:
@@ -280,10 +282,10 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     t = clock.t[kept]
 
     def joined(channel: str) -> Array:
-        columns = ((group.t, column) for _, group in groups for column in group.channels[channel].T)
+        columns = ((group.t, column) for _, group in groups for column in group.values_by_channel[channel].T)
         return np.stack([np.interp(t, known, column) for known, column in columns], axis=1)
 
-    channels: dict[str, Any] = {channel: joined(channel) for channel in clock.channels}
+    channels: dict[str, Any] = {channel: joined(channel) for channel in clock.values_by_channel}
     notes = []
     moved = [source for source, group in groups if not np.isin(t, group.t).all()]
     if moved:
@@ -311,9 +313,9 @@ def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str) -> Non
         if owner.setdefault(joint, source) != source:
             what = f"the joint '{joint}' is on {owner[joint]} and on {source}"
             raise DataError(what, where=where, allowed="every joint on one topic", hint=choose)
-    every = {channel for _, group in groups for channel in group.channels}
+    every = {channel for _, group in groups for channel in group.values_by_channel}
     for source, group in groups:
-        lacking = sorted(every - set(group.channels))
+        lacking = sorted(every - set(group.values_by_channel))
         if lacking:
             what = f"{source} has no {lacking[0]}, which another topic of joint states has"
             raise DataError(what, where=where, allowed="the same channels on every topic", hint=choose)

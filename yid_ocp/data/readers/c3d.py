@@ -31,7 +31,7 @@ class _Markers(NamedTuple):
     t: Array
     position: Array
     unit: str
-    others: tuple[base.FileDataSourceSummary, ...]
+    others: tuple[base.TopicOrColumnSummary, ...]
 
 
 @base.READERS.register(".c3d")
@@ -40,7 +40,7 @@ def read_c3d(
     *,
     points: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
-    sensor_description: str = "motion capture",
+    point_sensor_name: str = "motion capture",
     frame: str = "world",
     description: str = "",
 ) -> Recording:
@@ -52,13 +52,13 @@ def read_c3d(
     moments, powers) and analog channels. `points` are markers to keep, each with its name; all labelled ones that were
     ever seen when absent.
 
-    `DataError` where `ezc3d` is not installed, the file cannot be read or has no markers, and as `validate_recording`.
+    `DataError` where `ezc3d` is not installed, the file cannot be read or has no markers, and as `validated_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
     found = _markers(path)
     own = {"points": found.unit} if found.unit else {}
-    group = PointGroup("points", found.names, found.t, found.position, None, sensor_description, frame, None, "nominal")
+    group = PointGroup("points", found.names, found.t, found.position, None, point_sensor_name, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
     options = base.SelectionAndUnitOptions(points=points, units={**own, **(units or {})})
@@ -76,7 +76,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
     for i, name in enumerate(found.names):
         seen = np.isfinite(found.position[:, i]).all(axis=1)
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
-        sources.append(base.FileDataSourceSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
+        sources.append(base.TopicOrColumnSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
     notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
     return base.FilePreview((*sources, *found.others), {"points": {name: name for name in found.names}}, tuple(notes))
 
@@ -115,12 +115,12 @@ def _markers(path: Path) -> _Markers:
         what = "no labelled marker of the C3D file was ever seen"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
     others = [
-        base.FileDataSourceSummary(
+        base.TopicOrColumnSummary(
             labels[i] or f"marker {i + 1}", "marker", int(np.sum(~unseen[:, i])), rate, "", reason
         )
         for i, reason in why.items()
     ]
-    others += [base.FileDataSourceSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
+    others += [base.TopicOrColumnSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
     names, t = _short([labels[i] for i in kept]), np.arange(len(position)) / rate
     return _Markers(names, t, position[:, kept], unit, tuple(others))
 

@@ -20,14 +20,14 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
+    ClockKind,
     JointGroup,
     PointGroup,
-    RecordedOrNominalTimes,
     Recording,
     SensorChannelGroup,
 )
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_number_count, file_sha256
+from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
+from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
 from yid_ocp.sensors import CHANNEL_KINDS
 
 _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
@@ -59,8 +59,8 @@ class CsvOptions(base.SelectionAndUnitOptions):
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # leave out lines that are no rows of numbers, and count them in `notes`
     delimiter: str = ","  # one character between cells
-    clock: RecordedOrNominalTimes = "recorded"  # whether the times were measured
-    sensor_description: str = "unknown"  # what saw the points
+    clock: ClockKind = "recorded"  # whether the times were measured
+    point_sensor_name: str = "unknown"  # what saw the points
     frame: str = "world"  # their frame of reference
     description: str = ""  # what was recorded
 
@@ -80,7 +80,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     table has joints, points or such sensors together, a row in which all cells of one of them are empty is a time at
     which only the others were measured.
 
-    `DataError` where the file, a column, a cell, an option or a unit cannot be understood, and as `validate_recording`.
+    `DataError` where the file, a column, cell, option or unit cannot be understood, and as `validated_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
@@ -115,7 +115,7 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
         own: dict[str, Any] = {name: values[rows] for name, values in channels.items()}
         joints = JointGroup(joint_names, t[rows], clock=options.clock, **own)
     if point_names:
-        rows, said = measured([position]), (options.sensor_description, options.frame, None, options.clock)
+        rows, said = measured([position]), (options.point_sensor_name, options.frame, None, options.clock)
         points.append(PointGroup("points", point_names, t[rows], position[rows], None, *said))
     for name, (names, parts) in mounted.items():
         rows = measured(list(parts.values()))
@@ -194,7 +194,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
         becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "its name does not say what it is"
         rate = base.mean_sample_rate(t) if ok else math.nan
-        sources.append(base.FileDataSourceSummary(name, kind, count, rate, becomes, note))
+        sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
     notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
@@ -220,7 +220,7 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
             for cells in lines:
                 count += len(cells) + _LINE_COST
                 if count > MAX_INPUT_NUMBERS:
-                    check_number_count(count, str(path))
+                    check_max_input_numbers(count, str(path))
                 if len(cells) > _MAX_COLUMNS:
                     what, hint = f"the table has {len(cells)} columns", "see whether the delimiter is right"
                     raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)
@@ -323,7 +323,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         found = {name: match for name in header if (match := re.fullmatch(pattern, name))}
         if not found:
             what = f"there is no column '{key}'"
-            raise DataError(what, where=where, **unknown_name_details(key, header))
+            raise DataError(what, where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: dict[str, _Meaning] = {}
@@ -337,10 +337,8 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' mean the same, {' '.join(own).strip()}"
-            allowed, hint = (
-                "one column for every channel",
-                f"leave one out: --columns {name}={base.SKIPPED_COLUMN_MEANING}",
-            )
+            allowed = "one column for every channel"
+            hint = f"leave one out: --columns {name}={base.SKIPPED_COLUMN_MEANING}"
             raise DataError(what, where=where, allowed=allowed, hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:

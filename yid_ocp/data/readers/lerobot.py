@@ -14,8 +14,8 @@ from pydantic import BaseModel, Field, ValidationError
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.errors import DataError, unknown_name_details
-from yid_ocp.files import check_input_file, check_number_count, file_sha256, read_input_json
+from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.files import check_input_file, check_max_input_numbers, file_sha256, read_input_json
 
 _STATE, _ACTION = "observation.state", "action"
 _CHANNELS = {
@@ -73,7 +73,7 @@ def read_lerobot_episode(
     robots record degrees.
 
     `DataError` where `pyarrow` is not installed, the dataset is not understood or has no such episode, and as
-    `validate_recording`.
+    `validated_recording`.
     """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
@@ -99,7 +99,7 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     for name, feature in dataset.info.features.items():
         becomes = "position_command" if name == _ACTION else f"joints {', '.join(names)}"
         own = (becomes, "") if name not in left else ("", left[name])
-        sources.append(base.FileDataSourceSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
+        sources.append(base.TopicOrColumnSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
     units, guesses = base.guess_units(Recording(group))
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
@@ -122,7 +122,9 @@ def _dataset(folder: Path) -> _Dataset:
     if version not in _VERSIONS:
         raise DataError(f"the dataset is of version {version}", where=where, allowed=", ".join(_VERSIONS), hint=hint)
     if _STATE not in info.features:
-        raise DataError(f"the dataset has no {_STATE}", where=where, **unknown_name_details(_STATE, info.features))
+        raise DataError(
+            f"the dataset has no {_STATE}", where=where, **unknown_name_error_arguments(_STATE, info.features)
+        )
     return _Dataset(folder, info)
 
 
@@ -177,7 +179,7 @@ def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     held = (group.column(i) for group in groups for i in range(group.num_columns))
     count = sum(column.num_values for column in held if column.path_in_schema.split(".list.")[0] in columns)
-    check_number_count(count + 3 * metadata.num_rows, where)  # a row is a list of its own
+    check_max_input_numbers(count + 3 * metadata.num_rows, where)  # a row is a list of its own
 
 
 def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:

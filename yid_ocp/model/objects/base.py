@@ -55,8 +55,8 @@ class ClampPoseDefinition:
     """
 
     clamp_name: str
-    origin_point: str
-    z_axis_point: str
+    origin_point_name: str
+    z_axis_point_name: str
     roll_convention: Literal["level", "transported"] = "level"
 
 
@@ -64,52 +64,50 @@ class ClampPoseDefinition:
 class CableTopology:
     """Topology of a branched cable: vertices along the parent and child branches, and their undeformed positions."""
 
-    points_along_parent_branch: tuple[str, ...]  # from clamp to clamp; the clamps hold the first and last two vertices
-    points_along_child_branches: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
+    parent_branch_point_names: tuple[str, ...]  # from clamp to clamp; the clamps hold the first and last two vertices
+    child_branch_point_names: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
     undeformed_positions: Mapping[str, ArrayLike]  # position of every unloaded vertex, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
-        free = self.points_along_parent_branch[2:-2]
+        free = self.parent_branch_point_names[2:-2]
         if not free:
-            what, allowed = (
-                f"the parent has {len(self.points_along_parent_branch)} vertices",
-                "5 or more: two held at each end",
-            )
+            what = f"the parent has {len(self.parent_branch_point_names)} vertices"
+            allowed = "5 or more: two held at each end"
             raise ModelError(what, where="cable", allowed=allowed)
-        for name, vertices in self.points_along_child_branches.items():
+        for name, vertices in self.child_branch_point_names.items():
             if len(vertices) < 2 or vertices[0] not in free:
                 what = f"child '{name}' does not leave the parent at one of its free vertices"
                 raise ModelError(what, where="cable", allowed=", ".join(free))
-        for vertex in self.vertices:
+        for vertex in self.vertex_names:
             if vertex not in self.undeformed_positions:
                 hint = nearest_name_hint(vertex, self.undeformed_positions)
                 raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", hint=hint)
-        if len(set(self.vertices)) != len(self.vertices):
+        if len(set(self.vertex_names)) != len(self.vertex_names):
             raise ModelError("a vertex belongs to two branches", where="cable")
 
     @property
-    def vertices(self) -> tuple[str, ...]:
+    def vertex_names(self) -> tuple[str, ...]:
         """Names of all vertices, those of the parent branch first."""
         return (
-            *self.points_along_parent_branch,
-            *(vertex for chain in self.points_along_child_branches.values() for vertex in chain[1:]),
+            *self.parent_branch_point_names,
+            *(vertex for chain in self.child_branch_point_names.values() for vertex in chain[1:]),
         )
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
         """Names of the four clamped vertices, the first and last two of the parent branch."""
-        return (*self.points_along_parent_branch[:2], *self.points_along_parent_branch[-2:])
+        return (*self.parent_branch_point_names[:2], *self.parent_branch_point_names[-2:])
 
     @property
     def free_vertex_names(self) -> tuple[str, ...]:
         """Names of the vertices that no clamp holds; predictions are evaluated at them."""
-        return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertex_names)
+        return tuple(vertex for vertex in self.vertex_names if vertex not in self.clamped_vertex_names)
 
     @property
     def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
         """Vertex names of every branch by segment name, the parent branch first."""
-        return {self.parent_segment: self.points_along_parent_branch, **self.points_along_child_branches}
+        return {self.parent_segment: self.parent_branch_point_names, **self.child_branch_point_names}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
@@ -117,9 +115,9 @@ class CableTopology:
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
-    def clamp_pose_definitions(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
+    def clamp_poses_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Definitions of the poses of the two clamps, at the start and at the end."""
-        a, b, *_, y, z = self.points_along_parent_branch
+        a, b, *_, y, z = self.parent_branch_point_names
         start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
         return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
 
@@ -132,7 +130,7 @@ class CableTopology:
 
 
 @dataclass(frozen=True)
-class InitObjectConfiguration:
+class InitCommandObject:
     """An object from the command line of `init`: its settings, and start values of its free parameters."""
 
     settings: ObjectKind  # without its mount
@@ -143,7 +141,7 @@ class InitObjectConfiguration:
 
 
 @dataclass(frozen=True)
-class InitObjectTemplate:
+class InitCommandObjectTemplate:
     """Template for one word of `init --object`: how the object is built and which numbers it requires.
 
     `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
@@ -151,7 +149,7 @@ class InitObjectTemplate:
     """
 
     default_links: int  # per segment
-    build: Callable[[Mapping[str, Any], int], InitObjectConfiguration]
+    build: Callable[[Mapping[str, Any], int], InitCommandObject]
     # names beside length, mass and radius that `--number NAME=VALUE` takes, with their meanings
     further_numbers: Mapping[str, str] = field(default_factory=dict)
     has_branches: bool = False
@@ -198,7 +196,7 @@ class ObjectKind:
 
     # whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition
     default_link_refinement: ClassVar[bool] = False
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {}  # words of `init --object`
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("what the object is")]
@@ -222,7 +220,7 @@ class ObjectKind:
         return False
 
     @property
-    def links_per_segment_or_total(self) -> int | None:
+    def n_links_per_segment_or_total(self) -> int | None:
         """Number of links per segment, or in total if segments differ; None if the object has no such segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.build_segments()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
@@ -230,7 +228,7 @@ class ObjectKind:
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Factor on a per-joint parameter that keeps its segment's stiffness if each link is divided; 1 for others."""
         owner, _, quantity = parameter.rpartition(".")
-        per_joint = {segment.name for segment in self.build_segments() if not segment.stiffness_per_curvature}
+        per_joint = {segment.name for segment in self.build_segments() if not segment.has_stiffness_per_curvature}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
@@ -263,7 +261,7 @@ class ClampedObject(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedObject(ObjectKind):
+class MountedObjectKind(ObjectKind):
     """Base class of objects whose root is mounted on a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[
@@ -286,6 +284,6 @@ class MountedObject(ObjectKind):
 OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
-def init_object_templates() -> dict[str, InitObjectTemplate]:
+def init_command_object_templates() -> dict[str, InitCommandObjectTemplate]:
     """Templates of all object kinds, by their word for `init --object`."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

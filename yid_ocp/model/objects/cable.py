@@ -34,14 +34,14 @@ from yid_ocp.model.flexible import (
     ElasticJoint,
     FlexibleObject,
     Segment,
+    edge_to_edge_transport_rotations,
     flexible_object,
-    relative_parallel_transport_rotations,
 )
 from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
-from yid_ocp.model.system import Grasp, System, SystemBuildArguments, floating_clamp
+from yid_ocp.model.system import Grasp, System, SystemBuildArguments, floating_joint_mechanism
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -83,18 +83,18 @@ class CableOptions:
     radius: Annotated[float, Gt(0), Le(1), OptionInfo("of the solid cylinders that give the links' inertia", "m")] = (
         0.005
     )
-    end_clamp_kind: Annotated[
+    end_clamp_grasp_kind: Annotated[
         Literal["axis", "weld"],
         OptionInfo("whether the end clamp leaves the roll free or holds it at the parameter clamp_end.roll"),
     ] = "axis"
-    undeformed_rest_shape: Annotated[
+    rests_in_undeformed_shape: Annotated[
         bool, OptionInfo("whether branches rest in their undeformed shape, or straight")
     ] = True
     rigid_first_edge: Annotated[
         bool,
         OptionInfo("whether the first edge is rigid up to its second point, so that half of the next one bends alone"),
     ] = False
-    lengths_per_recording: Annotated[
+    has_edge_lengths_per_recording: Annotated[
         bool, OptionInfo("whether every recording has edge lengths of its own; every edge then has a length parameter")
     ] = True
     shape_memory_fraction: Annotated[
@@ -109,7 +109,7 @@ class CableOptions:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
 
-def read_vertex_positions(path: str | Path) -> dict[str, Array]:
+def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
     """Read vertex positions [m] by name from a CSV table with columns point, x, y, z; `DataError` for another file."""
     try:
         rows = csv.DictReader(read_input_text(Path(path)).splitlines())
@@ -121,9 +121,7 @@ def read_vertex_positions(path: str | Path) -> dict[str, Array]:
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of a cable's length parameters by name, from the lengths [m] of its edges."""
-    values = {
-        f"{START_CLAMP}.length": lengths[cable.points_along_parent_branch[0], cable.points_along_parent_branch[1]]
-    }
+    values = {f"{START_CLAMP}.length": lengths[cable.parent_branch_point_names[0], cable.parent_branch_point_names[1]]}
     for name, chain in cable.vertex_names_by_branch.items():
         first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
@@ -131,7 +129,7 @@ def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[st
     return values
 
 
-def cable_system(
+def clamped_cable_system(
     lengths: Mapping[tuple[str, str], float], cable: CableTopology, options: CableOptions | None = None
 ) -> System:
     """Build the system of a cable held by two clamps, from the lengths [m] of all its edges.
@@ -146,18 +144,18 @@ def cable_system(
         item = _with_rest_angles(item)
     if options.shape_memory_fraction is not None:
         item = _with_memory(item, options.shape_memory_fraction)
-    clamps = _start_clamp(lengths[cable.points_along_parent_branch[0], cable.points_along_parent_branch[1]], cable)
-    clamps = clamps.with_attached_mechanism(floating_clamp(END_CLAMP))
+    clamps = _start_clamp(lengths[cable.parent_branch_point_names[0], cable.parent_branch_point_names[1]], cable)
+    clamps = clamps.with_attached_mechanism(floating_joint_mechanism(END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
-    if options.end_clamp_kind == "weld":
+    if options.end_clamp_grasp_kind == "weld":
         text = "roll of the end clamp about the last edge"
         end_roll = Parameter(f"{END_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
         clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
         rotation = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], end_roll.symbol)
     hung = (_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None)
-    held = Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp_kind, rotation)
+    held = Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp_grasp_kind, rotation)
     known: SystemBuildArguments = {"objects": [hung], "grasps": [held], "prescribed": clamps.joint_names, "damping": {}}
-    known |= {"gravity": options.gravity, "point_frames": cable.vertices}
+    known |= {"gravity": options.gravity, "point_frames": cable.vertex_names}
     return System.build(clamps, **known)
 
 
@@ -213,16 +211,16 @@ def _with_vertices(
     last = tree.joint_index(item.segment_layouts[0].link_joints[-1][-1])
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
-    edges = np.array([lengths[edge] for edge in pairwise(cable.points_along_parent_branch)])
+    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_branch_point_names)])
     whole = ArcLengthChain(
-        (cable.points_along_parent_branch[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
+        (cable.parent_branch_point_names[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
     )
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
 
 
 def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
-    clamp = floating_clamp(START_CLAMP)
+    clamp = floating_joint_mechanism(START_CLAMP)
     text = "roll of the start clamp about the first edge"
     roll = Parameter(f"{START_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
     edge = Parameter(f"{START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
@@ -231,16 +229,16 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     frames = {
         **clamp.frames,
-        cable.points_along_parent_branch[0]: carrier,
-        cable.points_along_parent_branch[1]: tip,
+        cable.parent_branch_point_names[0]: carrier,
+        cable.parent_branch_point_names[1]: tip,
         _START_EDGE_FRAME: tip,
     }
     return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
 def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
-    parent = cable.points_along_parent_branch
-    turns = relative_parallel_transport_rotations(cable.undeformed_polyline(parent))
+    parent = cable.parent_branch_point_names
+    turns = edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
     for turn in turns[1:]:
@@ -252,12 +250,10 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
             junction = parent.index(chain[0])
-            own, before = (
-                relative_parallel_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1]),
-                None,
-            )
+            own = edge_to_edge_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1])
+            before = None
             at = junction - 2
-        if not options.undeformed_rest_shape:
+        if not options.rests_in_undeformed_shape:
             own = [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
         edges = [lengths[edge] for edge in pairwise(chain)]
         segment = Segment(
@@ -270,8 +266,8 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             twist=branch.twist_rigidity,
             damping=branch.bend_damping,
             twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
-            stiffness_per_curvature=True,
-            has_link_length_parameters=options.lengths_per_recording,
+            has_stiffness_per_curvature=True,
+            has_link_length_parameters=options.has_edge_lengths_per_recording,
         )
         segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
         segment = replace(segment, rest_rotation=own[0], link_rest_rotations=own[1:], clamped_edge_length=before)
@@ -289,28 +285,28 @@ class Cable(CableOptions, ObjectKind):
 model:
   object:
     kind: cable
-    points_along_parent_branch: [p0, p1, p2, p3, p4, p5]
-    points_along_child_branches: {side: [p2, s1, s2]}
+    parent_branch_point_names: [p0, p1, p2, p3, p4, p5]
+    child_branch_point_names: {side: [p2, s1, s2]}
     undeformed_shape_file: undeformed.csv
-    end_clamp_kind: axis
+    end_clamp_grasp_kind: axis
 """,
         "model.object.branch_properties.NAME": """\
 model:
   object:
     kind: cable
-    points_along_parent_branch: [p0, p1, p2, p3, p4, p5]
+    parent_branch_point_names: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
-    points_along_child_branches: {side: [p2, s1, s2]}
+    child_branch_point_names: {side: [p2, s1, s2]}
     branch_properties:
       side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     }
 
     kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
-    points_along_parent_branch: Annotated[
+    parent_branch_point_names: Annotated[
         tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")
     ]
-    points_along_child_branches: Annotated[
+    child_branch_point_names: Annotated[
         Mapping[str, tuple[str, ...]],
         OptionInfo("points of every branch, the first one the parent's at which it leaves"),
     ] = field(default_factory=dict)
@@ -321,8 +317,8 @@ model:
     ]
 
     def topology(self) -> CableTopology:
-        undeformed = read_vertex_positions(self.undeformed_shape_file)
-        found = CableTopology(self.points_along_parent_branch, dict(self.points_along_child_branches), undeformed)
+        undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
+        found = CableTopology(self.parent_branch_point_names, dict(self.child_branch_point_names), undeformed)
         for name in self.branch_properties:
             if name not in found.vertex_names_by_branch:
                 hint = nearest_name_hint(name, found.vertex_names_by_branch)
@@ -330,7 +326,9 @@ model:
         return found
 
     def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
-        return cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
+        return clamped_cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        return edge_length_parameter_values(self.topology(), edge_lengths) if self.lengths_per_recording else {}
+        return (
+            edge_length_parameter_values(self.topology(), edge_lengths) if self.has_edge_lengths_per_recording else {}
+        )

@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectConfiguration, InitObjectTemplate, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObjectKind
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -34,19 +34,21 @@ def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObje
     return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     names = [f"{segment.name}.{quantity}" for segment in foam_y_segments() for quantity in ("bend", "twist")]
-    return InitObjectConfiguration(
+    return InitCommandObject(
         FoamY(links=links), dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]", True
     )
 
 
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
-class FoamY(MountedObject):
+class FoamY(MountedObjectKind):
     """The source paper's foam letter Y; without a mount its foot stands where it does in the paper."""
 
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {"foam_y": InitObjectTemplate(4, _init_object)}
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
+        "foam_y": InitCommandObjectTemplate(4, _init_object)
+    }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: foam_y": """\
 model:

@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectConfiguration, InitObjectTemplate, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObjectKind
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -44,7 +44,7 @@ class FlexibleSegmentSettings:
     ] = None
     rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = _NO_TURN
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
-    stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
+    has_stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
     has_link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = (
@@ -58,13 +58,13 @@ class FlexibleSegmentSettings:
             raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)
         n = link_division
         # a rigidity does not depend on the number of links, a stiffness per joint does
-        factor = 1 if self.stiffness_per_curvature else n
+        factor = 1 if self.has_stiffness_per_curvature else n
         lengths, index = self.link_lengths, self.parent_link_index
         same = (
             "mass",
             "radius",
             "parent",
-            "stiffness_per_curvature",
+            "has_stiffness_per_curvature",
             "clamped_at_base",
             "joint_axes",
             "cross_section_size",
@@ -93,22 +93,22 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
     section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
-    return FlexibleSegmentSettings(stiffness_per_curvature=True, clamped_at_base=more.get("parent") is None, **more)
+    return FlexibleSegmentSettings(has_stiffness_per_curvature=True, clamped_at_base=more.get("parent") is None, **more)
 
 
-def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitObjectConfiguration:
+def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
     item = SegmentedObject(segments=segments)
-    return InitObjectConfiguration(item, base.bending_start_values(item.build_segments(), _RIGIDITY_RATIO[word]))
+    return InitCommandObject(item, base.bending_start_values(item.build_segments(), _RIGIDITY_RATIO[word]))
 
 
-def _cable(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
+def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_DESCRIPTIONS)
     section = _section(numbers)
     segment = _init_segment(links, length, mass, None if section else radius, cross_section_size=section)
     return _init_object("cable", {"cable": segment})
 
 
-def _beam(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
+def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     sizes = {name: base.SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
     length, mass = base.required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
@@ -119,7 +119,7 @@ def _beam(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
     return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section_size=section)})
 
 
-def _tree(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
+def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     if numbers.get("branch"):
         return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
     if not numbers.get("branches"):
@@ -171,14 +171,14 @@ def _branch(text: str, links: int) -> tuple[str, FlexibleSegmentSettings]:
 
 @OBJECT_KINDS.register("segments")
 @dataclass(frozen=True, kw_only=True)
-class SegmentedObject(MountedObject):
+class SegmentedObject(MountedObjectKind):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
-        "cable": InitObjectTemplate(8, _cable),
-        "beam": InitObjectTemplate(6, _beam),
-        "tree": InitObjectTemplate(4, _tree, has_branches=True),
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
+        "cable": InitCommandObjectTemplate(8, _cable),
+        "beam": InitCommandObjectTemplate(6, _beam),
+        "tree": InitCommandObjectTemplate(4, _tree, has_branches=True),
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: segments": """\
@@ -196,7 +196,7 @@ model:
     kind: segments
     segments:
       beam: {length: 0.52, mass: 0.33, cross_section_size: [0.001, 0.08], links: 8, joint_axes: y, \
-stiffness_per_curvature: true, clamped_at_base: true}
+has_stiffness_per_curvature: true, clamped_at_base: true}
 """,
     }
 

@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, Segment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectConfiguration, InitObjectTemplate, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObjectKind
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -21,17 +21,17 @@ _SEGMENT = "rod"
 _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     length, mass, radius, tip = base.required_object_numbers(
         "a tapered rod", numbers, base.SIZE_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitObjectConfiguration(item, base.bending_start_values(item.build_segments(), 1.0))
+    return InitCommandObject(item, base.bending_start_values(item.build_segments(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
 @dataclass(frozen=True, kw_only=True)
-class TaperedRod(MountedObject):
+class TaperedRod(MountedObjectKind):
     """A solid round rod whose radius changes linearly from its clamped base to its tip; the segment is called `rod`.
 
     `rod.bend`, `rod.twist` and `rod.damping` are per curvature at the base; a section of radius r has (r/base radius)^4
@@ -39,8 +39,8 @@ class TaperedRod(MountedObject):
     """
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
-        "tapered_rod": InitObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
+        "tapered_rod": InitCommandObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: tapered_rod": """\
@@ -62,7 +62,7 @@ parameters:
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Build the rod as one segment with the base's radius; `build` then tapers its links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
-        rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_per_curvature=True, clamped_at_base=True)
+        rod = Segment(_SEGMENT, *sizes, damping=damping, has_stiffness_per_curvature=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:

@@ -11,9 +11,9 @@ import numpy as np
 
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.diagnosis_result import ignored_after_overspeed_messages
-from yid_ocp.diagnosis.localise import smoothed_unknown_units, smoothed_unknown_z_scores
+from yid_ocp.diagnosis.localise import smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.inference.null_test import residual_channel_indices
-from yid_ocp.inference.smoother import SmootherResult
+from yid_ocp.inference.smoother import SmoothedUnknownsResult
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
@@ -111,7 +111,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     }
     evidence = smoothed.log_evidence
     side = (
-        f"By evidence the gap lies in {verdicts[smoothed.gap_origin]}: the log evidence rises by "
+        f"By evidence the gap lies in {verdicts[smoothed.plant_or_sensor_origin]}: the log evidence rises by "
         f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
         f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap where it was fitted."
@@ -142,12 +142,12 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     return "Where it is, and when", sentences, maps
 
 
-def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: list[int]) -> tuple[Any, str]:
+def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int, kept: list[int]) -> tuple[Any, str]:
     """Map of the unknowns `kept` over recording i, and a sentence on the surest value."""
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
-    _, _, values = smoothed_unknown_z_scores(smoothed, i, finding.thresholds.informed_fraction)
+    _, _, values = z_scores_of_smoothed_unknowns(smoothed, i, finding.thresholds.informed_fraction)
     units = smoothed_unknown_units(finding.nominal_model.problem.system, trace)
     mean, std = trace.posterior_mean * trace.reference_std, trace.posterior_std * trace.reference_std
     axis = "value in its standard deviations"
@@ -262,7 +262,7 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
         f"Alike: {listed}." if close else f"No two of them are alike; the closest are {said[0][1]}.",
     ]
-    figure = figures.explained_fraction_matrix_figure(names, values)
+    figure = figures.confusability_matrix_figure(names, values)
     return "What could be mistaken for what", sentences, [("", figure)]
 
 
@@ -276,7 +276,7 @@ def _curves(
         for k, samples in enumerate(episode.measurements):
             sensor = samples.sensor
             t = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
-            for column, channel in enumerate(samples.output_channel_names):
+            for column, channel in enumerate(samples.channel_name_per_output):
                 y, std = samples.value[:, column], samples.std[:, column]
                 own = (outcome.predicted_outputs[k][:, column] for outcome in outcomes)
                 lines = dict(zip(labels, own, strict=False))

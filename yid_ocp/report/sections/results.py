@@ -22,7 +22,7 @@ from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_traje
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import interval_and_p_value_calibration_rates
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
-from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, SummaryBlock, SummaryStatement, SummaryTable
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, StatementTableOrCode, SummaryStatement, SummaryTable
 
 _MAX_ANIMATIONS = 4  # a page with more is slow to open
 _MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
@@ -51,9 +51,9 @@ def _remaining_tables(findings: ReportData) -> Mapping[str, Any] | None:
     return {"blocks": rest} if rest else None
 
 
-def _result_blocks(findings: ReportData) -> tuple[list[str], list[SummaryBlock], list[SummaryBlock]]:
+def _result_blocks(findings: ReportData) -> tuple[list[str], list[StatementTableOrCode], list[StatementTableOrCode]]:
     """Conclusions and verdicts of a result, and the other blocks up to its key table and after it."""
-    known = SUMMARY_BY_FORMAT.get(str(findings.result.get("format")))
+    known = SUMMARY_BY_RESULT_FORMAT.get(str(findings.result.get("format")))
     blocks = [] if known is None else known(findings.result)
     ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, SummaryTable) and block.is_key_table)
     end = next(ends, 0)
@@ -234,7 +234,7 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
     for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
         if not isinstance(prediction, str):
-            shared, _ = problem.theta_and_initial_state_offset(solution.x, i)
+            shared, _ = problem.theta_and_initial_state_deviation(solution.x, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
             yield _PredictedEpisode(role, problem, theta, episode, prediction)
 
@@ -285,7 +285,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
         t = grid.start_time + grid.time_step * (samples.node + samples.fraction)
         if sensor.point_names and len(t) < grid.steps / 2:
             # what a sensor that looks seldom would have seen at every node
-            values = own.problem.predictor.node_values(own.prediction.rollout)
+            values = own.problem.predictor.state_values_at_nodes(own.prediction.rollout)
             course = own.problem.model_functions.compiled_sensor_function(sensor)(values, own.theta).output
         names, width = sensor.channel_names, sensor.outputs_per_channel
         parts = {name: range(width * c, width * (c + 1)) for c, name in enumerate(names)} if width > 1 else {}
@@ -306,7 +306,7 @@ def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
     for recording, group in ((own, group) for own in recordings for group in own.joint_and_point_groups):
         if isinstance(group, JointGroup):
             for channel in _JOINT_CHANNEL_UNITS:
-                values = group.channels.get(channel)
+                values = group.values_by_channel.get(channel)
                 if values is not None:
                     words, unit = channel.replace("_", " "), _joint_channel_unit(system, group.names, channel)
                     curve = TimePlotData(f"{words} [{unit}]", _lines(group.t, group.names, values))
