@@ -219,7 +219,7 @@ track:
 """,
     "track.options": """\
 track:
-  options: {max_mean_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
+  options: {max_frame_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
 """,
     "track.options.filters": """\
 track:

@@ -171,7 +171,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
     def broken(arguments):
         raise ZeroDivisionError("no good")
 
-    monkeypatch.setattr("yid_ocp.workflow.check.run", broken)
+    monkeypatch.setattr("yid_ocp.workflow.check.run_from_arguments", broken)
     bug = cli("check", pendulum, "--json")
     said = json.loads(bug.out)
     assert (bug.code, said["exit_code"], said["kind"], said["what"]) == (3, 3, "bug", "ZeroDivisionError: no good")
@@ -180,7 +180,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
     def stopped(arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("yid_ocp.workflow.check.run", stopped)
+    monkeypatch.setattr("yid_ocp.workflow.check.run_from_arguments", stopped)
     ended = cli("check", pendulum, "--json")
     assert (ended.code, json.loads(ended.out)["exit_code"]) == (130, 130)
 
@@ -191,7 +191,7 @@ def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
             logging.getLogger("yid_ocp.model").warning(text)
         return 0
 
-    monkeypatch.setattr("yid_ocp.workflow.check.run", noted)
+    monkeypatch.setattr("yid_ocp.workflow.check.run_from_arguments", noted)
     for _ in range(2):
         assert cli("check", pendulum).err == "notice: a coupling is not modelled\nnotice: another thing\n"
 

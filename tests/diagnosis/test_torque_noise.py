@@ -108,7 +108,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     for group in ("whitening_filters", "held_out_whitening_filters"):
         [before], [after] = getattr(wide, group), getattr(moved, group)
         assert after.filter_steps is before.filter_steps
-        biases = before.input_errors.torque_bias - 0.3, after.input_errors.torque_bias
+        biases = before.input_error_model.torque_bias - 0.3, after.input_error_model.torque_bias
         np.testing.assert_allclose(*biases, atol=1e-12)
     there, then = (problem_whitened_by_sensor_noise(own).evaluate(at) for own, at in ((moved, x), (wide, frozen)))
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)

@@ -19,8 +19,8 @@ from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
     residual_channel_indices,
+    residual_chi2_null_test,
     residuals_exceed_noise,
-    run_null_test,
     whiten_with_extra_errors,
 )
 from yid_ocp.inference.uncertainty import (
@@ -391,7 +391,7 @@ CHI2 = scipy.stats.chi2
     ids=["white", "less parameters", "coloured", "coloured less parameters", "a lag apart", "as many", "too many"],
 )
 def test_the_whole_residual_against_chi_squared(count, value, parameters, colour, degrees, ratio):
-    found = run_null_test([series(range(count), colour=colour)], np.full(count, value), parameters)
+    found = residual_chi2_null_test([series(range(count), colour=colour)], np.full(count, value), parameters)
     assert found.degrees_of_freedom == pytest.approx(degrees)
     assert found.chi2_per_dof == pytest.approx(ratio)
     assert found.p_value == pytest.approx(CHI2.sf(ratio * degrees, degrees), rel=1e-12)
@@ -412,7 +412,7 @@ def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_fo
 def test_several_series_add_and_rows_of_no_series_do_not_count():
     residual = np.array([1.0, 2.0, 3.0, 50.0, 4.0, 60.0])
     parts = [series([0, 1]), series([2, 4], channel="points.other", colour=(1.0, 0.5))]
-    found = run_null_test(parts, residual, 1)
+    found = residual_chi2_null_test(parts, residual, 1)
     assert found.degrees_of_freedom == pytest.approx(2 + 2 / 1.5 - 1)
     assert found.chi2_per_dof == pytest.approx((1 + 4 + 9 + 16) / 3)
     assert found.channel_chi2 == {"points.tip": pytest.approx(2.5), "points.other": pytest.approx(12.5)}
@@ -463,7 +463,7 @@ RATES = [(0.1, (0.02, 0.5, 0.6, 0.7), (0,)), (0.05, (0.02, 0.5, 0.6, 0.7), ())]
 
 @pytest.mark.parametrize(("level", "p_values", "flagged"), [*((0.01, *case) for case in (*FEW, *SOME, ALL)), *RATES])
 def test_windows_are_flagged_by_their_false_discovery_rate(level, p_values, flagged):
-    found = run_null_test(*with_p_values(*p_values), 0, level=level).windows
+    found = residual_chi2_null_test(*with_p_values(*p_values), 0, level=level).windows
     assert len(found) == 4
     assert tuple(i for i, entry in enumerate(found) if entry.is_flagged) == flagged
 
@@ -471,7 +471,7 @@ def test_windows_are_flagged_by_their_false_discovery_rate(level, p_values, flag
 def test_columns_of_a_channel_share_windows_and_recordings_do_not():
     residual = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     parts = [series([0, 1]), series([2, 3]), series([4], recording="second"), series([5], channel="points.other")]
-    found = run_null_test(parts, residual, 0).windows
+    found = residual_chi2_null_test(parts, residual, 0).windows
     places = [("run", "points.tip"), ("second", "points.tip"), ("run", "points.other")]
     assert [(w.recording, w.channel) for w in found] == places
 
@@ -480,7 +480,7 @@ def test_windows_are_as_long_as_wanted_and_reach_the_last_sample():
     t = [0.0, 0.25, 0.5, 0.75, 1.0, 2.1]
     parts = [series(range(3), t[:3]), series([3, 4, 5], t[3:])]
     for length, expected in ((0.5, [(0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (2.0, 2.1)]), (3.0, [(0.0, 2.1)])):
-        found = run_null_test(parts, np.ones(6), 0, window=length).windows
+        found = residual_chi2_null_test(parts, np.ones(6), 0, window=length).windows
         assert [(w.start_time, w.end_time) for w in found] == expected
 
 

@@ -227,7 +227,7 @@ def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folde
     [effect] = limited.system.effects
     name = effect.amplitude_names[0]
     power = TORQUE_SATURATION_EXPONENT
-    told = effect.reported_parameters({name: 5.0**-power}, {name: 0.01 * power * 5.0**-power})["limit"]
+    told = effect.parameters_as_reported({name: 5.0**-power}, {name: 0.01 * power * 5.0**-power})["limit"]
     assert (told.value, told.std, told.unit) == (pytest.approx(5.0), pytest.approx(0.05), "N m")
     one = problem_of(limited, made, ["shoulder.damping"], far)
     other = problem_of(step, made, ["shoulder.damping"], {"shoulder.servo_torque_limit": 5.0})

@@ -113,7 +113,7 @@ def ball(urdf_folder):
 
 
 def centre(surfaces, q):
-    return surfaces.part_poses_at(q)[surfaces.part_joints.index(1)][:3, 3]
+    return surfaces.part_poses_at_configuration(q)[surfaces.part_joints.index(1)][:3, 3]
 
 
 def test_distances_follow_the_joints(ball):

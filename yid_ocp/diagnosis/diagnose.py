@@ -65,7 +65,7 @@ from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
     residual_channel_indices,
-    run_null_test,
+    residual_chi2_null_test,
     whiten_with_extra_errors,
 )
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, select_and_smooth_unknowns
@@ -493,7 +493,7 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
     """The null test of a residual from which so many fitted parameters took their part."""
     samples = residual_channel_indices(problem)
-    return run_null_test(samples, residual, fitted, limits.significance_level, limits.residual_window)
+    return residual_chi2_null_test(samples, residual, fitted, limits.significance_level, limits.residual_window)
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:

@@ -170,7 +170,7 @@ class Payload(EffectBase):
         other = float(np.clip(opposite, self.definitions[0].lower, self.definitions[0].upper))
         return {f"{self.label}.mass": other} if other * mass < 0 else None
 
-    def reported_parameters(
+    def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
         """Reported mass and acting first moments; moments beyond the position limit have no standard deviation."""

@@ -71,7 +71,7 @@ class KalmanStepMatrices:
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
-    def smoothed_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
+    def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
         """Smoothed measurement noise (r, c), and the costate (nx, c) before the step, from the costate after it.
 
         The smoothed state is the filter's prediction + P costate.

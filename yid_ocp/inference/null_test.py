@@ -109,7 +109,7 @@ def chi2_p_value(chi2: float, degrees: float) -> float:
     return float(scipy.special.chdtrc(degrees, max(chi2, 0.0))) if degrees else 1.0
 
 
-def run_null_test(
+def residual_chi2_null_test(
     series: Sequence[ResidualChannel],
     residual: Array,
     parameters: int,

@@ -171,7 +171,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
         update = updates[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        noise, r = update.step.smoothed_noise_and_costate(update.white, r)
+        noise, r = update.step.smoothed_measurement_noise_and_costate(update.white, r)
         left.append(noise)
         n = update.step.costate_covariance_before_step(n)
         smoothed[j] = (update.mean + update.p @ r)[ns:]
@@ -195,7 +195,7 @@ def _run(models: _Models, variance: _Variances) -> _State:
     """All recordings at given variances; without smoothed unknowns where rounding shows."""
 
     def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
-        done = _forwards(model, model.unknown_variances_from_groups(variance), True)
+        done = _forwards(model, model.smoothed_unknown_prior_variances(variance), True)
         return done, _backwards(done) if done.updates else None
 
     filtered, smoothed = zip(*map_in_threads(run, models), strict=True)
@@ -266,7 +266,9 @@ def _largest_evidences(models: _Models, variance: _Variances, sources: _Groups) 
     """`_largest_evidence` of several groups, each on top of the same variances."""
     if not sources:
         return []
-    bases = map_in_threads(lambda model: _forwards(model, model.unknown_variances_from_groups(variance), True), models)
+    bases = map_in_threads(
+        lambda model: _forwards(model, model.smoothed_unknown_prior_variances(variance), True), models
+    )
     return map_in_threads(lambda source: _largest_evidence(bases, source), sources)
 
 
@@ -375,7 +377,7 @@ def force_log_likelihood_coefficients(
         jacobian = np.hstack([interval.negative_residual_jacobian, seen])
         rest = np.pad(interval.unreachable_products, (0, count))
         intervals.append(replace(interval, negative_residual_jacobian=jacobian, unreachable_products=rest))
-    known, split = model.unknown_variances_from_groups(variance), 1 + parameters
+    known, split = model.smoothed_unknown_prior_variances(variance), 1 + parameters
     products = _forwards(replace(model, intervals=tuple(intervals)), known, False).products
     free = products[1:split, 1:split] + np.eye(parameters) / 9.0
     cross = products[split:, 1:split]

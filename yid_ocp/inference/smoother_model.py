@@ -257,7 +257,7 @@ class LinearResidualModel:
     interval_correlation: float  # of an unknown with itself one interval later
     torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
 
-    def unknown_variances_from_groups(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
+    def smoothed_unknown_prior_variances(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
         """Variances (nd,) [squared reference] of all unknowns: the variance of the group plus that of torque noise."""
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 

@@ -15,8 +15,8 @@ from yid_ocp.inference.null_test import (
     DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     ExcessResidualCriteria,
     residual_channel_indices,
+    residual_chi2_null_test,
     residuals_exceed_noise,
-    run_null_test,
 )
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -94,7 +94,7 @@ def assess_goodness_of_fit(
                 parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
         residual = np.concatenate(parts)
     series = residual_channel_indices(problem)
-    found = run_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
+    found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.all_data_issues_are_warnings)
 

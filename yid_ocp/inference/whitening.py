@@ -123,7 +123,7 @@ class WhiteningFilter:
             step = self.filter_steps[k]
             if not step.holds_noise:
                 white[k + 1] = errors.torque_std**2 * costate[torque, 0]
-            noise[step.rows], costate = step.kalman.smoothed_noise_and_costate(noise[step.rows], costate)
+            noise[step.rows], costate = step.kalman.smoothed_measurement_noise_and_costate(noise[step.rows], costate)
         mean = self._expected(1) + self.initial_covariance @ costate
         white[0] = errors.torque_noise[0] + mean[torque, 0]
         error = np.zeros((last + 1, len(self.state_mask)))

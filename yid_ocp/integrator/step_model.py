@@ -79,7 +79,8 @@ _STATUS_MESSAGES = {
     NewtonStatusCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping or a fitting start",
     NewtonStatusCode.SINGULAR: "the step's equations are singular; "
     "look for redundant grasps or a coordinate without inertia",
-    NewtonStatusCode.NOT_FINITE: "the state is not finite; the motion is unstable open loop: add feedback or damping",
+    NewtonStatusCode.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: "
+    "add feedback or damping",
     NewtonStatusCode.OUT_OF_MEMORY: "there is not enough memory",
 }
 

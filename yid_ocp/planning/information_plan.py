@@ -20,10 +20,10 @@ from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.joint_paths import FramePositionEvaluator, PlannedMotion, PlanOptions
 from yid_ocp.planning.motion_search import (
     DOptimalityCriterion,
+    DOptimalityOrDiscriminationCriterion,
     EffectDiscriminationCriterion,
     InformativeMotionSearch,
     MotionSearchResult,
-    OptimalityCriterion,
     PlanResidualAndLimitFunctions,
 )
 from yid_ocp.planning.planned_experiment import ParameterizedExperiment
@@ -165,7 +165,7 @@ def _effects(
 
 def _criterion(
     experiment: ParameterizedExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
-) -> OptimalityCriterion:
+) -> DOptimalityOrDiscriminationCriterion:
     columns = [name.split("[")[0] for name in experiment.sensitivity_column_names]
     parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
     if not rivals:
@@ -279,7 +279,7 @@ def _plan(
     experiment: ParameterizedExperiment,
     limits: PlanResidualAndLimitFunctions,
     search: InformativeMotionSearch,
-    criterion: OptimalityCriterion,
+    criterion: DOptimalityOrDiscriminationCriterion,
     found: Sequence[MotionSearchResult],
     rivals: Sequence[EffectBase],
     unseen: Mapping[str, float],
@@ -314,7 +314,9 @@ def _plan(
     )
 
 
-def _judged(experiment: ParameterizedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
+def _judged(
+    experiment: ParameterizedExperiment, criterion: DOptimalityOrDiscriminationCriterion, found: MotionSearchResult
+) -> float:
     try:
         rows = experiment.configured_problem_sensitivities(found.w)
     except SolverError:
@@ -345,7 +347,10 @@ def _parameters(
 
 
 def _distances(
-    experiment: ParameterizedExperiment, criterion: OptimalityCriterion, rivals: Sequence[EffectBase], w: Array
+    experiment: ParameterizedExperiment,
+    criterion: DOptimalityOrDiscriminationCriterion,
+    rivals: Sequence[EffectBase],
+    w: Array,
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Distances of effects in the recordings that there are, and in the planned one."""
     assert isinstance(criterion, EffectDiscriminationCriterion)

@@ -347,7 +347,7 @@ class EffectDiscriminationCriterion:
         return square, rest, others, used
 
 
-OptimalityCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
+DOptimalityOrDiscriminationCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
 
 _MIN_TRUST_RADIUS, _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 1e-3, 0.05, 0.4  # for every unknown [rad or m]
 _MIN_STEP = 1e-9  # step in the linear picture that counts as none [rad or m]
@@ -373,7 +373,10 @@ class InformativeMotionSearch:
     """Search for the motion of a planned experiment that maximises an optimality criterion within limits."""
 
     def __init__(
-        self, experiment: ParameterizedExperiment, limits: PlanResidualAndLimitFunctions, criterion: OptimalityCriterion
+        self,
+        experiment: ParameterizedExperiment,
+        limits: PlanResidualAndLimitFunctions,
+        criterion: DOptimalityOrDiscriminationCriterion,
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())

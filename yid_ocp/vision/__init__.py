@@ -19,7 +19,7 @@ from yid_ocp.vision.surface_meshes import DepthSensorModel as DepthSensorModel
 from yid_ocp.vision.surface_meshes import ExtraMesh as ExtraMesh
 from yid_ocp.vision.surface_meshes import ObservedScene as ObservedScene
 from yid_ocp.vision.surface_meshes import VirtualCameraSetup as VirtualCameraSetup
-from yid_ocp.vision.surface_meshes import VirtualFrames as VirtualFrames
+from yid_ocp.vision.surface_meshes import VirtualFramesWithTruth as VirtualFramesWithTruth
 from yid_ocp.vision.surface_meshes import render_virtual_frames as render_virtual_frames
 from yid_ocp.vision.track import track_object as track_object
 from yid_ocp.vision.track_result import FrameReport as FrameReport

@@ -60,7 +60,7 @@ class TrackOptions:
             "sizes of the tubes that are estimated from the clouds, where these tell them; all are checked anyway"
         ),
     ] = ()
-    max_mean_distance_in_radii: Annotated[
+    max_frame_distance_in_radii: Annotated[
         PositiveFloat,
         OptionInfo(
             "a frame whose points are further from the fitted shape on average, beyond their "
@@ -70,7 +70,7 @@ class TrackOptions:
     max_frame_bend_angle: Annotated[
         PositiveFloat, OptionInfo("a frame whose shape has a joint that is bent further is dropped", "rad")
     ] = 1.2
-    max_distance_over_median: Annotated[
+    max_frame_distance_over_median: Annotated[
         PositiveFloat, OptionInfo("a frame whose distance is so many times the median of all good frames is dropped")
     ] = 1.7
     max_grasp_gap_change: Annotated[
@@ -133,12 +133,17 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
-    widest, noise = options.max_mean_distance_in_radii * float(shape.link_radii.mean()), shape.options.surface_noise_std
+    widest, noise = (
+        options.max_frame_distance_in_radii * float(shape.link_radii.mean()),
+        shape.options.surface_noise_std,
+    )
     limit = math.hypot(widest, _MEAN_ABS_DEVIATION * noise)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
-        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_mean_distance_in_radii allows {1e3 * limit:.1f} mm"
+        off = (
+            f"{1e3 * fit.mean_distance:.1f} mm off on average, max_frame_distance_in_radii allows {1e3 * limit:.1f} mm"
+        )
         return f"{_NO_FIT}: {off}"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > options.max_frame_bend_angle:
@@ -159,7 +164,7 @@ def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -
     for k, fit in fits.items():
         reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
-        if fit.mean_distance > options.max_distance_over_median * usual:
+        if fit.mean_distance > options.max_frame_distance_over_median * usual:
             off = f"{1e3 * fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
             reason = f"the shape fits worse than in other frames: {off}"
         elif apart > options.max_grasp_gap_change:

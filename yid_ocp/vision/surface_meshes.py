@@ -500,7 +500,7 @@ class CameraTimingModel:
 
 
 @dataclass(frozen=True, eq=False)
-class VirtualFrames:
+class VirtualFramesWithTruth:
     """Frame sequence of a virtual camera with the true times and configurations."""
 
     sequence: FrameSequence
@@ -520,7 +520,7 @@ class VirtualCameraSetup:
 
 def render_virtual_frames(
     scene: ObservedScene, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
-) -> VirtualFrames:
+) -> VirtualFramesWithTruth:
     """Frames that a virtual camera takes of a motion; each is rendered on loading, the same every time.
 
     Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
@@ -545,4 +545,4 @@ def render_virtual_frames(
         return lens.points_from_depth(camera.sensor_model._simulate_depth_image(depth, cosine, rng))
 
     made = FrameSequence(stamps, tuple(f"frame {i}" for i in range(len(taken))), pose, cloud, lens, "virtual camera")
-    return VirtualFrames(made, taken, lambda at: np.asarray(course(at)))
+    return VirtualFramesWithTruth(made, taken, lambda at: np.asarray(course(at)))

@@ -46,7 +46,7 @@ class _BatchRun:
     overrides: tuple[str, ...]
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `batch` and return its exit code."""
     members = batch_runs_from_configs(arguments.configs, arguments.recordings, arguments.overrides)
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG

@@ -49,7 +49,7 @@ _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": 
 log = logging.getLogger(__name__)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `blind` and return its exit code."""
     runs = [
         load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)

@@ -35,7 +35,7 @@ _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links
 _N_MODES = 3
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `check` and return its exit code."""
     code = command_with_settings(_run_check)(arguments)
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code

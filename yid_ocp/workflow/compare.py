@@ -78,4 +78,4 @@ def _compare_result(problem: EstimationProblem, comparison: MethodComparison) ->
     }
 
 
-run = command_with_settings(_run_compare)
+run_from_arguments = command_with_settings(_run_compare)

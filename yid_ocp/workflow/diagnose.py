@@ -39,14 +39,14 @@ from yid_ocp.workflow import prediction_outputs, run_history
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.plan import discrimination_plan_settings
-from yid_ocp.workflow.prediction_outputs import HeldOutPredictionPair
+from yid_ocp.workflow.prediction_outputs import EpisodeWithNominalAndEffectPredictions
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder, software_and_plugin_versions
 
 log = logging.getLogger(__name__)
 _STORE_FORMAT = "yid-refits/1"
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `diagnose` and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
@@ -195,7 +195,7 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     return levels
 
 
-def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPredictionPair]:
+def _held_out_predictions(finding: DiagnosisResult) -> list[EpisodeWithNominalAndEffectPredictions]:
     before, after = (
         problem_whitened_by_sensor_noise(fit.problem).predict_held_out(fit.problem.vector(fit.values))
         for fit in (finding.nominal_model, finding.final_model)
@@ -207,7 +207,7 @@ def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPredictionPai
     ]
 
 
-def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]) -> list[Animation]:
+def _scenes(finding: DiagnosisResult, predicted: Sequence[EpisodeWithNominalAndEffectPredictions]) -> list[Animation]:
     fits = {"nominal model": finding.nominal_model}
     fits |= {"with the effects": finding.final_model} if finding.accepted_effects else {}
     scenes = []

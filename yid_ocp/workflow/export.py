@@ -56,7 +56,7 @@ _RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
 _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bias": "vector"}  # by kind of unknown
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `export` and return its exit code."""
     source, form, out = Path(arguments.source), arguments.format, arguments.out
     if source.is_dir() and form not in ("csv", _MCAP):

@@ -82,4 +82,4 @@ def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tupl
     }
 
 
-run = command_with_settings(_run_friction)
+run_from_arguments = command_with_settings(_run_friction)

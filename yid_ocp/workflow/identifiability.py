@@ -67,7 +67,7 @@ class IdentifiabilityOptions:
         return asked + ([] if names == "auto" else ["--intervals", names])
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `identifiability` and return its exit code."""
     names = [name for name in arguments.intervals.split(",") if name]
     asked = IdentifiabilityOptions(

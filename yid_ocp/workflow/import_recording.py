@@ -37,7 +37,7 @@ _FLAGS = {"joint_topics": "--joint-topic"}  # of options whose flag is not their
 _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `import` and return its exit code."""
     file, asked = arguments.file, reader_options_from_arguments(arguments)
     if arguments.preview:

@@ -30,7 +30,7 @@ from yid_ocp.workflow.config_proposal import ProposedConfigChoices, held_out_spl
 _SCHEMA_FILE = "yid-ocp.schema.json"
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `init` and return its exit code."""
     out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):

@@ -127,7 +127,7 @@ def _run_inspect(
     return CommandOutcome(folder.path, written, None)
 
 
-run = command_with_settings(_run_inspect, "entries", "export")
+run_from_arguments = command_with_settings(_run_inspect, "entries", "export")
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint:

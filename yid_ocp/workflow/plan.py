@@ -75,7 +75,7 @@ def run_plan(
     return CommandOutcome(folder.path, written, found, found.is_successful)
 
 
-run = command_with_settings(run_plan)
+run_from_arguments = command_with_settings(run_plan)
 
 
 def compile_step_for_planning(run: RunSettings) -> Step:

@@ -196,7 +196,7 @@ SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
 DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/1"
 EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
 """A recording and its prediction, or why there is none."""
-HeldOutPredictionPair = tuple[Episode, EpisodePrediction, EpisodePrediction]
+EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, EpisodePrediction]
 """A held-out recording, its prediction by the nominal model and that with the effects."""
 
 
@@ -239,7 +239,9 @@ def write_solve_trajectories(
                 _store_sensor(group, episode, samples, {"predicted": predicted})
 
 
-def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, pairs: Sequence[HeldOutPredictionPair]) -> None:
+def write_diagnosis_trajectories(
+    path: Path, finding: DiagnosisResult, pairs: Sequence[EpisodeWithNominalAndEffectPredictions]
+) -> None:
     """Write held-out predictions and smoothed unknowns as `yid-diagnosis-trajectories/1`.
 
     `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the

@@ -233,7 +233,7 @@ def require_recordings_not_in_baseline(
             raise run.config_error(what, *where, allowed="recordings of another time")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `report` and return its exit code."""
     paths = [Path(folder) for folder in arguments.runs]
     return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown))

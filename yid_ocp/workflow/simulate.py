@@ -64,7 +64,7 @@ def run_simulate(
     return CommandOutcome(folder.path, written, recording, recording is not None)
 
 
-run = command_with_settings(run_simulate, "seed", "noise")
+run_from_arguments = command_with_settings(run_simulate, "seed", "noise")
 
 
 def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) -> _Made:

@@ -90,7 +90,7 @@ def run_solve(
     return CommandOutcome(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 
-run = command_with_settings(run_solve)
+run_from_arguments = command_with_settings(run_solve)
 
 
 def solve_and_decide_cable_memory(

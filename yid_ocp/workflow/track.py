@@ -42,7 +42,7 @@ from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-from yid_ocp.vision.surface_meshes import ObservedScene, VirtualFrames
+from yid_ocp.vision.surface_meshes import ObservedScene, VirtualFramesWithTruth
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
@@ -54,7 +54,7 @@ from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `track` and return its exit code."""
     return command_with_settings(partial(_run_track, workers=worker_config_from_arguments(arguments)))(arguments)
 
@@ -210,7 +210,9 @@ def _points(found: TrackResult) -> dict[str, Any]:
     return points
 
 
-def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Mapping[str, Mapping[str, float]]:
+def _truth_errors(
+    system: System, found: TrackResult, made: VirtualFramesWithTruth
+) -> Mapping[str, Mapping[str, float]]:
     shape = ShapeFitter(system)
     columns = [system.point_frames.index(name) for name in found.point_names]
     truth = np.array([shape.points_at_configuration(made.true_configuration_at(t))[columns] for t in found.t])
@@ -225,7 +227,7 @@ def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Ma
 # -- frames -----------------------------------------------------------------------------------------------------------
 
 
-def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFrames]:
+def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFramesWithTruth]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
     from yid_ocp.virtual.experiment import VirtualExperimentSettings, record_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -334,7 +336,7 @@ class _FrameTasks:
 
 def _frame_tasks(
     run: RunSettings, system: System, folder: RunFolder, progress: Progress
-) -> tuple[_FrameTasks, VirtualFrames | None]:
+) -> tuple[_FrameTasks, VirtualFramesWithTruth | None]:
     """Tracking tasks of frames in files, written before where a virtual camera sees them; and the latter's truth."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
     joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
