@@ -200,7 +200,7 @@ def _init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
     _switch(parser, "--replace", "write over files that are there")
     text = "what is held, such as cable, beam, tree or foam_y, the paper's; an unknown word lists all; "
-    text += "without it an arm of position servos, with a payload"
+    text += "without it the arm alone, with a payload"
     parser.add_argument("--object", metavar="KIND", help=text)
     for name, unit in (("length", "m"), ("mass", "kg"), ("radius", "m")):
         text = f"of the object, of each equal branch [{unit}]"

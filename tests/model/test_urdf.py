@@ -207,7 +207,9 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
     ("action", "words"),
     [
         (lambda path: read_urdf("nowhere.urdf"), ["'nowhere.urdf'", "package:NAME"]),
-        (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?"]),
+        (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?", "package:STEM"]),
+        (lambda path: read_urdf("so101"), ["'so101'", "write package:so101"]),
+        (lambda path: read_urdf("package:anymal"), ["has 2 robots 'anymal'", "package:anymal_b_simple_description/"]),
         (lambda path: read_urdf("default:y_objekt.urdf"), ["'y_objekt.urdf'", "did you mean 'y_object.urdf'?"]),
         (lambda path: read_urdf(path, joints=["swimg"]), ["'swimg'", "did you mean 'swing'?"]),
         (lambda path: read_urdf(path, locked={"nods": 1.0}), ["'nods'", "did you mean 'nod'?"]),
@@ -288,3 +290,17 @@ def test_mechanisms_that_ship_are_found_by_name_also_where_a_wheel_put_them(urdf
     assert resolve_urdf_path("default:turntable.urdf") == urdf_folder / "turntable.urdf"
     with pytest.raises(ModelError, match="no URDF"):
         resolve_urdf_path("default:cli.py")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("xarm7", "xarm_description/urdf/xarm7.urdf"),
+        ("SO101", "so_arm_description/urdf/so101.urdf"),
+        ("kinova.urdf", "kinova_description/robots/kinova.urdf"),
+        ("ur5", "ur_description/urdf/ur5_robot.urdf"),
+        ("anymal_b_simple_description/robots/anymal.urdf", "anymal_b_simple_description/robots/anymal.urdf"),
+    ],
+)
+def test_a_robot_of_example_robot_data_is_found_by_its_stem_in_any_case(name: str, file: str) -> None:
+    assert resolve_urdf_path(f"package:{name}").as_posix().endswith(f"robots/{file}")

@@ -27,6 +27,7 @@ from yid_ocp.data import (
     write_recording,
 )
 from yid_ocp.model.servos_and_springs import MotorOptions
+from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 
 RATE = 125.0
@@ -226,6 +227,47 @@ def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, r
     assert "*.servo_gain_factor" not in load_config("other.yaml").parameters
 
 
+def pushed_pendulum(folder: Path, phases: Sequence[float], name: str) -> None:
+    """A double pendulum in free air, its efforts by Pinocchio with friction, rotors, zeros of sensors and a payload."""
+    pin = pytest.importorskip("pinocchio")
+    urdf = resolve_urdf_path("default:double_pendulum.urdf")
+    model = pin.buildModelFromUrdf(str(urdf))
+    rng, t = np.random.default_rng(len(name)), np.arange(0, 6, 0.005)
+    model.appendBodyToJoint(2, pin.Inertia(0.3, np.array([0.0, 0.05, -0.4]), np.zeros((3, 3))), pin.SE3.Identity())
+    model.armature = np.array([0.05, 0.02])
+    waves = [(0.6, 2.1), (0.4, 5.3)]
+    q, v, a = (
+        np.stack(
+            [sum(A * w**k * np.sin(w * t + p + j + k * np.pi / 2) for A, w in waves) for j, p in enumerate(phases)], 1
+        )
+        for k in range(3)
+    )
+    data = model.createData()
+    turns = np.stack([np.cos(q), np.sin(q)], axis=2).reshape(len(t), 4)  # of joints without limits
+    torque = np.array([pin.rnea(model, data, *row) for row in zip(turns, v, a, strict=True)])
+    torque += [0.3, 0.1] * np.tanh(v / 0.02) + [0.4, 0.2] * v + [0.2, -0.1] + 0.02 * rng.standard_normal(v.shape)
+    names = tuple(model.names[1:])
+    write_recording(Recording(JointGroup(names, t, q, effort=torque), name=name), folder / f"{name}.h5")
+
+
+def test_an_arm_alone_with_efforts_is_identified_as_written(bench: Path) -> None:
+    """Without an object the arm's friction, rotors, zeros of sensors and payload are free, and found."""
+    for name, phases in {"first": (0.0, 1.0), "second": (2.0, 0.5)}.items():
+        pushed_pendulum(bench, phases, name)
+    assert main(["init", "default:double_pendulum.urdf", "first.h5", "second.h5", "--out", "run.yaml"]) == 0
+    run = load_config("run.yaml")
+    assert run.model.object is None
+    assert run.model.arms.mode == "prescribed"
+    assert main(["solve", "run.yaml", "--out", "solved", "--set", "output.write_report=false"]) == 0
+    found = json.loads(Path("solved/result.json").read_text())["parameters"]
+    [payload] = [name.removesuffix(".mass") for name in found if name.startswith("payload@") and name.endswith(".mass")]
+    truth = {"shoulder.damping": 0.4, "joint_coulomb@elbow.tau_c": 0.1, "rotor_inertia@shoulder.armature": 0.05}
+    truth |= {"effort_offset@shoulder.offset": 0.2, "effort_offset@elbow.offset": -0.1, f"{payload}.mass": 0.3}
+    for name, value in truth.items():
+        assert found[name]["free"], name
+        assert abs(found[name]["value"] - value) < max(4 * found[name]["std"], 0.03 * abs(value)), name
+
+
 def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
     assert main(["check", "run.yaml", "--out", "checked", "--set", "model.arms.mode=servo"]) == 2
@@ -265,7 +307,7 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
 ONE = ("--length", "1", "--mass", "1")
 TREE = ("--object", "tree", "--branch", "a=1,1,1")
 REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
-    "nothing and no commands": ((), "only an arm of position servos", "add --object"),
+    "nothing, no efforts and no commands": ((), "nothing in the recording shows what moving the arm takes", "--object"),
     "a length of nothing": (ONE[:2], "--length describes an object, and none is named", "add --object"),
     "cable without a length": (("--object", "cable"), "a cable needs a length", "--length"),
     "cable without a mass": (("--object", "cable", *ONE[:2]), "a cable needs a mass", "--mass"),

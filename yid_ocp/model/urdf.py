@@ -45,24 +45,32 @@ log = logging.getLogger(__name__)
 
 
 def _example_robot_urdf(robot: str) -> Path:
-    """Path of `baxter`, `so101` or another file's stem, or `folder/file.urdf` in the installed example-robot-data."""
+    """Path of a robot in the installed example-robot-data by its file's stem (any case), or by `folder/file.urdf`."""
     roots = [Path(p) / "cmeel.prefix/share/example-robot-data/robots" for p in [*sys.path, *site.getsitepackages()]]
     roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
     folder = next((root for root in roots if root.is_dir()), None)
     if folder is None:
         raise ModelError("example-robot-data is not installed", hint="pip install example-robot-data")
-    files = {str(path.relative_to(folder)): path for path in folder.rglob("*.urdf")}
-    short = {"ur5": "ur_description/urdf/ur5_robot.urdf", "ur10": "ur_description/urdf/ur10_robot.urdf"}
-    wanted = short.get(robot, robot)
-    for candidate in (wanted, f"{wanted}_description/urdf/{wanted}.urdf"):
-        if candidate in files:
-            return files[candidate]
-    by_stem: dict[str, list[Path]] = {}
-    for path in files.values():
-        by_stem.setdefault(path.stem, []).append(path)
-    if len(by_stem.get(wanted, ())) == 1:
-        return by_stem[wanted][0]
-    raise ModelError(f"example-robot-data has no robot '{robot}'", hint=nearest_name_hint(robot, by_stem))
+    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.urdf"))}
+    by_stem: dict[str, list[str]] = {}
+    for name, path in files.items():
+        by_stem.setdefault(path.stem.lower(), []).append(name)
+    stem = robot.lower().removesuffix(".urdf")
+    stem = {"ur5": "ur5_robot", "ur10": "ur10_robot"}.get(stem, stem)
+    found = [robot] if robot in files else by_stem.get(stem, [])
+    found = [name for name in found if name == f"{stem}_description/urdf/{stem}.urdf"] or found
+    if len(found) == 1:
+        return files[found[0]]
+    where = f"package:{robot}"
+    if found:
+        what, allowed = (
+            f"example-robot-data has {len(found)} robots '{robot}'",
+            ", ".join(f"package:{n}" for n in found),
+        )
+        raise ModelError(what, where=where, allowed=allowed, hint="name one of them by its folder")
+    allowed = "package:STEM of a URDF file there, such as package:xarm7, or package:FOLDER/FILE.urdf"
+    what, stems = f"example-robot-data has no robot '{robot}'", sorted({path.stem for path in files.values()})
+    raise ModelError(what, where=where, allowed=allowed, hint=nearest_name_hint(robot, stems))
 
 
 def resolve_urdf_path(robot: str | Path) -> Path:
@@ -122,7 +130,11 @@ def read_urdf(
     """
     file, locked = resolve_urdf_path(path), dict(locked or {})
     if not is_file(file):
-        raise ModelError(f"there is no URDF file '{file}'", hint="give a path, or package:NAME for example-robot-data")
+        hint = "give a path, or package:NAME for example-robot-data"
+        with contextlib.suppress(ModelError):
+            _example_robot_urdf(str(path))
+            hint = f"write package:{path} for that robot of example-robot-data"
+        raise ModelError(f"there is no URDF file '{file}'", hint=hint)
     robot, where, named = _parsed(file), str(file), (*(joints or ()), *locked)
     root = _check_tree(robot, where, named)
     dropped = _with_all_below(exclude_links, robot, where)

@@ -94,6 +94,7 @@ class ProposedConfigChoices:
     still_joints: tuple[str, ...]  # hardly turn in any recording
     motor_preset: str | None  # of its servos, where the robot is known
     firmware_gain: float | None  # its usual proportional gain, where the motor is known and no recording states one
+    has_object: bool  # false for an arm alone
 
     def to_dict(self) -> dict[str, Any]:
         """The proposal as plain data, under the keys of `yid-init/1`."""
@@ -107,10 +108,10 @@ class ProposedConfigChoices:
         }
 
     @property
-    def is_object_measured_only_by_effort(self) -> bool:
-        """Whether joint efforts of arms with prescribed motion are the only measurements that depend on the object."""
-        seen = (group for group in self.point_placements if not group.startswith("imu"))
-        return self.arm_mode == "prescribed" and not any(seen)
+    def is_identified_from_efforts(self) -> bool:
+        """Whether arms move as prescribed and there is no object, or nothing but joint efforts depends on it."""
+        seen = any(not group.startswith("imu") for group in self.point_placements)
+        return self.arm_mode == "prescribed" and not (self.has_object and seen)
 
 
 def propose_config_choices(
@@ -127,7 +128,7 @@ def propose_config_choices(
     Parameters
     ----------
     branches : sequence of Segment
-        Segments of the object, parents first; none for an arm of position servos without an object.
+        Segments of the object, parents first; none for an arm without an object.
     holder : str, optional
         Frame that carries the object's root; the tool of the arm that moves most when absent.
     grasps : mapping of frame to point, optional
@@ -186,6 +187,7 @@ def propose_config_choices(
         {group.name: _clock(group.t, group.clock) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
         *_motor_and_gain(robot, mode, recordings),
+        bool(branches),
     )
 
 
@@ -238,10 +240,13 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     wrists = [group.name for group in recording.channel_groups if group.name.startswith("wrist")]
     seen = ", ".join([*(group.name for group in recording.points), *wrists])
     is_servo = joints.effort is None and _commanded(joints)
-    if not has_object and not is_servo:
-        what = "without an object only an arm of position servos is described"
-        allowed = "commanded positions that differ from the measured ones, and no efforts"
-        raise ConfigError(what, where=recording.name, allowed=allowed, hint="add --object and its dimensions")
+    if not has_object and not is_servo and joints.effort is None and not wrists:
+        what = "nothing in the recording shows what moving the arm takes"
+        allowed = "efforts of its joints, commanded positions that differ from the measured ones, or a wrist sensor"
+        hint = (
+            "import them too (`yid-ocp import FILE --preview` lists what there is), or add --object and its dimensions"
+        )
+        raise ConfigError(what, where=recording.name, allowed=allowed, hint=hint)
     if joints.effort is None and not seen and has_object:
         hint = "import points too (`yid-ocp import FILE --preview` lists what there is)"
         allowed = "points on the object, or efforts of the joints that move it"
@@ -251,6 +256,8 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
         return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
     if joints.effort is None:
         return "prescribed", "no efforts were recorded, so the arm moves as its encoders say"
+    if not has_object:
+        return "prescribed", "the arm moves as its encoders say, and the model predicts the efforts that this takes"
     if closed:
         return "driven", "efforts were recorded, and grasps close loops, which exact encoder angles would overstrain"
     if seen:
@@ -318,6 +325,7 @@ def _places(
 ) -> dict[str, tuple[_PointPlacement, ...]]:
     """Places of all points: those of a frame or segment of their name, else, on an arm, where they were seen."""
     names = [branch.name for branch in branches]
+    standing = standing or not branches  # an arm alone holds nothing on which a point could sit
     frames = {f"w_{name}" for name in names} | set(tree.frames)
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for group in recording.points:

@@ -54,7 +54,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 
     files, where = list(map(near, made)), robot if robot.startswith(("package:", "default:")) else near(robot)
     options = import_recording.reader_options_from_arguments(arguments)
-    about = f"An arm of position servos, {where}, with a payload."
+    about = f"{'An arm of position servos' if proposal.arm_mode == 'servo' else 'The arm'}, {where}, with a payload."
     about = about if item is None else f"A {arguments.object.replace('_', ' ')} moved by {where}."
     lines = _config_lines(where, about, item, proposal, files, options)
     _write(out, "\n".join(lines) + "\n", written)
@@ -203,7 +203,7 @@ def _config_lines(
     if item is not None:
         yield from _object(item, proposal)
     yield from _friction(proposal)
-    yield from _effects(proposal, has_payload=item is None)
+    yield from _effects(proposal)
     yield ""
     yield from _recording_lines(recordings, imports)
     yield ""
@@ -334,25 +334,31 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
 
 def _friction(proposal: ProposedConfigChoices) -> Iterator[str]:
     about = "of geared arms, its sizes free; which law, `yid-ocp friction` says"
+    moving = [name for name in proposal.joints if name not in proposal.still_joints]
     if proposal.motor_preset:
-        moving = [name for name in proposal.joints if name not in proposal.still_joints]
         law = {"law": "load"} | ({"joints": moving} if proposal.still_joints else {})
         yield _line("  ", "friction", _value(law), about)
-    elif proposal.arm_mode == "servo" or proposal.is_object_measured_only_by_effort:
+    elif moving and not proposal.has_object and proposal.is_identified_from_efforts:
+        law = {"law": "coulomb"} | ({"joints": moving} if proposal.still_joints else {})
+        yield _line("  ", "friction", _value(law), about)
+    elif proposal.arm_mode == "servo" or proposal.is_identified_from_efforts:
         yield _line("  ", "# friction", "{law: coulomb}", about)
 
 
-def _effects(proposal: ProposedConfigChoices, has_payload: bool) -> Iterator[str]:
-    if proposal.arm_mode == "servo":
-        kind, words = "rotor_inertia", "what rotors add through their gears, free below"
-    elif proposal.is_object_measured_only_by_effort:
-        kind, words = "effort_offset", "the zero of every torque sensor, free below"
-    else:
+def _effects(proposal: ProposedConfigChoices) -> Iterator[str]:
+    kinds: dict[str, str] = {}
+    if proposal.arm_mode == "servo" or (proposal.is_identified_from_efforts and not proposal.has_object):
+        kinds["rotor_inertia"] = "what rotors add through their gears"
+    if proposal.is_identified_from_efforts and "joints.effort" in proposal.noise_by_group:
+        kinds["effort_offset"] = "the zero of every torque sensor"
+    if not kinds:
         return
-    yield _line("  ", "effects", "", words)
-    for joint in proposal.joints:
-        yield f"    - {{kind: {kind}, location: {_text(joint)}}}"
-    if has_payload:
+    yield _line("  ", "effects", "", f"{', '.join(kinds.values())}, free below")
+    for kind in kinds:
+        for joint in proposal.joints:
+            if kind == "effort_offset" or proposal.arm_mode == "servo" or joint not in proposal.still_joints:
+                yield f"    - {{kind: {kind}, location: {_text(joint)}}}"
+    if not proposal.has_object:
         yield f"    - {{kind: payload, location: {_text(proposal.holder_frame)}}}   # what the arm holds"
 
 
@@ -381,7 +387,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
             entries, said = [f"std: {_number(noise.std)}"], f"{noise.std:.2g} {noise.unit}, {noise.reason}"
         if frames := {place.point: place.frame for place in places if place.frame and place.frame != place.point}:
             entries.append(f"frames: {_value(frames)}")
-        told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_object_measured_only_by_effort
+        told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts
         if group == "joints.effort" and told_by_points:
             entries, said = ["use: false", *entries], "true once friction and payload of the arm are in the model"
         is_mounted = places and "." in group
@@ -425,10 +431,13 @@ def _parameters(item: InitCommandObject | None, proposal: ProposedConfigChoices)
                 yield _line("  ", f"rotor_inertia@{joint}.armature", "{free: false}")
         else:
             yield '  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said'
-    if proposal.is_object_measured_only_by_effort:
+    if proposal.is_identified_from_efforts:
+        if not proposal.has_object and set(proposal.joints) > set(proposal.still_joints):
+            yield _line("  ", '"rotor_inertia@*.armature"', free, "of the motors, at the joint [kg m^2]")
         for joint in proposal.joints:
             said, why = "{free: true, initial: 0.1, bounds: [0.0, 50.0]}", "viscous friction of the arm [N m s/rad]"
             if joint in proposal.still_joints:
                 said, why = "{initial: 0.1}", "it hardly turns"
             yield _line("  ", f"{joint}.damping", said, why)
-        yield _line("  ", '"effort_offset@*"', free, "zeros of the torque sensors [N m]")
+        if "joints.effort" in proposal.noise_by_group:
+            yield _line("  ", '"effort_offset@*"', free, "zeros of the torque sensors [N m]")
