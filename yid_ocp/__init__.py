@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from yid_ocp.analysis.estimation import solve as solve
     from yid_ocp.analysis.identifiability import identifiability as identifiability
     from yid_ocp.analysis.step_symbols import NamedStepEquations as NamedStepEquations
     from yid_ocp.analysis.what_if import what_if as what_if
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from yid_ocp.solvers import Solution as Solution
     from yid_ocp.solvers import Status as Status
     from yid_ocp.solvers import SteepestDescent as SteepestDescent
-    from yid_ocp.solvers import solve as solve
     from yid_ocp.solvers.nonlinear_program import NonlinearProgram as NonlinearProgram
     from yid_ocp.solvers.symbolic_transcription import transcribe as transcribe
     from yid_ocp.workflow.build import load_system as load_system
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 # what is entered here is imported above as well
 _HOMES: dict[str, tuple[str, ...]] = {
+    "analysis.estimation": ("solve",),
     "analysis.identifiability": ("identifiability",),
     "analysis.step_symbols": ("NamedStepEquations",),
     "analysis.what_if": ("what_if",),
@@ -63,7 +64,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "workflow.run_history": ("read_estimates",),
     "workflow.build": ("load_system",),
     "workflow.build_problem": ("load_problem",),
-    "solvers": ("GaussNewton", "MultipleShooting", "SingleShooting", "Solution", "Status", "SteepestDescent", "solve"),
+    "solvers": ("GaussNewton", "MultipleShooting", "SingleShooting", "Solution", "Status", "SteepestDescent"),
 }
 _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
 

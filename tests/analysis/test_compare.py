@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from made_models import estimate, solution
 
+from yid_ocp.analysis import cable_memory
 from yid_ocp.analysis import compare as module
+from yid_ocp.analysis.cable_memory import choose_cable_memory_fit
 from yid_ocp.analysis.compare import (
     _PAPER_PARAMETERS,
     _TRUTH_EXPERIMENT,
     PAPER_ESTIMATES,
     _load_torque_ensemble,
-    choose_cable_memory_fit,
     compare_methods,
     explain_paper_estimates,
     is_within_ensemble_range,
@@ -431,7 +432,7 @@ def solved(monkeypatch):
         kept.problems.append(problem)
         return fitted(start, problem.unknown_names) if kept.ok else SimpleNamespace(evaluation=None)
 
-    monkeypatch.setattr(module, "solve", solve)
+    monkeypatch.setattr(cable_memory, "solve", solve)
     return kept
 
 

@@ -16,22 +16,22 @@ from yid_ocp.analysis.discretisation import (
     _MAX_GROWTH_DECADES,
     _N_CHECKED_NODES,
     AlternatingErrorGrowth,
-    EstimateShiftByLinksAndTimeStep,
     FinerDiscretisationProblem,
     _error_growth_along,
-    fine_joints_by_coarse_joint,
+    _fine_joints_by_coarse_joint,
     inflate_estimates_by_discretisation,
     largest_alternating_error_growth,
     parameter_shifts_in_finer_model,
 )
+from yid_ocp.analysis.estimation import _checked_solution_and_step_stability
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.workflow.solve import checked_solution_and_step_stability
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 
@@ -85,10 +85,10 @@ def chain(links):
 
 def test_divided_links_share_their_angle():
     coarse, fine = chain(2), chain(4)
-    divided = fine_joints_by_coarse_joint(coarse, fine)
+    divided = _fine_joints_by_coarse_joint(coarse, fine)
     pairs = {f"T1_{i}_{axis}": (f"T1_{2 * i}_{axis}", f"T1_{2 * i + 1}_{axis}") for i in (0, 1) for axis in "xy"}
     assert divided == pairs
-    assert fine_joints_by_coarse_joint(coarse, coarse) == fine_joints_by_coarse_joint(fine, coarse) == {}
+    assert _fine_joints_by_coarse_joint(coarse, coarse) == _fine_joints_by_coarse_joint(fine, coarse) == {}
 
 
 def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
@@ -105,7 +105,7 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     fine.evaluate = lambda x, derivatives, equilibrium_guesses: asked.append((x, equilibrium_guesses)) or inner(x)
     guesses = (SimpleNamespace(equilibrium_guess=guess) for guess in (np.array([0.2, -0.4]), None))
     at = replace(coarse.evaluate(coarse.initial_unknowns), episode_predictions=tuple(guesses))
-    divided = fine_joints_by_coarse_joint(coarse.system, fine.system)
+    divided = _fine_joints_by_coarse_joint(coarse.system, fine.system)
     refined = FinerDiscretisationProblem(fine, {"a": 2.0, "c": 3.0}, divided)
     parameter_shifts_in_finer_model(refined, coarse, coarse.initial_unknowns, at)
     [(x, (warm, none))] = asked
@@ -386,7 +386,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     assert found.status == Status.CONVERGED
     entry = found.parameters["cable.bend"]
     assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)
-    judged, said = checked_solution_and_step_stability(problem, found)
+    judged, said = _checked_solution_and_step_stability(problem, found)
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
@@ -413,12 +413,12 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     grown = {x: AlternatingErrorGrowth("run", size, 1.3, 0.1, H) for x, size in decades.items()}
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
-    judged, said = checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    judged, said = _checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert judged.status == after
     assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: None)
-    unchecked = checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    unchecked = _checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert unchecked == (found, {"start": None, "estimate": None})

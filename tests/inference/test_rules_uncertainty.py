@@ -15,7 +15,6 @@ from small_problems import PENDULUM, H, pendulum_step, taken
 
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.null_test import (
-    ExcessResidualCriteria,
     NullTestResult,
     assumed_channel_noise_levels,
     residual_channel_indices,
@@ -39,6 +38,7 @@ from yid_ocp.inference.uncertainty import (
     with_profile_interval,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.signal_filters import effort_filter_with_path_cutoff
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)

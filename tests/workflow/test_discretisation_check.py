@@ -1,8 +1,11 @@
 """Estimates with finer links and shorter steps."""
 
+from dataclasses import replace
+
 import pytest
 from made_cross import TRUTH, configuration, record
 
+import yid_ocp as yid
 from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.solve import run_solve
 
@@ -42,6 +45,26 @@ def test_too_few_links_are_told_and_counted(folder, carried_out):
     moved = done.result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
     assert -error < moved < -0.4 * error
     assert "with twice the links these move by more than the data's" in done.out
+
+
+def test_python_and_shell_say_the_same(folder, tmp_path):
+    """The ± of four links for twelve is that of the links, not of the data, whoever asks."""
+    file = configuration(folder, 4, ["north"], 1.5)
+    shell = run_solve(load_config(file), tmp_path / "run").result
+    problem = yid.load_problem(file)
+    solution = yid.solve(problem)
+    for name, entry in solution.parameters.items():
+        said = shell["parameters"][name]
+        assert (entry.verdict, entry.value) == (said["verdict"], pytest.approx(said["value"], rel=1e-6))
+        assert entry.std == pytest.approx(said["std"], rel=1e-6)
+    assert solution.std["north.bend"] > 5 * solution.checks.data_std["north.bend"]
+    assert "without the error" not in repr(solution)
+    assert len(solution.checks.held_out_predictions) == len(problem.held_out)
+    # where the model cannot be refined, the print says what its ± leaves out
+    options = replace(problem.options, divided_links_model=None, checked_discretisations=("links",))
+    bare = yid.solve(problem.with_options(options))
+    assert bare.std == bare.checks.data_std
+    assert "± without the error of the object's links and of the time step" in repr(bare)
 
 
 @pytest.mark.parametrize(("setting", "tried"), [("none", set()), ("time_step", {"time_step"})])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
+from yid_ocp.analysis import baseline_comparison
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
@@ -71,14 +72,14 @@ def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
 
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
     problem, _, held_out = solved_pendulum
-    entry = prediction_outputs.prediction_error_entry(problem, *held_out[0])
+    entry = baseline_comparison._prediction_error_entry(problem, *held_out[0])
     assert entry["recording"] == "held_out"
     samples = held_out[0][0].measurements[0]
     for i, channel in enumerate(samples.sensor.channel_names):
         error = held_out[0][1].predicted_outputs[0][:, i] - samples.value[:, i]
         assert entry["rmse"][channel] == pytest.approx(np.sqrt(np.nanmean(error**2)))
         assert entry["baselines"]["zero"][channel] == pytest.approx(np.sqrt(np.nanmean(samples.value[:, i] ** 2)))
-    failed = prediction_outputs.prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
+    failed = baseline_comparison._prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
     assert (failed["message"], failed["rmse"]) == ("step 3 did not converge", {})
     assert failed["baselines"] == entry["baselines"]
 
@@ -204,7 +205,7 @@ EFFORT, POINTS = [("joints", "effort")], [("points", "")]
     ],
 )
 def test_a_sensor_counts_as_a_whole(rmse, guess, places):
-    found = prediction_outputs.worse_than_baseline_issues([entry(rmse, guess)], UNITS)
+    found = baseline_comparison.worse_than_baseline_issues([entry(rmse, guess)], UNITS)
     assert [(doubt.group, doubt.channel) for doubt in found] == places
     assert all((d.cause, d.weight, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
 
@@ -212,7 +213,7 @@ def test_a_sensor_counts_as_a_whole(rmse, guess, places):
 def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
-    (doubt,) = prediction_outputs.worse_than_baseline_issues([said], UNITS)
+    (doubt,) = baseline_comparison.worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
     assert doubt.evidence_ratio == pytest.approx(0.2 / 0.105)
 

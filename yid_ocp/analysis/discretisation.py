@@ -12,8 +12,9 @@ import scipy.optimize
 
 from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
+from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
-from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
+from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, ParameterEstimate, verdict_by_relative_std
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step, simulate
@@ -23,21 +24,17 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import Evaluation, ProcessNoiseWhitener
+from yid_ocp.problem.options import DiscretisationName
 from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
+from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
 # Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
 # m + m/2 + m/4 + ... What falls faster has less to go.
 _EXTRAPOLATION_FACTOR = 2.0
-
-
-@dataclass(frozen=True)
-class EstimateShiftByLinksAndTimeStep:
-    """Shifts of one estimate, in its unit, by dividing links in two and by halving the time step; None if not tried."""
-
-    links: float | None = None
-    time_step: float | None = None
+_MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
+_REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ class FinerDiscretisationProblem:
         return fine
 
 
-def fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
+def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
     """For each divided joint of the coarse model, the names of the fine joints that replace it."""
     found = {}
     for segment in coarse.segment_layouts:
@@ -155,6 +152,59 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
         episodes.append(replace(truncate_episode(own, ratio * other.grid.steps), input_errors=errors))
         filters.append(_CoarseWeights(whitening, errors, ratio) if whitening and errors else None)
     return fine.with_episodes(episodes, (), filters)
+
+
+def measure_discretisation_shifts(
+    problem: EstimationProblem,
+    x: Array,
+    at_x: Evaluation,
+    kinds: Sequence[DiscretisationName],
+    progress: Progress = NULL_PROGRESS,
+    *,
+    model_difference_only: bool = False,
+) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
+    """Shifts of the estimates when every link is divided in two and when the time step is halved.
+
+    Of every shared free parameter, none where nothing was tried; and why something that was asked for is not known.
+    `x`, shape (nx,), is the estimate, `at_x` its evaluation with Jacobian; `model_difference_only` for other points.
+    """
+    found: dict[str, dict[str, float]] = {}
+    notes: list[str] = []
+    for key in kinds:
+        words = _REFINEMENT_DESCRIPTIONS[key]
+        if key == "links" and (problem.options.divided_links_model is None or not problem.system.segment_layouts):
+            continue
+        progress.begin_stage(f"trying {words}", 2.5, 2.7)
+        try:
+            refined = _refined_problem(problem, key)
+            own = parameter_shifts_in_finer_model(
+                refined, problem, x, at_x, model_difference_only=model_difference_only
+            )
+        except YidError as error:
+            own = error.what
+        if isinstance(own, str):
+            notes.append(f"what {words} would change is not known: {own}")
+        else:
+            found[key] = own
+    links, steps = found.get("links", {}), found.get("time_step", {})
+    names = problem.shared_parameters if found else ()
+    return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
+
+
+def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> FinerDiscretisationProblem:
+    options = problem.options
+    if what == "time_step" or options.divided_links_model is None:
+        return FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
+    recordings = [episode.recording for episode in problem.episodes]
+    steps, factors = sum(e.grid.steps for e in problem.episodes), options.divided_links_model.parameter_factors
+    step = options.divided_links_model.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE)
+    priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
+    joint = options.multivariate_prior.with_parameters_scaled_by(factors)
+    made = EstimationProblem(
+        step, recordings, problem.free, replace(options, prior_stds=priors, multivariate_prior=joint)
+    )
+    joints = _fine_joints_by_coarse_joint(problem.system, step.system)
+    return FinerDiscretisationProblem(made, factors, joints)
 
 
 def inflate_estimates_by_discretisation(

@@ -22,7 +22,7 @@ from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     MAX_WEAK_RELATIVE_STD,
@@ -45,6 +45,7 @@ from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers.base import Solution
 

@@ -20,14 +20,13 @@ from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.null_test import ExcessResidualCriteria
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.model.objects import OBJECT_KINDS, ObjectKind
 from yid_ocp.model.objects.base import MountSettings
 from yid_ocp.model.servos_and_springs import PositionServoOptions
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
 from yid_ocp.planning.joint_paths import PlanOptions
-from yid_ocp.problem.options import ProblemOptions, SensorOptions
+from yid_ocp.problem.options import ExcessResidualCriteria, ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
 from yid_ocp.vision.frame_selection import TrackOptions

@@ -17,25 +17,11 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_with_path_cutoff
 from yid_ocp.sensors.mounted import MountedSensor
 
 RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
-
-
-@dataclass(frozen=True)
-class ExcessResidualCriteria:
-    """Significance level and smallest excess chi2 at which a residual counts as exceeding its noise.
-
-    It does where it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`; of the stated standard
-    deviations `noise_fraction_of_std` is noise, the rest represents model error.
-    """
-
-    significance_level: float = 0.01
-    min_excess_chi2_per_dof: float = 0.1
-    noise_fraction_of_std: float = 1.0
-
-
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 

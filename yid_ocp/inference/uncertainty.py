@@ -13,13 +13,13 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.null_test import (
     DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-    ExcessResidualCriteria,
     residual_channel_indices,
     residual_chi2_null_test,
     residuals_exceed_noise,
 )
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.options import ExcessResidualCriteria
 
 ConfidenceInterval = tuple[float | None, float | None]
 
@@ -76,6 +76,14 @@ class ParameterEstimate:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
         return -math.inf if lower is None else lower, math.inf if upper is None else upper
+
+
+@dataclass(frozen=True)
+class EstimateShiftByLinksAndTimeStep:
+    """Shifts of one estimate, in its unit, by dividing links in two and by halving the time step; None if not tried."""
+
+    links: float | None = None
+    time_step: float | None = None
 
 
 def assess_goodness_of_fit(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -12,12 +12,14 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.issues import Issue
-from yid_ocp.model.objects.base import ClampPoseDefinition
+from yid_ocp.integrator.step import Step
+from yid_ocp.model.objects.base import CableTopology, ClampPoseDefinition
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeightingName
 from yid_ocp.sensors import SensorOptions as SensorOptions
 
 _InitialStateKind = Literal["equilibrium", "estimated", "fitted_to_points"]
+DiscretisationName = Literal["links", "time_step"]
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,27 @@ class MultivariateGaussianPrior:
 
 
 @dataclass(frozen=True)
+class ExcessResidualCriteria:
+    """Significance level and smallest excess chi2 at which a residual counts as exceeding its noise.
+
+    It does where it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`; of the stated standard
+    deviations `noise_fraction_of_std` is noise, the rest represents model error.
+    """
+
+    significance_level: float = 0.01
+    min_excess_chi2_per_dof: float = 0.1
+    noise_fraction_of_std: float = 1.0
+
+
+@dataclass(frozen=True)
+class DividedLinksModel:
+    """Model of the same object with each link divided in two, and factors on parameters that keep its stiffness."""
+
+    build_step: Callable[[bool], Step]  # of whether it is compiled
+    parameter_factors: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class ProblemOptions:
     """Settings of an estimation problem besides model and data: initial states, tracking filter, weighting, priors, ...
 
@@ -59,6 +82,14 @@ class ProblemOptions:
         State (q, p, z) in which a recording starts, in place of equilibrium or of the fit.
     data_issues : tuple of Issue
         Data quality issues found in the recordings.
+    excess_residual_criteria : ExcessResidualCriteria
+        Criteria for a residual that exceeds noise.
+    checked_discretisations : tuple of str
+        What an estimate's standard deviation includes the error of: `links`, `time_step`.
+    divided_links_model : DividedLinksModel, optional
+        Needed for `links`.
+    cable_topology : CableTopology, optional
+        Of a cable held by clamps, for the baselines that it has.
     """
 
     initial_state: Annotated[
@@ -121,6 +152,10 @@ class ProblemOptions:
     parameters_by_recording: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     known_initial_states: Mapping[str, ArrayLike] = field(default_factory=dict)
     data_issues: tuple[Issue, ...] = ()
+    excess_residual_criteria: ExcessResidualCriteria = ExcessResidualCriteria()
+    checked_discretisations: tuple[DiscretisationName, ...] = ("links", "time_step")
+    divided_links_model: DividedLinksModel | None = field(default=None, compare=False, repr=False)
+    cable_topology: CableTopology | None = field(default=None, compare=False, repr=False)
 
     @property
     def all_data_issues_are_warnings(self) -> bool:

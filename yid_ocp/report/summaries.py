@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from yid_ocp.analysis.baseline_comparison import channel_or_group_unit
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
@@ -20,7 +21,6 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
-    channel_or_group_unit,
     discretisation_shift_sentences,
     format_error_value_and_unit,
     issue_summary_blocks,

@@ -99,11 +99,6 @@ def p_value_text(p_value: float) -> str:
     return f"{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
 
 
-def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
-    """Unit of a channel, or of the first member of a group; an empty text if it is unknown."""
-    return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
-
-
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary blocks on issues of the recordings: a table and advice."""
     doubts = result.get("doubts", ())

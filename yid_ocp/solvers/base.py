@@ -6,22 +6,24 @@ import importlib
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.data.issues import Issue
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.inference.linearized_residual import is_stationary_point
-from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
+    EstimateShiftByLinksAndTimeStep,
     GoodnessOfFit,
     ParameterEstimate,
     assess_goodness_of_fit,
@@ -33,9 +35,10 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
 from yid_ocp.options import check_option_bounds
-from yid_ocp.problem.episodes import EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
+from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
 from yid_ocp.solvers.initial_guess import unknowns_with_neutral_effects_activated
@@ -68,6 +71,36 @@ class Iterate:
     note: str = ""  # anything out of the ordinary, such as a shortened horizon
 
 
+EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
+"""A recording and its prediction, or why there is none."""
+
+
+@dataclass(frozen=True)
+class EstimateChecks:
+    """Checks of an estimate beyond its fit: finer discretisations, held-out recordings, stability of the step.
+
+    Attributes
+    ----------
+    data_std : mapping of str to float
+        Standard deviation of every free parameter without the discretisation's error.
+    discretisation_shifts : mapping of str to EstimateShiftByLinksAndTimeStep
+        Shift of every free parameter in a finer model, for those that were tried.
+    notes, uncounted_errors : tuple of str
+        Why a shift is not known; discretisations whose error the standard deviations leave out.
+    step_stability : mapping
+        Growth of alternating errors at the `start` of the search and at the `estimate`.
+    """
+
+    data_std: Mapping[str, float] = field(default_factory=dict)
+    discretisation_shifts: Mapping[str, EstimateShiftByLinksAndTimeStep] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    uncounted_errors: tuple[str, ...] = ()
+    held_out_predictions: tuple[EpisodeAndPrediction, ...] = ()
+    data_issues: tuple[Issue, ...] = ()
+    step_stability: Mapping[str, Any] = field(default_factory=dict)
+    cable_memory_message: str = ""
+
+
 @dataclass(frozen=True, repr=False)
 class Solution(ReprMixin):
     """Solution of an estimation problem: estimates, covariance, goodness of fit and history.
@@ -89,6 +122,8 @@ class Solution(ReprMixin):
         At `x`.
     problem : EstimationProblem, optional
         Problem as solved, whitened at `x`.
+    checks : EstimateChecks, optional
+        Where made (`yid_ocp.solve`): without them standard deviations count the data and the misfit alone.
     """
 
     status: Status
@@ -105,6 +140,7 @@ class Solution(ReprMixin):
     evaluation: Evaluation | None
     solver_name: str
     problem: EstimationProblem | None = None
+    checks: EstimateChecks | None = None
 
     def _summary(self) -> ReprTexts:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
@@ -116,7 +152,9 @@ class Solution(ReprMixin):
         more = f"and {count_with_noun(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
         fit = f"chi2 per degree of freedom {self.goodness_of_fit.chi2_per_dof:.3g}"
         how = f"{self.status.value.replace('_', ' ')} by {self.solver_name}"
-        return ReprTexts(", ".join(filter(None, (how, *told, more, fit))), rows)
+        left_out = ("of discretisation",) if self.checks is None else self.checks.uncounted_errors
+        uncounted = f"± without the error {' and '.join(left_out)}" if left_out and free else ""
+        return ReprTexts(", ".join(filter(None, (how, *told, more, fit, uncounted))), rows)
 
     @property
     def n_iterations(self) -> int:
@@ -269,11 +307,12 @@ def solve(
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     restarts: bool = True,
 ) -> Solution:
-    """Solve an estimation problem and return estimates with uncertainty and verdicts.
+    """Fit an estimation problem and return estimates with the uncertainty that data and misfit leave, and verdicts.
 
-    Free effects begin off their neutral value (`unknowns_with_neutral_effects_activated`) without a start. Where the
-    rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first seconds
-    only, and then over longer and longer horizons. A poor fit is started again from other initial values. Where noise
+    `yid_ocp.solve` (`analysis.estimation`) adds the discretisation's error and checks of the fit. Free effects
+    begin off their neutral value (`unknowns_with_neutral_effects_activated`) without a start. Where the rollout
+    fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only,
+    and then over longer and longer horizons. A poor fit is started again from other initial values. Where noise
     drives the motion, methods that can weigh residuals by it do so in several passes, its covariance frozen in each
     (`problem_whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
 

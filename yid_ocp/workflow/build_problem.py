@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.options import DiscretisationName, DividedLinksModel
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
@@ -96,7 +98,35 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
+        excess_residual_criteria=run.diagnosis.null_test_residual_limits,
+        checked_discretisations=_checked_discretisations(run),
+        divided_links_model=_divided_links_model(run, system),
+        cable_topology=cable,
     )
+
+
+def _checked_discretisations(run: RunSettings) -> tuple[DiscretisationName, ...]:
+    """Discretisations that a run's settings check after a solve, by default those that matter for its object."""
+    said, item = run.output.discretisation_check_mode, run.model.object
+    if said is None:
+        said = "both" if item is not None and item.default_link_refinement else "time_step"
+    choices: dict[str, tuple[DiscretisationName, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
+    return choices.get(said, ())
+
+
+def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel | None:
+    """The run's model with every link divided in two; None for an object without links of its own."""
+    if run.model.object is None or run.model.object.n_links_per_segment_or_total is None:
+        return None
+
+    names = system.parameters.names
+    factors = {name: float(build.divided_link_parameter_scale(run, name, 2)) for name in names}
+    return DividedLinksModel(partial(_divided_links_step, run), factors)
+
+
+def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:
+    settings = replace(run, problem=replace(run.problem, use_compiler=is_compiled))
+    return build_step(settings, build_system(run, link_division=2))
 
 
 def build_problem(

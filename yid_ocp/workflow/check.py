@@ -29,7 +29,7 @@ from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, Comma
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
-from yid_ocp.workflow.solve import discretisation_shifts_to_dict, measure_discretisation_shifts
+from yid_ocp.workflow.solve import discretisation_shifts_to_dict
 
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
 _N_MODES = 3
@@ -62,7 +62,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         moved, shown = {}, {}
         if problem is not None:
             first = problem.evaluate(problem.initial_unknowns)
-            moved = _moves(plain, problem, first, warnings, progress)
+            moved = _moves(problem, first, warnings, progress)
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
@@ -183,9 +183,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
     return scenes
 
 
-def _moves(
-    run: RunSettings, problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress
-) -> dict[str, Any]:
+def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress) -> dict[str, Any]:
     x = problem.initial_unknowns
     growth = discretisation.largest_alternating_error_growth(problem, x)
     if growth is not None and not growth.keeps_errors_below_resolution:
@@ -193,8 +191,8 @@ def _moves(
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")
         return {}
-    shifts, notes = measure_discretisation_shifts(
-        run, problem, x, at_x, ("links", "time_step"), progress, models_alone=True
+    shifts, notes = discretisation.measure_discretisation_shifts(
+        problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
     warnings += notes
     # how poorly initial values fit says nothing of how sure the data will be of what fits

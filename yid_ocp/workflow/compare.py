@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods, explain_paper_estimates
+from yid_ocp.analysis.estimation import checked_solution_and_issues
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
@@ -15,7 +16,7 @@ from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.solve import checked_solution_and_issues, solution_to_result_dict
+from yid_ocp.workflow.solve import solution_to_result_dict
 
 
 def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
