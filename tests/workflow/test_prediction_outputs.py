@@ -231,3 +231,14 @@ def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum
     assert [doubt["cause"] for doubt in result["doubts"]] == ([] if believed else ["worse_than_guess"])
     assert result["parameters"]["shoulder.stiffness"]["verdict"] == ("identifiable" if believed else "not_trusted")
     assert ("a prediction without a model is nearer" in done.out) is not believed
+
+
+def test_a_guess_is_not_judged_by_the_sample_that_made_it():
+    """A point that is seen once makes a guess without an error, which would beat every model."""
+    sensor = SimpleNamespace(naive_prediction="stays", point_names=("p", "q"))
+    value = np.array([[1.0, 1, 1, np.nan, np.nan, np.nan], [2.0, 2, 2, 5, 5, 5], [np.nan] * 6])
+    guess = baseline_comparison._baselines(None, SimpleNamespace(sensor=sensor, value=value), None)["stays"]
+    assert np.isnan(guess[0, :3]).all()
+    assert np.isnan(guess[1, 3:]).all()
+    assert np.array_equal(guess[1:, :3], np.ones((2, 3)))
+    assert np.array_equal(guess[[0, 2], 3:], np.full((2, 3), 5.0))

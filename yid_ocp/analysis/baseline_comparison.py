@@ -154,5 +154,7 @@ def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableTopolo
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
     if not len(samples.value):
         return {}
-    first = np.take_along_axis(samples.value, np.isfinite(samples.value).argmax(axis=0)[None], axis=0)
-    return {"stays": np.broadcast_to(first, samples.value.shape)}
+    at = np.isfinite(samples.value).argmax(axis=0)[None]
+    guess = np.broadcast_to(np.take_along_axis(samples.value, at, axis=0), samples.value.shape).copy()
+    np.put_along_axis(guess, at, np.nan, axis=0)  # a guess is not judged by the sample that made it
+    return {"stays": guess}

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
+from yid_ocp.analysis import estimation
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
@@ -19,6 +21,7 @@ from yid_ocp.inference.uncertainty import (
     VERDICT_SENTENCE_TEXTS,
     VERDICT_TABLE_TEXTS,
     ParameterEstimate,
+    all_estimates_marked_not_trusted,
     interval_text,
 )
 from yid_ocp.inference.whitening import problem_without_input_errors
@@ -26,13 +29,13 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
-from yid_ocp.solvers.base import Solver, uses_process_noise_covariance
+from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
 
 _MEMORY_SAMPLING_PERIOD = 0.02
 # Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of
 # the value: below that the methods' own stopping rules show.
 _AGREEMENT_STDS, _AGREEMENT_RTOL = 2.0, 0.005
-_ALL_NOISE_LABEL = "all noise"  # the run that weighs residuals by the noise that drives the motion too
+_SOLVE_LABEL = "solve"  # the run that gives the verdicts, by all noise
 _MEMORY_SUFFIX = ".memory"
 _MAX_REST_SPEED = 0.01  # a recording whose points move more slowly at its start starts at rest [m/s]
 _MIN_MOVING_RECORDINGS = 2  # that start in motion, of which one is left out at a time: fewer cannot agree
@@ -58,9 +61,8 @@ class MethodComparison:
     method_results: tuple[_MethodResult, ...]
     reference_method: str  # of the lowest cost, with which the others are compared
     has_process_noise: bool  # of the problem, which the methods are compared without
-    # solution whose verdicts are reported: the reference's or, with process noise, that of a method that models it
+    # the answer of `solve`: the reference's, checked, or with process noise that of a method that models it
     verdict_solution: Solution
-    verdict_held_out_predictions: list[tuple[Episode, EpisodePrediction | str]]
     disagreements: Mapping[str, list[str]]  # a sentence for each identifiable parameter, with the reason
     # on estimates of unidentifiable parameters, and on what steepest descent left far from a known truth
     explanations: tuple[str, ...]
@@ -77,27 +79,42 @@ def compare_methods(
     truth: Mapping[str, float] | None = None,
     callback: Callable[[str, Iterate], None] | None = None,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
+    time_budget: float = math.inf,
 ) -> MethodComparison:
     """Run several methods from the same initial values and compare their estimates.
 
     Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's,
-    without process noise, whose covariance not every method can carry. With process noise, the verdicts come from one
-    more run of a method that can. `truth` are known parameter values; `callback` is called with the method's name and
-    every `Iterate`; `limits` say when a residual is more than noise.
+    without process noise, whose covariance not every method can carry. With process noise their estimates are not
+    trusted, and the verdicts come from one more run of a method that can. `truth` are known parameter values;
+    `callback` is called with the method's name and every `Iterate`; `limits` say when a residual is more than noise.
+    Of the `time_budget` [s] each method has what is left over the number of those to come; then it is stopped.
     """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
+    deadline = time.perf_counter() + time_budget
 
-    def listener(name: str) -> Callable[[Iterate], None] | None:
-        return None if callback is None else partial(callback, name)
+    def listener(name: str, share: float = math.inf) -> Callable[[Iterate], None] | None:
+        if callback is None and not math.isfinite(share):
+            return None
+        begun = time.perf_counter()
 
-    for solver in solvers:
+        def told(entry: Iterate) -> None:
+            if callback is not None:
+                callback(name, entry)
+            if time.perf_counter() - begun > share:
+                raise StopSearch(f"stopped after {share:.3g} s, its share of compare.time_budget")
+
+        return told
+
+    for i, solver in enumerate(solvers):
         own = problem
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":
             own = problem.with_options(replace(problem.options, weighting="paper"))
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            told = listener(solver.name)
+            told = listener(solver.name, max(deadline - time.perf_counter(), 0.0) / (len(solvers) - i))
             solution = solve(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
+        if whole.has_process_noise:
+            solution = replace(solution, parameters=all_estimates_marked_not_trusted(solution.parameters))
         taken = time.perf_counter() - wall, time.process_time() - cpu, memory.peak
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(_MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), *taken))
@@ -105,15 +122,14 @@ def compare_methods(
     if best.method != "steepest_descent":
         shown = replace(best, solution=solution_with_profile_intervals(problem, best.solution))
         runs[runs.index(best)] = best = shown
-    judged, held_out = best.solution, best.held_out_predictions
     if whole.has_process_noise:
         able: Solver = next((solver for solver in solvers if uses_process_noise_covariance(solver)), GaussNewton())
-        judged = solve(whole, able, callback=listener(_ALL_NOISE_LABEL), limits=limits)
-        weighted = judged.problem or whole
-        judged, held_out = solution_with_profile_intervals(weighted, judged), weighted.predict_held_out(judged.x)
+        judged = estimation.solve(whole, able, callback=listener(_SOLVE_LABEL))
+    else:
+        judged = estimation.checked_solution(problem, best.solution)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
     explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.has_process_noise))
-    return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, held_out, agreement, explained)
+    return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)
 
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:

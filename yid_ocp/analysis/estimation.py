@@ -59,21 +59,27 @@ def solve(
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.solve(problem, solver, initial_unknowns, callback, limits)
     safe = choose_cable_memory_fit(problem, solver, found, limits)
-    solution, stability = _checked_solution_and_step_stability(safe.problem, safe.solution)
-    problem = solution.problem or safe.problem
+    solution = checked_solution(safe.problem, safe.solution, progress)
+    checks = replace(solution.checks or EstimateChecks(), cable_memory_message=safe.message)
+    return replace(solution, checks=checks)
+
+
+def checked_solution(problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS) -> Solution:
+    """The solution of a fit with profile intervals, the discretisation's error, and its `checks`; see `solve`."""
+    solution, stability = _checked_solution_and_step_stability(problem, solution)
+    problem = solution.problem or problem
     solution = solution_with_profile_intervals(problem, solution, progress)
     data_std = solution.std
     solution, checks = _with_discretisation_errors(problem, solution, progress)
     progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
     held_out = tuple(problem.predict_held_out(solution.x))
-    solution, issues = checked_solution_and_issues(problem, solution, held_out)
+    solution, issues = _checked_solution_and_issues(problem, solution, held_out)
     checks = replace(
         checks,
         data_std=data_std,
         held_out_predictions=held_out,
         data_issues=issues,
         step_stability=stability,
-        cable_memory_message=safe.message,
     )
     return replace(solution, checks=checks, problem=problem)
 
@@ -98,13 +104,10 @@ def _with_discretisation_errors(
     return replace(solution, parameters=inflated), checks
 
 
-def checked_solution_and_issues(
+def _checked_solution_and_issues(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> tuple[Solution, tuple[Issue, ...]]:
-    """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit.
-
-    `held_out` is from `EstimationProblem.predict_held_out`.
-    """
+    """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit."""
     if solution.evaluation is None:
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_and_units(problem, solution, held_out)

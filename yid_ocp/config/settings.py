@@ -328,6 +328,13 @@ class CompareSettings:
     methods: Annotated[
         Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
     ] = field(default_factory=_compared)
+    time_budget: Annotated[
+        float | None,
+        Gt(0),
+        OptionInfo(
+            "time of all methods together, beyond which they are stopped; the answer of `solve` takes more", "s"
+        ),
+    ] = 300.0
     reference_paper_experiment_name: Annotated[
         str | None, OptionInfo("experiment of the source paper whose answer stands beside")
     ] = None

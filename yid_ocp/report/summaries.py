@@ -138,51 +138,57 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of several methods on one problem."""
     methods: dict[str, Any] = result["methods"]
     judged, disturbed = result["judged"], result["disturbed"]
-    runs = methods | ({"all noise": judged} if disturbed else {})
+    runs = methods | {"solve": judged}
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "verdict")]
     for name, own in judged["parameters"].items():
         if own["free"]:
             cells = []
-            for entry in runs.values():
+            for method, entry in runs.items():
                 found = entry["parameters"][name]
-                # elsewhere a curvature tells nothing of how sure it is
-                ended = entry["status"] not in ("stalled", "failed")
+                # elsewhere a curvature tells nothing of how sure it is, nor where noise is left out
+                ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
                 known = (found["std"], found["interval"]) if ended else (None, None)
                 cells.append(value_and_uncertainty_text(found["value"], *known))
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged["fit"])
+    yield from (SummaryStatement(text, "conclusion") for text in _objections_to_agreement(result))
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "What it took")
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs: {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
-    if disturbed:
-        yield (
-            "the methods are compared by the sensors' noise alone; the column 'all noise' and the verdicts weigh the "
-            "noise that drives the motion as well"
-        )
     yield from result["published_explained"]
-    yield from (SummaryStatement(text, "conclusion") for text in _agreement(result))
+    if not [*_objections_to_agreement(result)]:
+        agree = "all methods agree within their uncertainty on the parameters that are found"
+        yield SummaryStatement(agree, "conclusion")
 
 
-def _agreement(result: Mapping[str, Any]) -> Iterator[str]:
-    judged, fit = result["judged"]["parameters"].values(), result["judged"]["fit"]
+def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with the methods' answers; nothing where they agree and that means something."""
+    methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
+    free = {name: entry for name, entry in own.items() if entry["free"]}
+    found = {name: entry for name, entry in free.items() if entry["verdict"] == "identifiable"}
+    if result["disturbed"]:
+        words = f"the noise that drives the motion is ignored by {', '.join(methods)}: no value of theirs is trusted"
+        yield f"{words}; `solve` counts it, and verdict and ± are those of its column"
+        for name, entry in found.items():
+            values = {method: one["parameters"][name]["value"] for method, one in methods.items()}
+            off = {m: v for m, v in values.items() if abs(v - entry["value"]) > 2 * (entry["std"] or 0.0)}
+            if off:
+                said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
+                yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
     if not fit["explains"]:
         yield "the model does not explain the recordings, so agreement of methods says nothing of the truth"
     elif not fit["believed"]:
         yield "the recordings are in doubt, so agreement of methods says nothing of the truth"
-    elif not any(entry["verdict"] == "identifiable" for entry in judged if entry["free"]):
+    elif not found:
         yield "no parameter can be found from these recordings, so there is nothing to agree on"
         yield "`yid-ocp identifiability CONFIG --what-if` says what would have to be measured"
     elif not result["agree"]:
         yield "the methods do not agree on the parameters that are found"
-    else:
-        yield "all methods agree within their uncertainty on the parameters that are found"
-        if result["disturbed"]:
-            yield "where the column 'all noise' is elsewhere, the torques' errors have misled them all alike"
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:

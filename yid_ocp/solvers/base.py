@@ -204,6 +204,10 @@ class Solution(ReprMixin):
 IterationCallback = Callable[[Iterate], None]
 
 
+class StopSearch(Exception):  # noqa: N818
+    """Exception that a callback raises to end a search at its last iterate; its text is the solution's message."""
+
+
 @dataclass(frozen=True)
 class SolverResult:
     """Raw result of a solver: status, best unknown vector, history, and the equilibria there (None if unknown)."""
@@ -215,6 +219,7 @@ class SolverResult:
     n_evaluations: int
     equilibrium_guesses: EquilibriumGuesses | None = None
     stopped_at_noise_level: bool = False  # many steps lowered the cost negligibly compared with the noise
+    stopped_by_callback: bool = False  # `StopSearch`
 
 
 @runtime_checkable
@@ -322,6 +327,8 @@ def solve(
         `GaussNewton()` when absent.
     initial_unknowns : sequence of float, optional
         The problem's when absent.
+    callback : callable, optional
+        Receives every `Iterate`; it may raise `StopSearch`.
     limits : ExcessResidualCriteria
         Criteria for a residual that exceeds noise.
     restarts : bool
@@ -397,6 +404,8 @@ class _MultiStartSearch:
         return np.where(self._problem.positive_unknowns_mask, np.clip(x * factor, *self._problem.bounds), x)
 
     def _try(self, x: Array, what: str, most: int) -> None:
+        if any(fit.result.stopped_by_callback for fit in self._fits):
+            return
         self._n_starts += 1
         note = f"start {self._n_starts} of at most {most}: {what}"
         log.info("starting again: %s", note)
@@ -444,6 +453,25 @@ def _noting(callback: IterationCallback | None, note: str) -> IterationCallback 
     return lambda entry: callback(replace(entry, note=", ".join(filter(None, (note, entry.note)))))
 
 
+def _minimize_cost(
+    solver: Solver, problem: EstimationProblem, x: Array, callback: IterationCallback | None
+) -> SolverResult:
+    """Result of a solver, of its last iterate where the callback stops it."""
+    seen: list[Iterate] = []
+
+    def watched(entry: Iterate) -> None:
+        seen.append(entry)
+        if callback is not None:
+            callback(entry)
+
+    try:
+        return solver.minimize_cost(problem, x, watched)
+    except StopSearch as stop:
+        last = seen[-1]
+        found = (Status.ITERATION_LIMIT, str(stop), last.x, tuple(seen), last.n_evaluations)
+        return SolverResult(*found, stopped_by_callback=True)
+
+
 def _fit_from(
     problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None, known: Sequence[_Fit] = ()
 ) -> _Fit:
@@ -458,7 +486,7 @@ def _fit_from(
                 shorter = problem.truncated_to_duration(fraction * longest)
                 if not shorter.evaluate(x, derivatives=False).ok:
                     continue
-                part = solver.minimize_cost(shorter, x, _noting(callback, note))
+                part = _minimize_cost(solver, shorter, x, _noting(callback, note))
             except YidError as error:
                 # so short a piece may hold too little for a filter or a node, or nothing to compare with
                 log.info("the %s are left out: %s", note, error)
@@ -472,11 +500,11 @@ def _fit_from(
     for number in range(passes):
         weighted = problem_whitened_at(weighted, x, warm) if passes > 1 else problem
         which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
-        result = solver.minimize_cost(weighted, x, _noting(callback, which))
+        result = _minimize_cost(solver, weighted, x, _noting(callback, which))
         x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
         history += result.history
         # the second pass is the first about torque offsets that are not guessed
-        if number and len(result.history) < 2:
+        if (number and len(result.history) < 2) or result.stopped_by_callback:
             break
         # a search that has come to a known fit is not weighted again
         if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:

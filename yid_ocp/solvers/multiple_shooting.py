@@ -26,6 +26,7 @@ from yid_ocp.solvers.base import (
     SolverResult,
     SolverWithCheckedSettings,
     Status,
+    StopSearch,
     projected_gradient_norm,
 )
 from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, mean_square_residual_without_efforts
@@ -149,6 +150,8 @@ class MultipleShooting(SolverWithCheckedSettings):
             "ipopt", self.hessian, iteration_callback=watch, **self._solver_options(1.0 / watch.unit)
         )
         w = np.array(solver(**program.solver_arguments)["x"]).ravel()
+        if watch.stop_request is not None:
+            raise watch.stop_request
         w = w if np.all(np.isfinite(w)) else watch.best
         defect = float(ca.norm_inf(functions(w, program.parameter_values)[2]))
         stats = solver.stats()
@@ -269,6 +272,7 @@ class _Watch(ca.Callback):
         ca.Callback.__init__(self)
         self.recorder, self.best, self._ridge = recorder, program.initial_guess, ridge
         self._problem, self._program, self._functions = problem, program, functions
+        self.stop_request: StopSearch | None = None
         cost = float(functions(program.initial_guess, program.parameter_values)[0])
         self.unit = max(cost, 0.5 * program.residual.numel() * problem.rms_noise_of_data_residuals**2)
         nw, ng = program.w.numel(), program.g.numel()
@@ -291,7 +295,11 @@ class _Watch(ca.Callback):
         x = problem_unknowns_from_program(self._problem, self._program, w)
         self.recorder.n_evaluations += 1
         note = "" if self.recorder.history else "start"
-        self.recorder.record_iterate(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
+        try:
+            self.recorder.record_iterate(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
+        except StopSearch as stop:
+            self.stop_request = stop  # IPOPT would make an error of its own of it
+            return [1]
         return [0]
 
 

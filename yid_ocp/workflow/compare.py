@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
 from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods, explain_paper_estimates
-from yid_ocp.analysis.estimation import checked_solution_and_issues
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_method_convergence
 from yid_ocp.solvers import SOLVERS, Iterate, Status
+from yid_ocp.solvers.base import EstimateChecks
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -43,15 +43,15 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             folder.log_event("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.report_iterate(entry)
 
-        comparison = compare_methods(problem, solvers, truth, iterate, run.diagnosis.null_test_residual_limits)
+        limits, budget = run.diagnosis.null_test_residual_limits, run.compare.time_budget
+        comparison = compare_methods(problem, solvers, truth, iterate, limits, math.inf if budget is None else budget)
         draw_method_convergence(folder.path / "convergence.png", comparison)
-        own = comparison.verdict_solution.problem or problem
-        held_out = tuple(comparison.verdict_held_out_predictions)
-        judged, doubts = checked_solution_and_issues(own, comparison.verdict_solution, held_out)
-        comparison = replace(comparison, verdict_solution=judged)
+        judged = comparison.verdict_solution
+        own, checks = judged.problem or problem, judged.checks or EstimateChecks()
+        held_out = checks.held_out_predictions
         explained = explain_paper_estimates(experiment, judged.parameters, truth) if experiment else ()
         about = {
-            "doubts": issues_to_plain_data(doubts),
+            "doubts": issues_to_plain_data(checks.data_issues),
             "published": PAPER_ESTIMATES[experiment] if experiment else {},
             "published_explained": list(explained),
             "truth": truth,

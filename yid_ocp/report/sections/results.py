@@ -123,7 +123,8 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
     for name, entry in findings.result["judged"]["parameters"].items():
         if entry["free"]:
             own = {method: e["parameters"][name] for method, e in findings.result["methods"].items()}
-            rows.append((name, entry["unit"], {method: (e["value"], e["std"]) for method, e in own.items()}))
+            values = {m: (e["value"], None if comparison.has_process_noise else e["std"]) for m, e in own.items()}
+            rows.append((name, entry["unit"], values | {"solve": (entry["value"], entry["std"])}))
     for _, figure in figures_by_unit(rows, figures.parameter_values_by_source_figure):
         yield "Estimates", figure
     costs = {}
