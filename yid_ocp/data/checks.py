@@ -284,12 +284,15 @@ def _transitions(one: JointGroup | PointGroup, other: JointGroup | PointGroup) -
         changes.append(np.hstack([rows[:-1], rows[1:], np.rint(np.diff(t) / _INTERVAL_GRID)[:, None]]))
     if changes[0].shape[1] != changes[1].shape[1]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    numbers = np.unique(np.vstack(changes), axis=0, return_inverse=True)[1].ravel()
+    known: dict[bytes, int] = {}  # sorting the rows takes far longer; a zero has one sign
+    numbers = np.array([known.setdefault(row.tobytes(), len(known)) for row in np.vstack(changes) + 0.0], np.int64)
     return numbers[: len(changes[0])], numbers[len(changes[0]) :]
 
 
 def _longest_shared_run(one: IntArray, other: IntArray) -> int:
     """Length of the longest stretch that two sequences have in common."""
+    if not np.intersect1d(one, other).size:
+        return 0
     least, most, size = 0, min(len(one), len(other)), max(len(one), len(other))
     # a stretch's hash is a difference of two sums of the powers of an odd number, modulo 2^64
     powers = np.cumprod(np.full(size + 1, _HASH_BASE))
