@@ -231,6 +231,8 @@ class Mechanism(ReprMixin):
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)
 
         def number(expression: ca.SX) -> ca.SX:
+            if expression.is_constant():
+                return ca.densify(expression)
             return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(theta)))
 
         mapped: Mechanism = map_expressions(self, number)
