@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import json
 import os
@@ -22,6 +23,7 @@ from pendulum_run import pendulum_data as pendulum_data
 from pendulum_run import rubbing as rubbing
 from pendulum_run import solved_pendulum as solved_pendulum
 
+from yid_ocp.data import recording_hdf5
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model.system import System
@@ -53,6 +55,30 @@ def pytest_configure(config):
         folder = config.cache.mkdir("compiled")
         folder.chmod(0o700)
         os.environ["YID_OCP_CACHE"] = str(folder)
+
+
+def pytest_collection_finish():
+    """What is imported and collected stays: the garbage collector need not look through it again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _unchanged_files_are_tried_once():
+    """A file that could be read, and did not change since, is not tried in a fork again by the same process."""
+    check, known = recording_hdf5.check_readable_in_fork, set()
+
+    def once(path, complaint, noun):
+        state = os.stat(path) if os.path.exists(path) else None
+        state = state and (state.st_ino, state.st_size, state.st_mtime_ns, state.st_mode)
+        if (path, complaint, state) not in known:
+            check(path, complaint, noun)
+            known.add((path, complaint, state))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording_hdf5, "check_readable_in_fork", once)
+        yield
 
 
 @pytest.fixture
