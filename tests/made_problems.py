@@ -66,6 +66,7 @@ class MadeUp:
             all_data_issues_are_warnings=True,
             weighting=weighting,
             prior_stds=dict(priors or {}),
+            stated_std_factor=1.0,
             path_cutoff=np.inf,
             multivariate_prior=MultivariateGaussianPrior(),
         )

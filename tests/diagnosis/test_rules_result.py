@@ -24,6 +24,7 @@ from factories import (
 
 from yid_ocp.diagnosis.diagnosis_result import _UNKNOWN_REASON_TEXTS, _ranked_candidates
 from yid_ocp.diagnosis.verdict import UnknownVerdictReason
+from yid_ocp.inference.null_test import AssumedChannelNoiseLevel
 
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 
@@ -60,6 +61,19 @@ not_judged next_experiment side evidence explainable statistics summary message 
 unseen noise baseline counterfactual seconds stopped"""
 
 
+def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
+    errors = {"points.tip": (0.03, "m"), "points.end": (0.02, "m"), "joints.effort.elbow": (0.5, "N m")}
+    levels = (("points.tip", "m", 0.0169, 3), ("points.end", "m", 0.001, 3), ("joints.effort.elbow", "N m", 0.6, 1))
+    made = finding(
+        "unknown",
+        nominal_model=fit(lost=loss(2.0, channels=errors)),
+        noise_floor=tuple(AssumedChannelNoiseLevel(*own[:3], 100, own[3]) for own in levels),
+    )
+    channel, size = made.model_error_by_unit["m"]
+    assert (channel, size) == ("points.end", pytest.approx(math.sqrt(0.02**2 - 3 * 0.001**2)))
+    assert set(made.model_error_by_unit) == {"m"}  # noise alone gives the torque's
+
+
 def test_the_result_holds_what_was_found():
     spoken = smoothed({FORCE: 9.0}, evidence={"plant": 9.0, "both": 9.0})
     made = finding(
@@ -81,7 +95,8 @@ def test_the_result_holds_what_was_found():
     first = {"location": "T1", "share": 0.7, "observable": True, "windows": [[0.0, 1.0]], "indistinguishable_from": []}
     assert result["where"] == [first]
     other = first | {"location": "T2", "share": 0.3, "observable": False, "windows": []}
-    assert result["remaining"] == {"p_value": 0.4, "where": [other]}
+    beyond_noise = {"points.tip": {"rms": pytest.approx(math.sqrt(0.01**2 - 0.001**2)), "unit": "m"}}
+    assert result["remaining"] == {"p_value": 0.4, "model_error": beyond_noise, "where": [other]}
     assert result["confusable"] == [
         [{"kind": "friction", "location": "elbow"}, {"kind": "offset", "location": "wrist"}]
     ]

@@ -29,6 +29,7 @@ from yid_ocp.inference.uncertainty import (
     ParameterEstimate,
     _cost_checked_std,
     _misfit_sandwich_covariance,
+    _score_covariance,
     assess_goodness_of_fit,
     needs_no_profile_likelihood,
     parameter_estimates,
@@ -183,6 +184,11 @@ def test_a_fit_is_judged_in_units_of_noise_by_the_limits_of_a_diagnosis():
     assert half.chi2_per_dof == pytest.approx(4 * assess_goodness_of_fit(problem, found).chi2_per_dof)
 
 
+def wider_by_few(count):
+    """How much wider intervals of so many independent scores are than those of very many."""
+    return scipy.stats.t.ppf(0.975, count - 1) / scipy.stats.norm.ppf(0.975)
+
+
 def constant(residual):
     """A constant seen by every sample."""
     return MadeUp(linear(np.ones((len(residual), 1)), residual))
@@ -197,8 +203,8 @@ def widened(problem):
 def test_a_misfit_that_stays_for_long_counts_as_one_and_one_that_alternates_as_many():
     t = np.linspace(0, 1, 480)
     slow, quick = 5 * np.sign(np.sin(4 * np.pi * t)), 5 * (-1.0) ** np.arange(480)
-    # each of the eight blocks of 60 samples counts about as one
-    assert widened(constant(slow)) == pytest.approx(math.sqrt(60 * 8 / 7), rel=0.1)
+    # each of the eight blocks of 60 samples counts about as one, and eight are few
+    assert widened(constant(slow)) == pytest.approx(math.sqrt(60 * 8 / 7) * wider_by_few(8), rel=0.1)
     assert widened(constant(quick)) == 1.0
 
 
@@ -225,11 +231,37 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
     slope = found.jacobian[:, 0]
     scores = np.array([size * slope[own.residual_indices].sum() for own, size in zip(series, offset, strict=True)])
     scores -= scores.mean()
-    expected = scores @ scores * len(series) / (len(series) - 1) / (slope @ slope) ** 2
+    own_part = np.array([slope[own.residual_indices] @ slope[own.residual_indices] for own in series])
+    scores *= wider_by_few(len(series)) / np.sqrt(1 - own_part / (slope @ slope))
+    expected = scores @ scores / (slope @ slope) ** 2
     plain, _ = unknowns_covariance_and_reduced_chi2(problem, found)
     assert len(series) >= _MIN_CLUSTER_CHANNELS
     assert expected > 3 * plain[0, 0]
     assert _misfit_sandwich_covariance(problem, found, plain)[0, 0] == pytest.approx(expected)
+
+
+def test_scores_of_a_fit_scatter_as_the_noise_does_however_much_a_cluster_decides():
+    """Summed over the directions of white noise, what a fit leaves of it gives the information itself."""
+    slopes = np.random.default_rng(0).standard_normal((12, 3))
+    slopes[:4] *= 5.0  # the first of four clusters decides
+    information, left = slopes.T @ slopes, np.eye(12) - slopes @ np.linalg.pinv(slopes)
+    clusters = [slice(0, 4), slice(4, 6), slice(6, 7), slice(7, 12)]
+
+    def scatter(residual):
+        return _score_covariance(information, np.linalg.inv(information), [(slopes[c], residual[c]) for c in clusters])
+
+    np.testing.assert_allclose(sum(map(scatter, left)) / wider_by_few(4) ** 2, information, rtol=1e-9, atol=1e-9)
+
+
+def test_a_prior_counts_as_stated_where_a_part_of_all_stated_deviations_is_noise():
+    share, slopes = 0.1, np.array([[0.0, 2.0], [0.0, -2.0], [1 / (0.5 * 0.1), 0.0]])  # the prior of the first is 0.5
+    problem = MadeUp(linear(slopes, [3.0, 4.0, 0.0]), (1.0, 1.0), stated=1)
+    problem.options.stated_std_factor = share
+    found = problem.evaluate([0.0, 0.0])
+    covariance, chi2 = unknowns_covariance_and_reduced_chi2(problem, found)
+    assert covariance[1, 1] == pytest.approx(chi2 / 8)
+    assert covariance[0, 0] == pytest.approx(0.5**2)
+    assert _misfit_sandwich_covariance(problem, found, covariance)[0, 0] == pytest.approx(0.5**2)
 
 
 def saturating(top):
@@ -453,7 +485,7 @@ def with_p_values(*wanted: float) -> tuple[list, np.ndarray]:
     return [series(range(len(residual)), t)], np.array(residual)
 
 
-FEW = [((0.008, 0.5, 0.6, 0.7), ()), ((0.0049, 0.5, 0.6, 0.7), ()), ((0.002, 0.5, 0.6, 0.7), (0,))]
+few = [((0.008, 0.5, 0.6, 0.7), ()), ((0.0049, 0.5, 0.6, 0.7), ()), ((0.002, 0.5, 0.6, 0.7), (0,))]
 SOME = [((0.6, 0.7, 0.5, 0.002), (3,)), ((0.5, 0.0049, 0.6, 0.004), (1, 3)), ((0.0074, 0.0049, 0.5, 0.007), (0, 1, 3))]
 
 
@@ -461,7 +493,7 @@ ALL = (0.0099, 0.009, 0.0095, 0.0098), (0, 1, 2, 3)
 RATES = [(0.1, (0.02, 0.5, 0.6, 0.7), (0,)), (0.05, (0.02, 0.5, 0.6, 0.7), ())]
 
 
-@pytest.mark.parametrize(("level", "p_values", "flagged"), [*((0.01, *case) for case in (*FEW, *SOME, ALL)), *RATES])
+@pytest.mark.parametrize(("level", "p_values", "flagged"), [*((0.01, *case) for case in (*few, *SOME, ALL)), *RATES])
 def test_windows_are_flagged_by_their_false_discovery_rate(level, p_values, flagged):
     found = residual_chi2_null_test(*with_p_values(*p_values), 0, level=level).windows
     assert len(found) == 4

@@ -240,6 +240,7 @@ def test_every_row_is_so_many_times_larger_and_the_fit_the_same(problem_of):
     shrunk = _with_noise_only_stds(problem, SETTINGS)
     rows = problem.residual_rows
     assert shrunk.residual_rows == rows
+    assert shrunk.options.stated_std_factor == SHARE
     assert [part.stop - part.start for part in (rows.stated_priors, rows.weak_priors)] == [3, 1]
     for seed in range(3):
         apart = np.random.default_rng(seed).uniform(-0.3, 0.3, len(problem.initial_unknowns))

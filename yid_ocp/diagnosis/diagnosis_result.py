@@ -40,7 +40,6 @@ from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
 from yid_ocp.files import object_attributes_to_json_dict, to_json_types
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
 from yid_ocp.inference.smoother import SmoothedUnknownsResult
-from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 
 _FORMAT = "yid-diagnosis/2"
 
@@ -115,6 +114,16 @@ class DiagnosisResult(ReprMixin):
         """The model with all accepted effects; the nominal model if there are none."""
         return self.selected_effects[-1].refitted_model if self.accepted_effects else self.nominal_model
 
+    @property
+    def model_error_by_unit(self) -> dict[str, tuple[str, float]]:
+        """Channel with the largest held-out error that the final model leaves beyond noise, and its RMS, by unit."""
+        noise = {own.channel: own.noise_rmse for own in self.noise_floor}
+        found: dict[str, tuple[str, float]] = {}
+        for channel, (error, unit) in self.final_model.held_out_loss.channel_rmse.items():
+            size = math.sqrt(max(error**2 - noise.get(channel, 0.0) ** 2, 0.0))
+            found[unit] = max(found.get(unit, ("", 0.0)), (channel, size), key=lambda own: own[1])
+        return {unit: own for unit, own in found.items() if own[1] > 0}
+
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
         smoothed, accepted, since = self.smoother_result, self.accepted_effects, self.baseline_comparison
@@ -139,6 +148,9 @@ class DiagnosisResult(ReprMixin):
             "effects": [object_attributes_to_json_dict(e, _EFFECT) for e in accepted],
             "remaining": {
                 "p_value": self.remaining_test.p_value,
+                "model_error": {
+                    channel: {"rms": size, "unit": unit} for unit, (channel, size) in self.model_error_by_unit.items()
+                },
                 "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.remaining_gap_locations],
             },
             "reason": self.unknown_reason,
@@ -219,23 +231,6 @@ def _behind(fit: RefittedModel, first: RefittedModel) -> dict[str, float]:
     lost, error = held_out_improvement(fit.held_out_loss, first.held_out_loss)
     left, squares = fit.held_out_loss.chi2_per_sample, penalized_chi2_difference(fit, first)
     return {"left": left, "chi2_per_dof": lost, "error": error, "squares": squares}
-
-
-def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
-    """Return the final model for result.json: its parameters and effects, and the free parameters' covariance."""
-    fit = finding.final_model
-    problem, shared = fit.problem, fit.problem.shared_parameters
-    idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
-    theta, _ = problem.theta_and_initial_state_deviation(problem.vector(fit.values), 0)
-    found = {}
-    for entry, value in zip(problem.system.parameters, theta, strict=True):
-        if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
-            free = entry.name in shared
-            std = to_json_types(fit.std[entry.name]) if free else 0.0
-            found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
-    matrix, _ = unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
-    covariance = covariance_to_dict(shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared])
-    return {"parameters": found, "covariance": covariance}
 
 
 _EFFECT = "kind location"
@@ -401,7 +396,8 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
     if finding.accepted_effects:
         text += _effects(finding)
     elif finding.verdict == "unknown":
-        text.append(_nameless(finding))
+        size = _model_error(finding)
+        text += [_nameless(finding), f"What remains is model error{size}." if size else ""]
     if finding.untried:
         rest = ", ".join(finding.untried[:8]) + (", ..." if len(finding.untried) > 8 else "")
         text.append(f"The search stopped after {finding.search_seconds:.3g} s; it would go on with {rest}.")
@@ -493,7 +489,8 @@ def _effects(finding: DiagnosisResult) -> list[str]:
         text.append(f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}.")
     if rest.chi2_per_dof > 1 and rest.p_value < finding.thresholds.significance_level:
         mostly = "".join(f", most of it in {place.location}" for place in finding.remaining_gap_locations[:1])
-        text.append(f"What remains: held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}{mostly}.")
+        size = f"held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}"
+        text.append(f"What remains is model error{_model_error(finding)} ({size}{mostly}).")
     else:
         text.append("What remains is noise.")
     moved = [
@@ -502,6 +499,12 @@ def _effects(finding: DiagnosisResult) -> list[str]:
         if abs(a.value_after - a.value_before) > _MIN_RELATIVE_CHANGE * max(abs(a.value_before), 1e-9)
     ]
     return [*text, f"With it {', '.join(moved[:6])}."] if moved else text
+
+
+def _model_error(finding: DiagnosisResult) -> str:
+    sizes = finding.model_error_by_unit.items()
+    said = " and ".join(f"{size:.2g} {unit} (rms) at {channel}" for unit, (channel, size) in sizes)
+    return f" of {said}" if said else ""
 
 
 def _figures(effect: EffectBase, fit: RefittedModel) -> str:

@@ -7,6 +7,7 @@ chi-squared variable with n/(1 + 2 sum rho_l^2) degrees of freedom; a free param
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -46,6 +47,12 @@ class AssumedChannelNoiseLevel:
     unit: str
     noise_std: float
     n_samples: int
+    outputs_per_channel: int = 1  # coordinates of a point
+
+    @property
+    def noise_rmse(self) -> float:
+        """Root mean square error that noise alone gives; for points that of a distance."""
+        return math.sqrt(self.outputs_per_channel) * self.noise_std
 
 
 @dataclass(frozen=True)
@@ -73,15 +80,17 @@ class NullTestResult:
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
     """Noise level that the problem assumes for each channel; the level is stated, not measured."""
     found: dict[str, list[Array]] = {}
-    units: dict[str, str] = {}
+    told: dict[str, tuple[str, int]] = {}
     for episode in problem.episodes:
         for samples in episode.measurements:
             for column, channel in enumerate(samples.channel_name_per_output):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
-                units[channel] = samples.sensor.unit
+                told[channel] = samples.sensor.unit, samples.sensor.outputs_per_channel
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
     return tuple(
-        AssumedChannelNoiseLevel(c, units[c], float(np.median(v)), len(v)) for c, v in joined.items() if len(v)
+        AssumedChannelNoiseLevel(c, told[c][0], float(np.median(v)), len(v), told[c][1])
+        for c, v in joined.items()
+        if len(v)
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
@@ -110,12 +111,16 @@ def assess_goodness_of_fit(
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
     """Return the covariance (nx, nx) of the unknowns from data and stated priors, and chi2 per degree of freedom.
 
-    Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
+    Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one. A prior
+    counts with at least the standard deviation that was stated, however few of the stated ones are noise.
     """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
     spread, chi2 = unknowns_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
-    return spread @ spread.T * max(1.0, chi2), chi2
+    scale = max(1.0, chi2)
+    priors = linearization_without_weak_priors(problem, evaluation)[1][problem.residual_rows.stated_priors]
+    pull = spread @ (priors @ spread).T * math.sqrt(max(0.0, problem.options.stated_std_factor**-2 - scale))
+    return spread @ spread.T * scale + pull @ pull.T, chi2
 
 
 def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
@@ -151,17 +156,40 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
         return covariance
     residual, jacobian = linearization_without_weak_priors(problem, evaluation)
     jacobian = jacobian * (scale := problem.unknown_scales)
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
-    scores = jacobian * residual[:, None]
+    priors = jacobian[problem.residual_rows.stated_priors] / problem.options.stated_std_factor
+    information = jacobian.T @ jacobian
+    inverse = np.asarray(np.linalg.pinv(information, rcond=1e-10, hermitian=True), float)
     plain = np.maximum(np.diag(covariance), 1e-300)
     widest = plain
     for labels in _clusters(problem):
-        sums = np.array([scores[rows].sum(axis=0) for rows in labels])
-        sums = sums - sums.mean(axis=0)
-        middle = sums.T @ sums * len(sums) / (len(sums) - 1)
+        middle = _score_covariance(information, inverse, [(jacobian[rows], residual[rows]) for rows in labels])
+        middle += priors.T @ priors
         widest = np.maximum(widest, np.diag(inverse @ middle @ inverse) * scale**2)
     factor = np.sqrt(widest / plain)
     return covariance * np.outer(factor, factor)
+
+
+def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tuple[Array, Array]]) -> Array:
+    """Covariance (nx, nx) of the sum of scores J' r over clusters of rows (J, r) that err independently of one another.
+
+    A fit follows a cluster that alone informs a direction, and leaves too little of its error: the sums are divided by
+    (1 - h)^(1/2), h the cluster's part of the information (Bell, McCaffrey 2002). Of few clusters even that is too
+    little; intervals of two standard deviations then are those of Student's t.
+    """
+    values, vectors = np.linalg.eigh(information)
+    root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    back = root @ inverse
+    sums = np.array([slopes.T @ errors for slopes, errors in clusters])
+    adjusted = []
+    for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
+        share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
+        # what no other cluster informs cannot be told from these
+        kept = share < 1 - 1e-6
+        grown = np.where(kept, 1.0 / np.sqrt(np.where(kept, 1.0 - np.maximum(share, 0.0), 1.0)), 0.0)
+        adjusted.append(root @ (axes * grown) @ axes.T @ (back @ total))
+    by_few = float(scipy.special.stdtrit(len(sums) - 1, 0.975) / scipy.special.ndtri(0.975))
+    scores = np.array(adjusted) * by_few
+    return scores.T @ scores
 
 
 def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:

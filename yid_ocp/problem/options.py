@@ -76,6 +76,8 @@ class ProblemOptions:
         Gaussian priors about the initial value, in the parameter's unit.
     multivariate_prior : MultivariateGaussianPrior
         Correlated prior of several parameters, in place of entries of `prior_stds`.
+    stated_std_factor : float
+        Factor by which all standard deviations here have been multiplied, priors' too, so that they are noise alone.
     parameters_by_recording : mapping of recording to mapping of parameter to value
         Known values of parameters that differ from recording to recording, such as where markers sit.
     known_initial_states : mapping of recording to array_like, shape (nx,)
@@ -120,6 +122,7 @@ class ProblemOptions:
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)
+    stated_std_factor: float = 1.0
     weak_prior_geometric_std: Annotated[
         float,
         Ge(0),

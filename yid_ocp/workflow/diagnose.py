@@ -18,16 +18,17 @@ from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_confi
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import BaselineRunData, with_baseline_prior
-from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import (
     dataclass_from_plain_data,
     json_sha256,
     read_input_json,
+    to_json_types,
     to_lossless_plain_data,
     write_strict_json,
 )
+from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -102,7 +103,7 @@ def run_diagnose(
         moving = not last.problem.options.clamp_poses_from_points and bool(system.driven or system.prescribed)
         x = last.problem.vector(last.values)
         own = {
-            "model": final_model_to_dict(finding),
+            "model": _final_model_to_dict(finding),
             "doubts": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.estimated_torque_offsets(last.problem, x),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
@@ -112,6 +113,23 @@ def run_diagnose(
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
     refits.delete_file()
     return CommandOutcome(folder.path, written, finding)
+
+
+def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
+    """The final model for result.json: its parameters and effects, and the free parameters' covariance."""
+    fit = finding.final_model
+    problem, shared = fit.problem, fit.problem.shared_parameters
+    idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
+    theta, _ = problem.theta_and_initial_state_deviation(problem.vector(fit.values), 0)
+    found = {}
+    for entry, value in zip(problem.system.parameters, theta, strict=True):
+        if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
+            free = entry.name in shared
+            std = to_json_types(fit.std[entry.name]) if free else 0.0
+            found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
+    matrix, _ = unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
+    covariance = covariance_to_dict(shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared])
+    return {"parameters": found, "covariance": covariance}
 
 
 @dataclass(frozen=True)
@@ -162,6 +180,7 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
         replace(
             options,
             sensors=sensors,
+            stated_std_factor=share * options.stated_std_factor,
             prior_stds={name: share * std for name, std in options.prior_stds.items()},
             multivariate_prior=prior.with_parameters_scaled_by(dict.fromkeys(prior.parameter_names, share)),
             huber_threshold=options.huber_threshold / share,

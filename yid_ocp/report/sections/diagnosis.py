@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
@@ -54,10 +53,7 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
     changed = bool(finding.accepted_effects)
-    # what noise alone gives; for points that of a distance
-    sensors = [samples.sensor for own in finding.nominal_model.problem.held_out for samples in own.measurements]
-    width = {channel: sensor.outputs_per_channel for sensor in sensors for channel in sensor.channel_names}
-    floor = {own.channel: math.sqrt(width.get(own.channel, 1)) * own.noise_std for own in finding.noise_floor}
+    floor = {own.channel: own.noise_rmse for own in finding.noise_floor}
     rows = []
     for channel, (error, unit) in before.items():
         factor, shown = scale_and_unit_with_metres_as_mm(unit)
