@@ -98,7 +98,7 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
         initial_state="fitted_to_points",
         path_cutoff=8.0,
         sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free_vertex_names)},
-        clamp_poses_from_points=cable.clamp_poses_from_points,
+        clamp_pose_definitions_from_points=cable.clamp_pose_definitions_from_points,
         prior_stds=dict.fromkeys(names, 0.2),
         initial_state_fit_window=TIME_STEP,
         start_point_noise_std=NOISE,
@@ -136,8 +136,8 @@ def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
         "linear_carry": interpolated_displacement_position_baseline(
             recording,
             free,
-            cable.parent_branch_point_names,
-            cable.child_branch_point_names,
+            cable.parent_branch_vertex_names,
+            cable.vertex_names_by_child_branch,
             cable.clamped_vertex_names,
         ),
     }

@@ -499,7 +499,7 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
     causes = sorted({doubt.cause for doubt in doubts})
     found: list[str] = []
     wrong: list[str] = []
-    if solving and problem.options.all_data_issues_are_warnings:
+    if solving and problem.options.no_data_issue_exceeds_warning:
         outcome = solve(problem, run.solver, limits=run.diagnosis.null_test_residual_limits)
         verdicts = {name: entry for name, entry in outcome.parameters.items() if entry.verdict == "identifiable"}
         found = list(verdicts)
@@ -509,7 +509,7 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
         "outcome": "doubted" if doubts else "believed",
         "named": bool(set(causes) & set(case.causes)),
         "causes": causes,
-        "harmless": problem.options.all_data_issues_are_warnings and bool(doubts),
+        "harmless": problem.options.no_data_issue_exceeds_warning and bool(doubts),
         "found": found,
         "wrong": wrong,
         "doubts": [f"{doubt.where}: {doubt.what}" for doubt in doubts],

@@ -63,7 +63,7 @@ class MadeUp:
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.unknown_scales = np.abs(self.initial_unknowns) if scales is None else np.array(scales, float)
         self.options = SimpleNamespace(
-            all_data_issues_are_warnings=True,
+            no_data_issue_exceeds_warning=True,
             weighting=weighting,
             prior_stds=dict(priors or {}),
             stated_std_factor=1.0,

@@ -24,9 +24,9 @@ from yid_ocp.parallel import (
     TaskResult,
     WorkerConfig,
     available_processor_count,
-    call_batched_across_threads,
+    call_merged_with_other_threads,
     map_in_threads,
-    map_with_batched_calls,
+    map_with_merged_calls,
     process_pool,
     require_task_values,
     run_tasks,
@@ -380,18 +380,18 @@ def test_questions_of_all_items_meet():
     def item(i: int) -> int:
         """Asks i + 1 times, one question more every time."""
         return sum(
-            sum(call_batched_across_threads(squares, [10 * i + k for k in range(turn + 1)])) for turn in range(i + 1)
+            sum(call_merged_with_other_threads(squares, [10 * i + k for k in range(turn + 1)])) for turn in range(i + 1)
         )
 
-    found = map_with_batched_calls(item, range(3))
+    found = map_with_merged_calls(item, range(3))
     assert squares.asked == [[0, 10, 20], [10, 11, 20, 21], [20, 21, 22]]
     assert found == [0, 100 + 100 + 121, 400 + 400 + 441 + 400 + 441 + 484]
 
 
 def test_more_items_than_are_at_work_at_once_and_two_functions():
     squares, others = Answers(), Answers()
-    found = map_with_batched_calls(
-        lambda i: call_batched_across_threads(others if i % 2 else squares, [i])[0], range(20)
+    found = map_with_merged_calls(
+        lambda i: call_merged_with_other_threads(others if i % 2 else squares, [i])[0], range(20)
     )
     assert found == [i * i for i in range(20)]
     assert (squares.asked[0], others.asked[0]) == ([0, 2, 4, 6], [1, 3, 5, 7])
@@ -400,14 +400,14 @@ def test_more_items_than_are_at_work_at_once_and_two_functions():
 
 def test_outside_and_within_an_item_one_asks_as_usual():
     squares = Answers()
-    assert call_batched_across_threads(squares, [3]) == [9]
+    assert call_merged_with_other_threads(squares, [3]) == [9]
 
     def inner(_: int) -> list[int]:
-        return map_with_batched_calls(lambda j: call_batched_across_threads(squares, [j])[0], range(2))
+        return map_with_merged_calls(lambda j: call_merged_with_other_threads(squares, [j])[0], range(2))
 
-    assert map_with_batched_calls(inner, range(2)) == [[0, 1], [0, 1]]
+    assert map_with_merged_calls(inner, range(2)) == [[0, 1], [0, 1]]
     assert squares.asked == [[3], [0, 0], [1, 1]]
-    assert map_with_batched_calls(str, []) == []
+    assert map_with_merged_calls(str, []) == []
 
 
 @pytest.mark.parametrize("kind", [KeyError, KeyboardInterrupt])
@@ -419,16 +419,16 @@ def test_what_goes_wrong_is_said_where_the_map_was_called_and_leaves_nobody_wait
 
     def item(i: int) -> None:
         try:
-            call_batched_across_threads(refuses, [i])
+            call_merged_with_other_threads(refuses, [i])
         finally:
             ended.append(i)
 
     with pytest.raises(kind):
-        map_with_batched_calls(item, range(3))
+        map_with_merged_calls(item, range(3))
     assert sorted(ended) == [0, 1, 2]
 
     def fails(i: int) -> int:
-        return call_batched_across_threads(Answers(), [i])[0] if i != 1 else int("item 1")
+        return call_merged_with_other_threads(Answers(), [i])[0] if i != 1 else int("item 1")
 
     with pytest.raises(ValueError, match="item 1"):
-        map_with_batched_calls(fails, range(3))
+        map_with_merged_calls(fails, range(3))

@@ -10,7 +10,7 @@ _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows
 
 
 @dataclass(frozen=True)
-class ReprTexts:
+class ReprLineAndTableRows:
     """Texts that represent an object: one line without its class name, and rows of a notebook table, header first."""
 
     one_line: str
@@ -20,7 +20,7 @@ class ReprTexts:
 class ReprMixin:
     """Mixin that makes `__repr__` and a notebook table from the method `_summary`; a dataclass needs `repr=False`."""
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         raise NotImplementedError
 
     def __repr__(self) -> str:

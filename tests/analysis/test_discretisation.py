@@ -206,7 +206,7 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     free, gains = ("elbow.damping", "elbow.stiffness"), (9.0,)
     options = ProblemOptions(arm_tracking_feedback=feedback, arm_tracking_feedback_gains=gains)
     truth = EstimationProblem(step_with_time_step(step, 0.0025), [drawn], free, options)
-    recording = truth.simulate_noisy_recording(seed=1)
+    recording = truth.simulate_synthetic_recording(seed=1)
     coarse, anew = (EstimationProblem(step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02))
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)

@@ -20,8 +20,8 @@ from yid_ocp.analysis.experiment_design import (
     CandidateExperimentSensitivityBuilder,
     FrameObservationSchedule,
     RecordedExperiment,
+    extended_step_and_observable_frames,
     observable_frames,
-    step_and_observable_frames,
 )
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
@@ -55,8 +55,8 @@ MARKER_DISTANCE = 0.03
 def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
-        (made.camera_group_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_point_group_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.camera_point_group_and_sampling(episode), camera, (np.arange(7) / 3.0, 5e-3)),
+        (made.arm_point_group_and_sampling(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -67,9 +67,9 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     std = np.full((3, 2, 3), 2e-3)
     std[0] = [9e-3, np.nan, 9e-3]
     made, episode = setting(group(std=std))
-    assert made.camera_group_times_and_std(episode)[2] == 2e-3
+    assert made.camera_point_group_and_sampling(episode)[2] == 2e-3
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
-    assert made.camera_group_times_and_std(episode)[2] == 3e-3
+    assert made.camera_point_group_and_sampling(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
     with pytest.raises(DataError, match="the noise level of group 'points_camera' is not known"):
         unknown.existing_point_observation_schedules(episode)
@@ -272,7 +272,7 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
     np.testing.assert_allclose(camera.t, episode.grid.node_times)
     assert np.all(camera.std == 1.0)
     step = swung().step
-    more, seen = step_and_observable_frames(step)
+    more, seen = extended_step_and_observable_frames(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel
@@ -372,13 +372,13 @@ def drawn_motion(monkeypatch):
             row[:, feedback.state_indices] -= s.state_by_torque @ gain
         return [(np.stack(rows), None)]
 
-    monkeypatch.setattr(propagation, "rollout_step_derivatives", maps)
+    monkeypatch.setattr(propagation, "step_derivatives_along_rollout", maps)
     monkeypatch.setattr(
         propagation, "applied_torque_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    functions = SimpleNamespace(step=None, effect_momentum_shift=shift)
+    functions = SimpleNamespace(step=None, effect_momentum_shift_functions=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,

@@ -21,7 +21,7 @@ from yid_ocp.analysis.friction_ladder import (
     FrictionLawFit,
     cross_validate_friction_law,
     friction_torque_clouds,
-    motion_kind_mean_and_std_error,
+    mean_and_std_error_over_motion_kinds,
     recording_names_by_name_stem,
     simplest_fit_within_std_error,
 )
@@ -152,7 +152,7 @@ def fit_of(law: str, *errors: float) -> FrictionLawFit:
 
 
 def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():
-    mean, error = motion_kind_mean_and_std_error({"a_1": 1.0, "a_2": 3.0, "b_1": 5.0, "c_1": 8.0}, KINDS)
+    mean, error = mean_and_std_error_over_motion_kinds({"a_1": 1.0, "a_2": 3.0, "b_1": 5.0, "c_1": 8.0}, KINDS)
     assert mean == pytest.approx(5.0)
     assert error == pytest.approx(np.std([2.0, 5.0, 8.0], ddof=1) / np.sqrt(3))
     rough, good, best = fit_of("viscous", 9, 9, 8, 9), fit_of("coulomb", 3, 3, 2, 4), fit_of("stribeck", 2.8, 2.8, 2, 4)
@@ -181,7 +181,7 @@ def dry(urdf_folder) -> EstimationProblem:
         command = 0.4 * np.sin(rate * t[:, None] + [0.0, 1.0]) + (0.5 * t[:, None] if name == "turn_1" else 0.0)
         group = joints(PENDULUM, t, command, position_command=command, position_std=1e-3)
         source = EstimationProblem(step, [recording(group, name=name)], ["shoulder.servo_gain"], None, TRUTH)
-        made.append(source.simulate_noisy_recording(seed=len(made)))
+        made.append(source.simulate_synthetic_recording(seed=len(made)))
     off = joints(PENDULUM, t, np.zeros((81, 2)), effort=np.zeros((81, 2)), position_std=1e-3)
     names = ["joint_coulomb@shoulder.tau_c", "shoulder.servo_gain"]
     known = TRUTH | {"joint_coulomb@shoulder.tau_c": 0.6}

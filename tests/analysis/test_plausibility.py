@@ -587,7 +587,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
     arm = joints(("shoulder",), t, 0.4 * np.sin(5 * t)[:, None], effort=2 * np.cos(5 * t)[:, None], **more)
     camera = seen(["tip"], t[4:-4:4], np.zeros((74, 1, 3)), "points_camera", std=np.full((74, 1, 3), 2e-3))
     source = EstimationProblem(step, [recording(arm, camera)], ["elbow.stiffness"])
-    made = source.simulate_noisy_recording(seed=1)
+    made = source.simulate_synthetic_recording(seed=1)
     moved = replace(made.points[0], t=1.5 + 1.02 * (made.points[0].t - 1.5))
     problem = EstimationProblem(step, [replace(made, points=(moved,))], ["elbow.stiffness"])
     solution = solve(problem, GaussNewton(), restarts=False)

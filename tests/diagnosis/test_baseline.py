@@ -9,7 +9,7 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import BaselineRunData, with_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -25,7 +25,7 @@ model:
     kind: segments
     mount: {rpy: [0.0, 1.5707963267948966, 0.0]}
     segments:
-      beam: {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, has_stiffness_per_curvature: true,
+      beam: {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_given_as_rigidity: true,
              clamped_at_base: true, joint_axes: y}
 recordings: {estimate: [bare.h5]}
 parameters:
@@ -112,7 +112,7 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
     both = refit_with_effects(AllCandidatesProblem(with_baseline_prior(problem, known), (), False), (), {})
-    [shift] = BaselineRunData.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
+    [shift] = EarlierRunsBaseline.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:
         assert shift.z_score is None  # the recording says nothing beside such a baseline

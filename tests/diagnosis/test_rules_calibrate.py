@@ -108,9 +108,9 @@ def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
     found = calibrated(*clean, *effects)
     assert found["rules"]["candidate"]["quantile"] == 2.345e-5
     assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 2
-    assert found["settings"]["candidate_score_significance_level"] == 2.3e-5
+    assert found["settings"]["gap_significance_level_by_candidate"] == 2.3e-5
     few = calibrated(clean[0])
-    assert few["settings"]["candidate_score_significance_level"] == 1e-4, "no less sure than odds that convince"
+    assert few["settings"]["gap_significance_level_by_candidate"] == 1e-4, "no less sure than odds that convince"
 
 
 def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:

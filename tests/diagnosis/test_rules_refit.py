@@ -318,7 +318,7 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
 
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     monkeypatch.setattr(module, "refit_with_effects", one)
-    monkeypatch.setattr(module, "map_with_batched_calls", batched)
+    monkeypatch.setattr(module, "map_with_merged_calls", batched)
     search, march = RefitContext("problem", LIMITS, Heard(), deadline=35.0), [["a"], ["b", "c"], ["d"]]
     found = refit_with_each_effect(search, (), tried, {})
     assert ([f.effects[-1].kind for f in found], batches, search.skipped) == ([*"abcd"], march, ["e@x", "f@x"])

@@ -455,7 +455,7 @@ LITTLE = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "
         # surer than a rest that the residual as a whole shows, counted as the best of two
         "along a candidate": (4e-5, {}, ["a", "b"]),
         "hardly along one": (6e-5, {}, ["a"]),
-        "along one by another level": (6e-5, {"candidate_score_significance_level": 2e-4}, ["a", "b"]),
+        "along one by another level": (6e-5, {"gap_significance_level_by_candidate": 2e-4}, ["a", "b"]),
     },
 )
 def test_a_rest_is_left_unless_it_is_large_or_shows_along_a_candidate(monkeypatch, left, limits, chosen):

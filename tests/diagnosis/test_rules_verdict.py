@@ -32,7 +32,7 @@ from yid_ocp.diagnosis.verdict import (
     find_unknown_verdict_reason,
     fraction_of_smoother_chi2_decrease,
     has_significant_gap,
-    inflate_std_by_disagreement,
+    inflate_fit_stds_by_disagreement,
     is_barely_significant_and_unexplained,
 )
 from yid_ocp.progress import NULL_PROGRESS
@@ -85,12 +85,12 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    limits = Thresholds(min_channel_excess_chi2_per_dof=0.03, candidate_score_significance_level=0.01)
+    limits = Thresholds(min_channel_excess_chi2_per_dof=0.03, gap_significance_level_by_candidate=0.01)
     assert has_significant_gap(*tests, limits, scored(*p_values)) is gap
 
 
 def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
-    sure = Thresholds(candidate_score_significance_level=1e-4, significance_level=0.05)
+    sure = Thresholds(gap_significance_level_by_candidate=1e-4, significance_level=0.05)
     assert [has_significant_gap(outcome(), outcome(chi2=1.2), sure, scored(p)) for p in (9e-5, 0.03)] == [True, False]
 
 
@@ -314,10 +314,10 @@ def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
 )
 def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(first, second, std):
     one, other = (of("spring@elbow", {"k": value, "s": 3.0}, {"k": size}) for value, size in (first, second))
-    counted = inflate_std_by_disagreement(one, _compare(SPRING, one, other, Thresholds()))
+    counted = inflate_fit_stds_by_disagreement(one, _compare(SPRING, one, other, Thresholds()))
     assert counted.std == one.std | {"spring@elbow.k": pytest.approx(std)}
     assert counted.values == one.values
-    again = inflate_std_by_disagreement(other, _compare(SPRING, other, one, Thresholds()))
+    again = inflate_fit_stds_by_disagreement(other, _compare(SPRING, other, one, Thresholds()))
     reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
     assert not abs(first[0] - second[0]) > reach  # their intervals overlap
 

@@ -202,7 +202,9 @@ def test_what_a_recording_holds(driven) -> None:
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     layout, made, system = cable
     options = ProblemOptions(
-        **OPEN, initial_state="fitted_to_points", clamp_poses_from_points=layout.clamp_poses_from_points
+        **OPEN,
+        initial_state="fitted_to_points",
+        clamp_pose_definitions_from_points=layout.clamp_pose_definitions_from_points,
     )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):

@@ -27,7 +27,7 @@ def beam() -> System:
     """Panda with a beam on its hand, its joints prescribed."""
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names)
-    segment = Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, has_stiffness_per_curvature=True)
+    segment = Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_given_as_rigidity=True)
     item = flexible_object([segment], name="beam")
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
 

@@ -29,7 +29,7 @@ def rested(step, theta, angle=START, path=None):
 
 def places(mover, state, name="tip"):
     """Positions of a frame along states."""
-    return mover.frame_position_trajectories(FramePositionEvaluator(mover.step.system, [name]), state)[:, 0]
+    return mover.frame_positions_along_states(FramePositionEvaluator(mover.step.system, [name]), state)[:, 0]
 
 
 def elsewhere(plan, change):

@@ -90,7 +90,7 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
     system = found.simulator.step.system
     names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    at = found.simulator.frame_position_trajectories(FramePositionEvaluator(system, names), found.rollout.state)
+    at = found.simulator.frame_positions_along_states(FramePositionEvaluator(system, names), found.rollout.state)
     at = at.reshape(len(found.t), -1, 2, 3)
     assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
 
@@ -119,9 +119,9 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
     fewer = (
-        "child_branch_point_names={}",
+        "vertex_names_by_child_branch={}",
         "branch_properties={}",
-        "parent_branch_point_names=[p0, p1, p4, p6, p8, p11, p12]",
+        "parent_branch_vertex_names=[p0, p1, p4, p6, p8, p11, p12]",
     )
     coarse = [f"model.object.{entry}" for entry in fewer]
     coarse += ["model.object.branch_properties={parent: {separate_twist_damping: true, linear_density: 0.05}}"]

@@ -103,7 +103,7 @@ def twin(cable, clamps):
     )
     step = compile_step(system, PERIOD)
     path = prescribed_coordinates_at_nodes(
-        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_poses_from_points
+        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_pose_definitions_from_points
     )
     theta = system.parameters.vector(TRUTH)
     rest = EquilibriumSolver(step).solve(path[0], theta)

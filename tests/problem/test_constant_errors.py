@@ -13,7 +13,7 @@ from yid_ocp.problem.measurements import (
     estimated_constant_errors,
     subtract_estimated_biases,
     whitened_for_sensor_biases,
-    whitened_sensitivities_to_standardized_biases,
+    whitened_measurement_sensitivities_to_biases,
 )
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
@@ -121,7 +121,7 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     counted = problem.whitened_held_out_prediction_residual(0, episode, result).residual
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     plain = np.concatenate([samples.residual_and_jacobian(y).residual for samples, y in pairs])
-    slopes = whitened_sensitivities_to_standardized_biases(episode.measurements)
+    slopes = whitened_measurement_sensitivities_to_biases(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

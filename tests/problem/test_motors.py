@@ -160,7 +160,7 @@ def test_a_column_switches_motors_within_a_recording(step) -> None:
     off = problem.episodes[0].torque >= MOTOR_OFF_COMMAND / 2
     assert not off[:, 0].any()
     assert list(np.flatnonzero(off[:, 1])) == list(range(20, 35))
-    found = problem.simulate_noisy_recording().joints
+    found = problem.simulate_synthetic_recording().joints
     assert np.array_equal(found.torque_enable[:60], enabled[:60])
     assert found.position_command == pytest.approx(moved.position_command)
     with pytest.raises(DataError, match="neither 0 nor 1"):

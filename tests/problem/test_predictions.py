@@ -31,7 +31,7 @@ def problem(urdf_folder):
 
 def test_what_is_simulated_is_what_is_found(problem):
     truth = {"elbow.stiffness": 4.2, "elbow.damping": 0.31}
-    made = problem.simulate_noisy_recording(truth)
+    made = problem.simulate_synthetic_recording(truth)
     assert made.name == "run_1_simulated"
     assert {name: made.true_parameters[name] for name in FREE} == truth
     assert np.array_equal(made.points[0].t, problem.episodes[0].recording.points[0].t)
@@ -45,7 +45,7 @@ def test_what_is_simulated_is_what_is_found(problem):
 
 
 def test_its_own_values_without_any_and_noise_by_its_seed(problem):
-    plain, first, same, other = (problem.simulate_noisy_recording(seed=seed) for seed in (None, 3, 3, 4))
+    plain, first, same, other = (problem.simulate_synthetic_recording(seed=seed) for seed in (None, 3, 3, 4))
     own = problem.evaluate(problem.initial_unknowns, derivatives=False).episode_predictions[0]
     [samples] = [s for s in problem.episodes[0].measurements if s.sensor.group_name == plain.points[0].name]
     predicted = own.predicted_outputs[problem.episodes[0].measurements.index(samples)]
@@ -63,7 +63,7 @@ def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
     source = taken(step, 1)
     source = replace(source, joints=replace(source.joints, effort_bias_std=0.5))
     problem = EstimationProblem(step, [source], ("elbow.mass",), ProblemOptions(path_cutoff=np.inf))
-    plain, *many = (problem.simulate_noisy_recording(seed=seed).joints for seed in (None, *range(40)))
+    plain, *many = (problem.simulate_synthetic_recording(seed=seed).joints for seed in (None, *range(40)))
     angle, effort = (np.array([getattr(one, name) for one in many]) for name in ("position", "effort"))
     angle, effort = angle - plain.position, effort - plain.effort
     np.testing.assert_allclose(np.std(angle, axis=(0, 1)), 1e-3, rtol=0.1)
@@ -80,7 +80,7 @@ def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
 
 def test_a_parameter_that_is_not_there_is_named(problem):
     with pytest.raises(ConfigError, match=r"there is no parameter 'elbow\.stifness'") as caught:
-        problem.simulate_noisy_recording({"elbow.stifness": 1.0})
+        problem.simulate_synthetic_recording({"elbow.stifness": 1.0})
     assert caught.value.hint == "did you mean 'elbow.stiffness'?"
 
 

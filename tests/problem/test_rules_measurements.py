@@ -10,7 +10,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.problem.measurements import (
     TimeGrid,
     huber_loss_and_residual_factors,
-    measurements_on_grid,
+    measurements_located_on_grid,
     measurements_with_paper_weights,
     recording_time_grid,
 )
@@ -86,7 +86,7 @@ def test_every_output_has_its_channel():
 
 def located(t, value, std, *span):
     data = SensorData(efforts("a"), np.array(t), np.array(value)[:, None], np.array(std)[:, None], *span)
-    return measurements_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
+    return measurements_located_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
 
 
 def test_data_are_placed_on_nodes_and_whitened():

@@ -84,7 +84,7 @@ def test_currents_say_what_efforts_say(step, made):
 
 def test_a_synthetic_recording_holds_currents(step, made):
     problem = problem_of(step, made)
-    again = problem.simulate_noisy_recording(TRUTH, seed=1)
+    again = problem.simulate_synthetic_recording(TRUTH, seed=1)
     [motors] = again.channel_groups
     assert (motors.name, motors.names, motors.values_by_quantity["current"].shape) == (
         "motors_left",

@@ -235,7 +235,7 @@ def test_stiffness_is_found_from_a_wrist_in_mujoco_and_from_a_synthetic_one(
     noisy = {q: v + noise[q] * rng.standard_normal(v.shape) for q, v in wrist.values_by_quantity.items()}
     one = replace(recorded, channel_groups=(replace(wrist, values_by_quantity=noisy),))
     made = problem(holding(urdf, prescribed=ARM), one, "T1.bend", step=0.005)
-    write_recording(made.simulate_noisy_recording({"T1.bend": 4.5}, seed=1), tmp_path / "made.h5")
+    write_recording(made.simulate_synthetic_recording({"T1.bend": 4.5}, seed=1), tmp_path / "made.h5")
     again = read_recording(tmp_path / "made.h5")
     assert again.channel_groups[0].names == ("lower",)
     assert again.sensor_setting_keys[2:] == ("wrist.force", "wrist.torque")

@@ -61,7 +61,7 @@ def test_an_object_of_segments_on_a_robots_hand(built):
         "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
         "    segments:\n"
         "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, "
-        "has_stiffness_per_curvature: true, clamped_at_base: true}\n"
+        "stiffness_given_as_rigidity: true, clamped_at_base: true}\n"
         "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
         "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
     )
@@ -148,7 +148,7 @@ SEGMENTED = (
     "model:\n  object:\n    kind: segments\n    segments:\n"
     "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 2}\n"
     "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, "
-    "has_stiffness_per_curvature: true, separate_twist_damping: true}\n"
+    "stiffness_given_as_rigidity: true, separate_twist_damping: true}\n"
     "parameters:\n  '*.bend': {initial: 5, bounds: [1, 8]}\n  a.twist: {initial: 2}\n  b.damping: {initial: 0.3}\n"
 )
 

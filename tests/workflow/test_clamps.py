@@ -26,7 +26,7 @@ model:
     mount: {xyz: [0.1, 0.2, 0.3], rpy: [0.0, 1.5707963267948966, 0.0]}
     segments:
       beam:
-        {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, has_stiffness_per_curvature: true,
+        {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_given_as_rigidity: true,
          clamped_at_base: true, joint_axes: y}
   frames:
     mark: {parent_frame: w_beam, marker_reference_pose: true}

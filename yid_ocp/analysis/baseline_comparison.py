@@ -142,7 +142,7 @@ def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableTopolo
         recording, held, points = episode.recording, cable.clamped_vertex_names, sensor.point_names
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
-        parents, children = cable.parent_branch_point_names, cable.child_branch_point_names
+        parents, children = cable.parent_branch_vertex_names, cable.vertex_names_by_child_branch
         carried = predictions.interpolated_displacement_position_baseline
         arrays = {
             "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),

@@ -14,7 +14,7 @@ from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.data.issues import Issue
 from yid_ocp.files import named_attributes
-from yid_ocp.inference.uncertainty import all_estimates_marked_not_trusted, typical_parameter_magnitudes
+from yid_ocp.inference.uncertainty import free_estimates_marked_not_trusted, typical_parameter_magnitudes
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import GaussNewton, Solution, Status
@@ -115,7 +115,7 @@ def _checked_solution_and_issues(
     found += worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
-        marked = all_estimates_marked_not_trusted(solution.parameters)
+        marked = free_estimates_marked_not_trusted(solution.parameters)
         solution = replace(solution, goodness_of_fit=believed, parameters=marked)
     return solution, (*problem.options.data_issues, *found)
 

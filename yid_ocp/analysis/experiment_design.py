@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns_by_name, with_nuisance_unknowns
-from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_fisher_information
+from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_sensor_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
@@ -73,12 +73,12 @@ class RecordedExperiment:
         theta, _ = self.problem.theta_and_initial_state_deviation(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
-    def camera_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def camera_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """The camera's point group (None: defaults are used), frame times since the start [s] and typical std [m]."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group that the arms measure (None: defaults are used), its sample times [s] and typical std [m]."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
@@ -165,7 +165,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def step_and_observable_frames(step: Step) -> tuple[Step, list[_ObservableFrame]]:
+def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_ObservableFrame]]:
     """The step with all measurable frames added to its mechanism, and those frames; its equations stay the same."""
     mechanism, seen = step.system.mechanism, observable_frames(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
@@ -178,7 +178,7 @@ class CandidateExperimentSensitivities:
     """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
     Sensitivities of a frame's position at every node, by (episode, group, frame), are by the unknowns, then by the q
-    that stand for the errors of the torques that drive this episode (`point_sensitivities_and_fisher_information`).
+    that are errors of the torques that drive this episode (`point_sensitivities_and_joint_sensor_information`).
     """
 
     problem: EstimationProblem  # with nuisances, and every measurable frame observed at every node
@@ -264,7 +264,7 @@ class CandidateExperimentSensitivityBuilder:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
-        step, seen = step_and_observable_frames(step)
+        step, seen = extended_step_and_observable_frames(step)
         wide = with_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
@@ -281,7 +281,7 @@ class CandidateExperimentSensitivityBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = point_sensitivities_and_fisher_information(
+            points, by_joints[i] = point_sensitivities_and_joint_sensor_information(
                 problem, evaluation, x, i, finest, encoders
             )
             slopes |= {(i, *key): value for key, value in points.items()}
@@ -307,7 +307,7 @@ class CandidateExperimentSensitivityBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Least standard deviation that each group's points can have in a recording [m]."""
         finest = {}
-        samplings = self.setting.camera_group_times_and_std, self.setting.arm_point_group_times_and_std
+        samplings = self.setting.camera_point_group_and_sampling, self.setting.arm_point_group_and_sampling
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
@@ -428,8 +428,8 @@ class CandidateExperimentSensitivityBuilder:
         wanted: dict[str, dict[str, None]] = {}
         for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
-        camera = setting.camera_group_times_and_std(episode)[0]
-        arm = setting.arm_point_group_times_and_std(episode)[0]
+        camera = setting.camera_point_group_and_sampling(episode)[0]
+        arm = setting.arm_point_group_and_sampling(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})

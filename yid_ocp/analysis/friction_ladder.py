@@ -78,7 +78,7 @@ def cross_validate_friction_law(
     return FrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
 
 
-def motion_kind_mean_and_std_error(
+def mean_and_std_error_over_motion_kinds(
     errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
     """Mean of the recordings' errors over kinds of motion, and its standard error."""
@@ -91,7 +91,7 @@ def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping
 
     Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
     """
-    sizes = [motion_kind_mean_and_std_error(fit.left_out_errors, kinds) for fit in fits]
+    sizes = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds) for fit in fits]
     least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))
     return next((fit for fit, (mean, _) in zip(fits, sizes, strict=True) if mean <= least + error), fits[0])
 

@@ -18,7 +18,7 @@ from yid_ocp.analysis.profile import (
     results_by_parameter_at_optimum,
 )
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
@@ -107,13 +107,13 @@ class IdentifiabilityResult(ReprMixin):
     chi2_per_dof: float  # at the point; above one, its root scales standard deviations at a fit
     profiles: Mapping[str, ParameterProfileLikelihood] = field(default_factory=dict)
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         rows = [("parameter", "value", "unit", "")]
         for name, entry in self.parameters.items():
             value = value_and_uncertainty_text(entry.value, finite_or_none(entry.std), None)
             rows.append((name, value, entry.unit, VERDICT_TABLE_TEXTS[entry.verdict]))
         found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
-        return ReprTexts(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
+        return ReprLineAndTableRows(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
 
     @property
     def unidentifiable_directions(self) -> tuple[_ParameterDirection, ...]:

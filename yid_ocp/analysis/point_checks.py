@@ -365,7 +365,7 @@ def _upside_down(
     """A cable that rises between its clamps by more than its own shape does: gravity points the other way."""
     pull = float(np.linalg.norm(gravity))
     free = [name for name in cable.free_vertex_names if name in at]
-    ends = [name for name in (cable.parent_branch_point_names[0], cable.parent_branch_point_names[-1]) if name in at]
+    ends = [name for name in (cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[-1]) if name in at]
     if pull == 0 or len(ends) < 2 or not free:
         return None
     up = -gravity / pull

@@ -23,7 +23,7 @@ from yid_ocp.inference.uncertainty import (
     unknowns_covariance_and_reduced_chi2,
     with_profile_interval,
 )
-from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.progress import NULL_PROGRESS, PartsDoneCounter, Progress
@@ -140,7 +140,7 @@ def results_by_parameter_at_optimum(
         parts.count_done(name)
         return found
 
-    return dict(zip(names, map_with_batched_calls(one, names), strict=True))
+    return dict(zip(names, map_with_merged_calls(one, names), strict=True))
 
 
 def mark_unidentifiable_near_zero_estimate(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.integrator.discrete import DiscreteEquations
 
@@ -234,11 +234,11 @@ class NamedStepEquations(ReprMixin):
     row_blocks: tuple[SymbolBlock, ...]
     column_blocks: tuple[SymbolBlock, ...]
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         blocks = (*self.row_blocks, *self.column_blocks)
         rows = [("block", "entries", "meaning"), *((b.name, str(len(b.full_names)), b.meaning) for b in blocks)]
         count = count_with_noun(sum(len(block.full_names) for block in self.row_blocks), "equation")
-        return ReprTexts(f"{count} of a step of {self.equations.system.mechanism.name}", rows)
+        return ReprLineAndTableRows(f"{count} of a step of {self.equations.system.mechanism.name}", rows)
 
     @staticmethod
     def from_equations(equations: DiscreteEquations) -> NamedStepEquations:

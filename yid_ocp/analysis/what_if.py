@@ -23,7 +23,7 @@ from yid_ocp.analysis.experiment_design import (
 )
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 from yid_ocp.model.system import System
@@ -90,12 +90,12 @@ class ExperimentRanking(ReprMixin):
     greedy_sequence: tuple[ChangedExperimentResult, ...]
     n_evaluated_sets: int
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         shown = (self.unchanged_experiment, *self.single_changes)
         rows = [("change", "parameters found", "gain [nat]")]
         rows += [(entry.description, str(entry.identifiable), f"{entry.gain:.3g}") for entry in shown]
         count = count_with_noun(len(self.single_changes), "change")
-        return ReprTexts(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
+        return ReprLineAndTableRows(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 
 
 # From sets of changes and a factor on the stated variances to the predicted results, one for each set.
@@ -222,8 +222,8 @@ class _Outcomes:
     def possible(self) -> list[ExperimentChange]:
         """All single changes that apply to the experiment."""
         setting, episode = self.setting, self.setting.problem.episodes[0]
-        camera = setting.camera_group_times_and_std(episode)[0]
-        arm = setting.arm_point_group_times_and_std(episode)[0]
+        camera = setting.camera_point_group_and_sampling(episode)[0]
+        arm = setting.arm_point_group_and_sampling(episode)[0]
         views = setting.existing_point_observation_schedules(episode)
         groups = ("" if group is None else group.name for group in (camera, arm))
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
@@ -274,8 +274,8 @@ class _Outcomes:
         self, episode: Episode, changes: Sequence[ExperimentChange], layout: CandidateExperimentSensitivities
     ) -> list[FrameObservationSchedule]:
         setting = self.setting
-        camera, times, std = setting.camera_group_times_and_std(episode)
-        arm, arm_times, arm_std = setting.arm_point_group_times_and_std(episode)
+        camera, times, std = setting.camera_point_group_and_sampling(episode)
+        arm, arm_times, arm_std = setting.arm_point_group_and_sampling(episode)
         looking, feeling = CAMERA_GROUP if camera is None else camera.name, ARM_GROUP if arm is None else arm.name
         rate = next((change.camera_rate for change in changes if change.camera_rate is not None), None)
         if rate is not None:

@@ -29,8 +29,8 @@ from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.files import read_input_text
 
 _KeyPath = tuple[str | int, ...]
-DEFAULT_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
-DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
+EMBEDDED_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
+EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
 _ALIAS_COST = 40  # in entries: the reader compares each mapping that an alias is merged into with all others
@@ -38,7 +38,7 @@ _ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
 
 
 def load_config(
-    path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT_CONFIG_FILE_NAME
+    path: str | Path | None = None, overrides: Sequence[str] = (), default: str = EMBEDDED_CONFIG_FILE_NAME
 ) -> RunSettings:
     """Return the checked settings of a configuration file; without `path`, of the embedded file `default`.
 

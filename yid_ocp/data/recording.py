@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_for_group_name
 
@@ -110,10 +110,10 @@ class JointGroup(ReprMixin):
         """`effort_kind`, or `sample` (as robot drivers publish) if the recording does not state it."""
         return self.effort_kind or "sample"
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         count = count_with_noun(len(self.names), "joint")
         rows = [("joint",), *((name,) for name in self.names)]
-        return ReprTexts(f"{count}, {_sampled(self.t)}: {', '.join(self.values_by_channel)}", rows)
+        return ReprLineAndTableRows(f"{count}, {_sampled(self.t)}: {', '.join(self.values_by_channel)}", rows)
 
     def _rows(self, rows: BoolArray) -> JointGroup:
         changes: dict[str, Any] = {name: value[rows] for name, value in self.values_by_channel.items()}
@@ -158,11 +158,11 @@ class PointGroup(ReprMixin):
             object.__setattr__(self, "std", np.full(self.position.shape, float(self.std)))
             _freeze_arrays(self, ("std",))
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         seen = np.isfinite(self.position).all(axis=2).sum(axis=0)
         rows = [("point", "seen"), *((name, str(count)) for name, count in zip(self.names, seen, strict=True))]
         count = count_with_noun(len(self.names), "point")
-        return ReprTexts(f"{self.name}, {count}, {_sampled(self.t)}, in {self.frame}", rows)
+        return ReprLineAndTableRows(f"{self.name}, {count}, {_sampled(self.t)}, in {self.frame}", rows)
 
     def _rows(self, rows: BoolArray) -> PointGroup:
         std = None if self.std is None else self.std[rows]
@@ -205,9 +205,9 @@ class SensorChannelGroup(ReprMixin):
         object.__setattr__(self, "values_by_quantity", values)
         object.__setattr__(self, "stds_by_attribute", stds)
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         quantities = ", ".join(self.values_by_quantity)
-        return ReprTexts(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
+        return ReprLineAndTableRows(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
 
     def _rows(self, rows: BoolArray) -> SensorChannelGroup:
         values = {key: value[rows] for key, value in self.values_by_quantity.items()}
@@ -250,7 +250,7 @@ class Recording(ReprMixin):
         if self.marker_reference_pose is not None:
             object.__setattr__(self, "marker_reference_pose", read_only_array(self.marker_reference_pose, "straight"))
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         names = {"joint": self.joint_names, "point": self.point_names}
         counts = " and ".join(count_with_noun(len(own), noun) for noun, own in names.items())
         rows = [("group", "names", "samples", "channels")]
@@ -260,7 +260,7 @@ class Recording(ReprMixin):
             )
             rows.append((g.name, ", ".join(g.names), _sampled(g.t), ", ".join(channels)))
         span = f", {self.duration:.4g} s" if self.all_groups else ""
-        return ReprTexts(f"'{self.name}', {counts}{span}", rows)
+        return ReprLineAndTableRows(f"'{self.name}', {counts}{span}", rows)
 
     @property
     def joint_and_point_groups(self) -> tuple[JointGroup | PointGroup, ...]:

@@ -50,7 +50,7 @@ class _ParameterShift:
 
 
 @dataclass(frozen=True)
-class BaselineRunComparison:
+class EarlierRunsComparison:
     """Comparison of a fit with baseline runs: the runs, their agreement, and the shift of every parameter."""
 
     baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
@@ -97,7 +97,7 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
 
 
 @dataclass(frozen=True)
-class BaselineRunData:
+class EarlierRunsBaseline:
     """Combined estimates of earlier runs, and reference recordings made without the effect sought."""
 
     combined_estimates: RunEstimates | None  # all earlier runs together
@@ -107,14 +107,16 @@ class BaselineRunData:
     reference_recordings: tuple[Recording, ...]
 
     @staticmethod
-    def from_runs(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> BaselineRunData:
+    def from_runs(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> EarlierRunsBaseline:
         """Combine the estimates of several runs, and reference recordings `without` the effect, into a baseline."""
         if not runs:
-            return BaselineRunData(None, (), 0.0, 1.0, without)
+            return EarlierRunsBaseline(None, (), 0.0, 1.0, without)
         known, chi2, degrees = pool_estimates(runs)
-        return BaselineRunData(known, tuple(run.run_name for run in runs), chi2, chi2_p_value(chi2, degrees), without)
+        return EarlierRunsBaseline(
+            known, tuple(run.run_name for run in runs), chi2, chi2_p_value(chi2, degrees), without
+        )
 
-    def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> BaselineRunComparison | None:
+    def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> EarlierRunsComparison | None:
         """Return how far the parameters of a fit have moved from its baseline prior; None if there are no runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
@@ -138,16 +140,16 @@ class BaselineRunData:
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         between = (self.between_runs_chi2, self.between_runs_p_value)
         labels = tuple(baseline.effects)
-        return BaselineRunComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
+        return EarlierRunsComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
 
-    def fit_differs_significantly(self, fit: RefittedModel, limits: Thresholds) -> bool:
+    def fit_parameters_differ_significantly(self, fit: RefittedModel, limits: Thresholds) -> bool:
         """Whether any parameter of `fit` differs significantly from the earlier runs; False without runs."""
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
-    def errors_with_and_without_effects(
+    def errors_with_effects_removed_and_added(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> ErrorsWithAndWithoutEffects | None:
+    ) -> ErrorsWithEffectsRemovedAndAdded | None:
         """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
 
         None without effects or reference recordings. Without earlier runs, the parameters of the system without the
@@ -167,8 +169,8 @@ class BaselineRunData:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return ErrorsWithAndWithoutEffects(removed, _nothing(present, error.what))
-        return ErrorsWithAndWithoutEffects(removed, _predicted(last, present, then, {**then, **effects}))
+            return ErrorsWithEffectsRemovedAndAdded(removed, _nothing(present, error.what))
+        return ErrorsWithEffectsRemovedAndAdded(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
@@ -218,7 +220,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class ErrorsWithAndWithoutEffects:
+class ErrorsWithEffectsRemovedAndAdded:
     """Prediction errors on reference recordings with the effects removed, and on the diagnosed ones with them added."""
 
     # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted

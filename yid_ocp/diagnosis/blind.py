@@ -240,7 +240,7 @@ class BlindCaseGenerator:
         start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
         return {name: float(start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1)) for name in self.problem.free}
 
-    def simulate_noisy_recording(
+    def simulate_synthetic_recording(
         self,
         truth: Mapping[str, float],
         injected: Sequence[InjectedEffect],
@@ -260,7 +260,7 @@ class BlindCaseGenerator:
         rng = self._rng(0)
         names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
         *clean, other = [
-            self.simulate_noisy_recording(self._draw_true_parameters(rng), (), rng, name) for name in names
+            self.simulate_synthetic_recording(self._draw_true_parameters(rng), (), rng, name) for name in names
         ]
         problem = self._nominal_problem(clean)
         effects = make_candidate_effects(problem.system, clean, self._candidates)
@@ -309,7 +309,7 @@ class BlindCaseGenerator:
             links = 2 if wanted.category == "finer_chain" else 1
             try:
                 *estimate, held_out = (
-                    self.simulate_noisy_recording(truth, injected, rng, f"{name}_{purpose}", links)
+                    self.simulate_synthetic_recording(truth, injected, rng, f"{name}_{purpose}", links)
                     for purpose in (*purposes, "held_out")
                 )
             except ModelError:

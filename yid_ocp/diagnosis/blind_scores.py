@@ -246,7 +246,7 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
     return replace(
         limits,
         significance_level=sure,
-        candidate_score_significance_level=sure,
+        gap_significance_level_by_candidate=sure,
         unexplained_p_factor=1.0,
         min_excess_chi2_per_dof=-1.0,
         min_channel_excess_chi2_per_dof=-1.0,
@@ -267,7 +267,7 @@ def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
 
 def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
     """That of the worst channel, if any candidate is significant."""
-    is_sure = said["candidate"] < limits.candidate_score_significance_level
+    is_sure = said["candidate"] < limits.gap_significance_level_by_candidate
     return (said["largest_channel"] or 1.0) - 1 if is_sure else -math.inf
 
 
@@ -312,7 +312,7 @@ class _CalibrationRule:
 
 _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "gap": _CalibrationRule("min_excess_chi2_per_dof", _excess, "clean", "most", 0.1),
-    "candidate": _CalibrationRule("candidate_score_significance_level", _of("candidate"), "clean", "least", 1e-4),
+    "candidate": _CalibrationRule("gap_significance_level_by_candidate", _of("candidate"), "clean", "least", 1e-4),
     "channel": _CalibrationRule("min_channel_excess_chi2_per_dof", _along, "clean", "most", 0.02),
     "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),

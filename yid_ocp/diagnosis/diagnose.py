@@ -15,7 +15,7 @@ import threadpoolctl
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline import BaselineRunData, with_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import (
     DiagnosisResult,
     NominalParameterChange,
@@ -26,7 +26,7 @@ from yid_ocp.diagnosis.diagnosis_result import (
 )
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
-    KEPT_HELD_OUT_FRACTIONS,
+    KEPT_HELD_OUT_DURATION_FRACTIONS,
     AllCandidatesProblem,
     CandidateNamesOrAll,
     TruncatedHeldOutRecording,
@@ -57,7 +57,7 @@ from yid_ocp.diagnosis.verdict import (
     find_unknown_verdict_reason,
     fraction_of_smoother_chi2_decrease,
     has_significant_gap,
-    inflate_std_by_disagreement,
+    inflate_fit_stds_by_disagreement,
     is_barely_significant_and_unexplained,
 )
 from yid_ocp.errors import DataError, SolverError
@@ -71,7 +71,7 @@ from yid_ocp.inference.null_test import (
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, select_and_smooth_unknowns
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
 from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
-from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.measurements import subtract_estimated_biases
 from yid_ocp.progress import NULL_PROGRESS, LoggingProgress, Progress
@@ -91,7 +91,7 @@ def diagnose(
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
     known_fits: NominalSolutionAndRefitStore | None = None,
-    baseline: RunEstimates | Sequence[RunEstimates] | BaselineRunData = (),
+    baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: whether it exists, where, its cause, and how far it closes.
@@ -106,10 +106,11 @@ def diagnose(
         Never touched by a fit; the problem's own where absent. Where there are none, alternate blocks are held out.
     progress : Progress, optional
         The package's log when absent.
-    baseline : RunEstimates or sequence of RunEstimates, or BaselineRunData, optional
+    baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline, optional
         What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
-        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is. A `BaselineRunData`
-        may have reference recordings too, made without what is looked for; the effects found are taken out for them.
+        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is.
+        An `EarlierRunsBaseline` may have reference recordings too, made without what is
+        looked for; the effects found are taken out for them.
 
     Raises
     ------
@@ -123,7 +124,7 @@ def diagnose(
         told = progress or LoggingProgress(log)
         known = known_fits or NominalSolutionAndRefitStore()
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
-        earlier = runs if isinstance(runs, BaselineRunData) else BaselineRunData.from_runs(runs, ())
+        earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_runs(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = with_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, told)
@@ -175,10 +176,10 @@ def _examined(
     return found
 
 
-def _diagnosed(seen: _Examined, earlier: BaselineRunData, clock: dict[str, float]) -> DiagnosisResult:
+def _diagnosed(seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, float]) -> DiagnosisResult:
     search, nominal, before, held, screened = seen.search, seen.nominal, seen.before, seen.held, seen.screened
     limits, enough, scores = search.thresholds, seen.has_enough_samples, screened.candidate_scores
-    changed = earlier.fit_differs_significantly(nominal, limits)
+    changed = earlier.fit_parameters_differ_significantly(nominal, limits)
     moved = changed and not seen.has_gap
     gap, smoothed, trusted = seen.has_gap or moved, None, None
     if gap and enough:
@@ -199,7 +200,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineRunData, clock: dict[str, float
     clock["refits"] = time.perf_counter()
     carried = check_effect_amplitude_transfer(search, added[-1].refitted_model) if added else ()
     if carried:
-        last = inflate_std_by_disagreement(added[-1].refitted_model, carried)
+        last = inflate_fit_stds_by_disagreement(added[-1].refitted_model, carried)
         added = (*added[:-1], replace(added[-1], refitted_model=last))
     clock["carry_over"] = time.perf_counter()
     last = added[-1].refitted_model if added else nominal
@@ -244,7 +245,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineRunData, clock: dict[str, float
         stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
-        counterfactual=earlier.errors_with_and_without_effects(nominal, final, search.progress),
+        counterfactual=earlier.errors_with_effects_removed_and_added(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         search_seconds=clock["refits"] - clock[""],
     )
@@ -346,7 +347,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
     """The nominal model beside held-out recordings as far as it can follow them, fitted again where they were cut."""
     found = before
-    for margin in KEPT_HELD_OUT_FRACTIONS:
+    for margin in KEPT_HELD_OUT_DURATION_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
@@ -381,7 +382,7 @@ def _better_nominal_fit(search: RefitContext, nominal: RefittedModel) -> Refitte
         return refit_with_effects(search.problem, (), start, search.store, name, limits)
 
     best = nominal
-    for found in map_with_batched_calls(begun, INITIAL_VALUE_RESTART_FACTORS):
+    for found in map_with_merged_calls(begun, INITIAL_VALUE_RESTART_FACTORS):
         if found is not None and found.cost < best.cost - limits.min_log_bayes_factor:
             best = found
     return None if best is nominal else _settled(search, best.values, "the nominal model from a better start")

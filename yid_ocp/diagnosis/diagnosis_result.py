@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from yid_ocp.diagnosis.baseline import BaselineRunComparison, ErrorsWithAndWithoutEffects
+from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsRemovedAndAdded
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, ForceOrFaultEvent
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
@@ -34,7 +34,7 @@ from yid_ocp.diagnosis.verdict import (
     independent_assumption_count,
     required_fraction_of_smoother_chi2_decrease,
 )
-from yid_ocp.display import ReprMixin, ReprTexts
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
 from yid_ocp.files import object_attributes_to_json_dict, to_json_types
@@ -81,8 +81,8 @@ class DiagnosisResult(ReprMixin):
     message: str  # why the data are insufficient; empty if they suffice
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]
-    baseline_comparison: BaselineRunComparison | None = None
-    counterfactual: ErrorsWithAndWithoutEffects | None = None
+    baseline_comparison: EarlierRunsComparison | None = None
+    counterfactual: ErrorsWithEffectsRemovedAndAdded | None = None
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     unknown_reason: UnknownVerdictReason = ""
@@ -92,7 +92,7 @@ class DiagnosisResult(ReprMixin):
     untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
     search_seconds: float = 0.0  # from the start to the end of the search for effects
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction
         said = f"{100 * closed:.3g} % of the held-out gap closed" if effects and math.isfinite(closed) else ""
         rows = [("candidate", "parameters", "closure alone", "p")]
@@ -101,7 +101,7 @@ class DiagnosisResult(ReprMixin):
             known = ", ".join(f"{name} = {own['value']:.3g} {own['unit']}" for name, own in values.items())
             alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
             rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
-        return ReprTexts(", ".join(filter(None, (self.verdict.replace("_", " "), effects, said))), rows)
+        return ReprLineAndTableRows(", ".join(filter(None, (self.verdict.replace("_", " "), effects, said))), rows)
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
@@ -237,7 +237,7 @@ _EFFECT = "kind location"
 _PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
 
 
-def _baseline_to_json(found: BaselineRunComparison) -> dict[str, Any]:
+def _baseline_to_json(found: EarlierRunsComparison) -> dict[str, Any]:
     runs = "runs=baseline_runs explains=is_baseline_explained effects=baseline_effects chi2=between_runs_chi2"
     shift = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
     parameters = {
@@ -526,7 +526,7 @@ def _out_of_range(effect: EffectBase, fit: RefittedModel) -> list[str]:
     return found
 
 
-def _since(found: BaselineRunComparison, effects: bool) -> list[str]:
+def _since(found: EarlierRunsComparison, effects: bool) -> list[str]:
     """What has moved since the baseline, and what a baseline that explained little is worth."""
     several, p_value = len(found.baseline_runs), found.between_runs_p_value
     moved = [
@@ -553,7 +553,7 @@ _COUNTERFACTUAL_TEXTS = (
 """Beginning, how the recordings were made, and what the prediction is compared with: effects removed, and added."""
 
 
-def _counterfactual(found: ErrorsWithAndWithoutEffects) -> list[str]:
+def _counterfactual(found: ErrorsWithEffectsRemovedAndAdded) -> list[str]:
     """Whether taking the effects away predicts the world without them, and adding them the world with them."""
     text = []
     both = (found.effects_removed, found.effects_added)

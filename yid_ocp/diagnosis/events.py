@@ -38,7 +38,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.signal_filters import effort_filter_with_path_cutoff
+from yid_ocp.problem.signal_filters import twice_applied_effort_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 from yid_ocp.sensors.joints import quantization_step
 
@@ -183,7 +183,7 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
 
 def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
-    until = ends._end_of(history.recording) - effort_filter_with_path_cutoff(history.filter_cutoff).settling_time
+    until = ends._end_of(history.recording) - twice_applied_effort_filter(history.filter_cutoff).settling_time
     keep = np.flatnonzero(history.t <= until)
     return None if len(keep) < 10 else history.subset_at_indices(keep)
 
@@ -438,7 +438,7 @@ def _counting(
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(end) and is_effort:
-        hidden |= t > end - effort_filter_with_path_cutoff(cutoff).settling_time
+        hidden |= t > end - twice_applied_effort_filter(cutoff).settling_time
     smear = 1 / cutoff if is_effort else 0.0
     for event in own:
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)

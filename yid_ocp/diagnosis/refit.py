@@ -25,7 +25,7 @@ from yid_ocp.inference.whitening import (
     problem_whitened_by_sensor_noise,
     torque_bias_change_in_stds,
 )
-from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
@@ -369,7 +369,7 @@ def refit_with_each_effect(
         if search.deadline < math.inf:
             count = int((search.deadline - now) * len(fits) / max(now - begun, 1e-9)) if fits else 1
         batch, rest = rest[: max(count, 1)], rest[max(count, 1) :]
-        fits += map_with_batched_calls(one, batch)
+        fits += map_with_merged_calls(one, batch)
     return [fit for fit in fits if fit is not None]
 
 

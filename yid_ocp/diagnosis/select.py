@@ -266,7 +266,7 @@ def select_effects(
             screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)
-            if _little_is_left(current, limits) and p_value >= limits.candidate_score_significance_level:
+            if _little_is_left(current, limits) and p_value >= limits.gap_significance_level_by_candidate:
                 break
             if len(base) == 1 and _futile([nominal, current, *first], alone, screened, limits):
                 break

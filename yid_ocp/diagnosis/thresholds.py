@@ -33,7 +33,7 @@ class Thresholds(SmootherThresholds):
     min_channel_excess_chi2_per_dof: Annotated[
         float, Ge(0), OptionInfo("the same of the worst channel, where a candidate mends it")
     ] = 0.02
-    candidate_score_significance_level: Annotated[
+    gap_significance_level_by_candidate: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance from which a candidate alone shows a gap")
     ] = 1e-4
     unexplained_p_factor: Annotated[

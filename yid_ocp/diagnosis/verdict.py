@@ -95,7 +95,9 @@ def _compare(
     return found
 
 
-def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[EffectAmplitudeTransferCheck]) -> RefittedModel:
+def inflate_fit_stds_by_disagreement(
+    fit: RefittedModel, entries: Sequence[EffectAmplitudeTransferCheck]
+) -> RefittedModel:
     """Return the fit with standard deviations increased for amplitudes that disagree between the recordings.
 
     Where two fits differ by more than `_DISAGREEMENT_Z` standard deviations of both together, each is known to the
@@ -130,11 +132,11 @@ def has_significant_gap(
     if residuals_exceed_noise((before, held_out), limits.null_test_limits):
         return True
     stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
-    if stated and min(stated) * len(ranked) < limits.candidate_score_significance_level:
+    if stated and min(stated) * len(ranked) < limits.gap_significance_level_by_candidate:
         return True
     best = bonferroni_min_p_value(ranked)
     largest = max((*before.channel_chi2.values(), *held_out.channel_chi2.values()), default=1.0)
-    return best < limits.candidate_score_significance_level and largest > 1 + limits.min_channel_excess_chi2_per_dof
+    return best < limits.gap_significance_level_by_candidate and largest > 1 + limits.min_channel_excess_chi2_per_dof
 
 
 def is_barely_significant_and_unexplained(

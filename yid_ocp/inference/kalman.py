@@ -66,7 +66,7 @@ class KalmanStepMatrices:
     projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
     transition: FilterStateTransition
 
-    def innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
+    def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
         """Normalized innovations (r, c) of the measurements (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)

@@ -143,7 +143,7 @@ class ResidualDerivativesAtNodes:
                 found[used] += np.einsum("rx,rxd->rd", by_effort[used], effort[local])
         return found
 
-    def residual_rows_by_first_node(self, last: int) -> list[IntArray]:
+    def residual_indices_by_first_node(self, last: int) -> list[IntArray]:
         """Indices of the residuals whose first node is node k, one array for each k from 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))

@@ -19,7 +19,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_with_path_cutoff
+from yid_ocp.problem.signal_filters import LowPassFilter, twice_applied_effort_filter
 from yid_ocp.sensors.mounted import MountedSensor
 
 RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
@@ -206,7 +206,7 @@ def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChanne
             is_smoothed = isinstance(samples.sensor, MountedSensor) and problem.system.prescribed
             if samples.sensor.effort_joints or is_smoothed:
                 cutoff, step = problem.options.path_cutoff, episode.grid.time_step
-                low_pass = LowPassFilter(cutoff) if is_smoothed else effort_filter_with_path_cutoff(cutoff)
+                low_pass = LowPassFilter(cutoff) if is_smoothed else twice_applied_effort_filter(cutoff)
                 stride = low_pass.decorrelation_stride(step)
                 autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.channel_name_per_output):

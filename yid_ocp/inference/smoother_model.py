@@ -33,7 +33,7 @@ from yid_ocp.inference.linearized_residual import (
 from yid_ocp.integrator.step import (
     applied_driven_joint_torques,
     moving_observable_state_mask,
-    rollout_step_derivatives,
+    step_derivatives_along_rollout,
 )
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -329,7 +329,7 @@ def _steps(
         # before; this step's stands for it)
         followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
         inputs = feedback.gain @ followed
-    found = rollout_step_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span)
+    found = step_derivatives_along_rollout(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span)
     for k, pair in enumerate((pair for some in found for pair in zip(*some, strict=True)), span.start):
         state, own = (np.hstack([one[:, moving], one[:, nx : nx + width] + one[:, nx + width :]]) for one in pair)
         loaded = slice(len(moving), len(moving) + forces)

@@ -105,7 +105,7 @@ def assess_goodness_of_fit(
     series = residual_channel_indices(problem)
     found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
-    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.all_data_issues_are_warnings)
+    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.no_data_issue_exceeds_warning)
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
@@ -427,7 +427,7 @@ def parameter_estimates(
     return result
 
 
-def all_estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+def free_estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
     """Copies of estimates with the verdict not_trusted, except for fixed and not_identifiable parameters."""
     doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}

@@ -50,7 +50,7 @@ from yid_ocp.inference.linearized_residual import (
     ResidualDerivativesAtNodes,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import moving_observable_state_mask, rollout_step_derivatives
+from yid_ocp.integrator.step import moving_observable_state_mask, step_derivatives_along_rollout
 from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -147,7 +147,7 @@ class WhiteningFilter:
         """Innovations of step k, and the mean of another w after it."""
         step, nu = self.filter_steps[k], len(self.input_error_model.torque_bias)
         known = None if push is None or k >= len(push) else push[k]
-        white, later = step.kalman.innovations_and_next_mean(
+        white, later = step.kalman.normalized_innovations_and_next_mean(
             mean, own if known is None else own - step.by_torque @ known
         )
         if known is not None:
@@ -164,7 +164,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course)
     live = moving_observable_state_mask(step, course.theta, course.rollout, seen=slopes.visible_state_mask)
     kept = np.flatnonzero(live)
-    rows_of_node, slopes = slopes.residual_rows_by_first_node(count), slopes.select_states(kept)
+    rows_of_node, slopes = slopes.residual_indices_by_first_node(count), slopes.select_states(kept)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
@@ -198,7 +198,9 @@ def _filter_steps(
         feedback = None
     elif feedback is not None:
         # what torques of the step before add to the momenta that the filter follows
-        momentum = course.model_functions.effect_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
+        momentum = course.model_functions.effect_momentum_shift_functions.momentum_derivative_by_previous_torque(
+            course.theta
+        )
         driving = applied_torque_by_torque_error(feedback.gain, momentum)
         # an error of the angles that the filter follows; that of the momenta as their slope averages out
         shaken = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
@@ -208,7 +210,7 @@ def _filter_steps(
     ordered = slopes.select_residual_rows(np.concatenate(rows_of_node))
     (before, after), by_effort = ordered.by_state, ordered.by_effort.sum(axis=0)
     ends = np.cumsum([0, *map(len, rows_of_node)])
-    for state, effort in rollout_step_derivatives(
+    for state, effort in step_derivatives_along_rollout(
         course.model_functions.step, course.theta, course.rollout, inputs, feedback
     ):
         span = slice(len(made), len(made) + len(state))

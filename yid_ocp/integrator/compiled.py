@@ -18,7 +18,7 @@ from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
-    CostDerivativesByRollout,
+    CostDerivativesByRolloutVariables,
     NewtonStatusCode,
     Rollout,
     RolloutCostGradient,
@@ -28,10 +28,10 @@ from yid_ocp.integrator.step_model import (
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
+    attach_status_to_rollout,
     out_of_memory_error,
-    rollout_with_status,
 )
-from yid_ocp.parallel import CasadiLockedCache, call_batched_across_threads, map_in_threads
+from yid_ocp.parallel import CasadiLockedCache, call_merged_with_other_threads, map_in_threads
 
 _BATCH_COST, _BATCH_COST_PER_COLUMN = 1.7, 0.11
 """Cost of a batch in rollouts of one member, whatever its size, and the extra cost per sensitivity column."""
@@ -130,7 +130,7 @@ class CompiledKernel:
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate several rollouts in C, one per entry of `members`, in SIMD batches where that is faster."""
-        return call_batched_across_threads(self._rollouts, list(members))
+        return call_merged_with_other_threads(self._rollouts, list(members))
 
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         alike: dict[Hashable, list[int]] = {}
@@ -193,7 +193,7 @@ class CompiledKernel:
         by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
         _check(library.yid_rollout(ctypes.c_int(len(members)), *filled, by, outcomes), outcomes[0])
         ends = ((o.status, o.step, o.error, (o.iterations, o.factorisations)) for o in outcomes)
-        return [rollout_with_status(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
+        return [attach_status_to_rollout(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
 
     def adjoint_gradient(
         self,
@@ -201,7 +201,7 @@ class CompiledKernel:
         rollout: Rollout,
         feedback: TrackingFeedback | None,
         names: tuple[str, ...],
-        by: CostDerivativesByRollout,
+        by: CostDerivativesByRolloutVariables,
     ) -> RolloutCostGradient:
         """Gradient of a cost along a rollout by the adjoint method in C; `by` holds the cost's derivatives."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
@@ -230,10 +230,10 @@ class CompiledKernel:
         self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
 
-    def rollout_step_derivatives(
+    def step_derivatives_along_rollout(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, in C; arguments and shapes as in `step.rollout_step_derivatives`."""
+        """Derivatives of a rollout's steps, in C; arguments and shapes as in `step.step_derivatives_along_rollout`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
-    CostDerivativesByRollout,
+    CostDerivativesByRolloutVariables,
     NewtonStatusCode,
     Rollout,
     RolloutCostGradient,
@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import (
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
-    rollout_with_status,
+    attach_status_to_rollout,
 )
 from yid_ocp.parallel import CasadiLockedCache
 
@@ -162,7 +162,7 @@ class InterpretedKernel:
                     break
                 by[0][k + 1], by[1][k], by[2][k] = moved
             done = k + 1
-        return rollout_with_status(out, self._model.sizes, code, done, error, (total, total))
+        return attach_status_to_rollout(out, self._model.sizes, code, done, error, (total, total))
 
     def _moved(
         self,
@@ -203,10 +203,10 @@ class InterpretedKernel:
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
 
-    def rollout_step_derivatives(
+    def step_derivatives_along_rollout(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of next states and efforts in a rollout; arguments as in `step.rollout_step_derivatives`."""
+        """Derivatives of next states and efforts; arguments as in `step.step_derivatives_along_rollout`."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
@@ -229,7 +229,7 @@ class InterpretedKernel:
         rollout: Rollout,
         feedback: TrackingFeedback | None,
         names: tuple[str, ...],
-        by: CostDerivativesByRollout,
+        by: CostDerivativesByRolloutVariables,
     ) -> RolloutCostGradient:
         """Gradient of a cost along a finished rollout by the adjoint method; `by` holds the cost's derivatives.
 

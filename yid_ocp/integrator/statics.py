@@ -384,7 +384,7 @@ def _solved(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
-def internal_coordinates_at_held_configuration(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
+def steady_effect_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
     """Steady internal coordinates (nz,) of a system held at configuration `q` until they have fully relaxed."""
     e = step.equations
     nz = e.z0.numel()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprMixin, ReprTexts
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
@@ -43,9 +43,11 @@ class Step(ReprMixin):
     kernel: CompiledKernel | InterpretedKernel
     is_compiled: bool
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         how = "compiled" if self.is_compiled else "interpreted"
-        return ReprTexts(f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().one_line}")
+        return ReprLineAndTableRows(
+            f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().one_line}"
+        )
 
     @property
     def system(self) -> System:
@@ -346,7 +348,7 @@ def moving_observable_state_mask(
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))
     ends = [
-        next(rollout_step_derivatives(step, theta, rollout, np.repeat(inputs, count, 0), None, loads, one))
+        next(step_derivatives_along_rollout(step, theta, rollout, np.repeat(inputs, count, 0), None, loads, one))
         for one in chosen
     ]
     by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
@@ -361,7 +363,7 @@ def moving_observable_state_mask(
     return moved & felt
 
 
-def rollout_step_derivatives(
+def step_derivatives_along_rollout(
     step: Step,
     theta: Array,
     rollout: Rollout,
@@ -390,4 +392,4 @@ def rollout_step_derivatives(
         span = slice(first, min(first + _STEPS_PER_CHUNK, end))
         nodes, own = rollout.state[first : span.stop + 1], feedback and replace(feedback, gain=feedback.gain[span])
         along = replace(rollout, state=nodes, multipliers=rollout.multipliers[span], torque=rollout.torque[span])
-        yield step.kernel.rollout_step_derivatives(theta, along, own, inputs[span], loads)
+        yield step.kernel.step_derivatives_along_rollout(theta, along, own, inputs[span], loads)

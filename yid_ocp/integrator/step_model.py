@@ -196,7 +196,7 @@ class Rollout:
     status: RolloutStatus
 
 
-CostDerivativesByRollout = tuple[Array, Array | None, Array | None]
+CostDerivativesByRolloutVariables = tuple[Array, Array | None, Array | None]
 """Partial derivatives of a cost by states (N + 1, nx), multipliers (N, m) and efforts (N, nc) of a rollout."""
 
 
@@ -274,7 +274,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     return InsufficientMemoryError(said, hint=hint)
 
 
-def rollout_with_status(
+def attach_status_to_rollout(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
     """A copy of the rollout with a `RolloutStatus`; `counts` are Newton iterations and matrix factorisations."""

@@ -53,11 +53,11 @@ def lqr_tracking_feedback(
     the object, with the errors that weigh the same; the gains act on the arms' angles and momenta (Anderson and Moore
     1990, Optimal Control: Linear Quadratic Methods, section 2.4). The reference momentum follows from the measured
     angles (N + 1, nu) [rad], smooth enough to be differenced, and torques (N, nu) [N m] by the arms' own DEL equations,
-    so that it means the same as the model's. `arms` is the `compile_driven_joints_step`, made when absent.
+    so that it means the same as the model's. `arms` is the `compile_driven_arms_only_step`, made when absent.
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
-    arm_step = compile_driven_joints_step(step) if arms is None else arms
+    arm_step = compile_driven_arms_only_step(step) if arms is None else arms
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
     parameters = arm_step.system.parameters
     arm_theta = parameters.vector({name: values[name] for name in parameters.names})
@@ -85,7 +85,7 @@ def lqr_tracking_feedback(
     return TrackingFeedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
 
 
-def compile_driven_joints_step(step: Step) -> Step:
+def compile_driven_arms_only_step(step: Step) -> Step:
     """Compiled step of the driven joints alone, without object, grasps, prescribed joints and effects.
 
     `ModelError` where the driven joints do not come first in the configuration.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.mechanism import ArcLengthChain, Frame, Inertia, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -44,17 +44,17 @@ class Segment:
     link_rest_rotations: Sequence[ArrayLike] | None = None
     """At rest, of every later link in the frame of the one before (a measured undeformed shape)."""
     bend: float = 3.0
-    """Of every joint [N m/rad]; with `has_stiffness_per_curvature` rigidities [N m^2], [N m^2 s]."""
+    """Of every joint [N m/rad]; with `stiffness_given_as_rigidity` rigidities [N m^2], [N m^2 s]."""
     twist: float = 3.0
     damping: float = 0.05
     """Of every joint [N m s/rad]."""
     twist_damping: float | None = None
     """Of the twists; that of the bends when absent."""
-    has_stiffness_per_curvature: bool = False
+    stiffness_given_as_rigidity: bool = False
     """Whether a joint between links of length a and b has 2/(a + b) times the value, the first of a clamped one 2/a."""
     clamped_at_base: bool = False
     """Whether the first joint turns about the tip of a rigid wall or clamp, not between the parent's link and the first
-    one (only matters with `has_stiffness_per_curvature`)."""
+    one (only matters with `stiffness_given_as_rigidity`)."""
     joint_axes: str = "xyz"
     """Axes of the turns at each joint, base to tip; about those left out the segment is rigid."""
     cross_section_size: tuple[float, float] | None = None
@@ -63,7 +63,7 @@ class Segment:
     """Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`, for
     markers that sit elsewhere in every recording; masses do not follow them."""
     clamped_edge_length: float | None = None
-    """Length of a flexible edge that a clamp keeps straight before a root segment; with `has_stiffness_per_curvature`
+    """Length of a flexible edge that a clamp keeps straight before a root segment; with `stiffness_given_as_rigidity`
     its first joint then counts half of it [m]."""
 
 
@@ -104,10 +104,10 @@ class FlexibleObject(ReprMixin):
     elastic_joints: tuple[ElasticJoint, ...]
     segment_layouts: tuple[SegmentLayout, ...]
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         names, tree = ", ".join(segment.name for segment in self.segment_layouts), self.mechanism
         count = count_with_noun(len(tree.joints), "joint")
-        return ReprTexts(f"{names}, {count}", tree.parameters._summary().table_rows)
+        return ReprLineAndTableRows(f"{names}, {count}", tree.parameters._summary().table_rows)
 
 
 def flexible_object(
@@ -186,7 +186,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
         parent, placement = carrier.joint_index, carrier.placement @ turned
         # rigidities are converted to stiffnesses
         factor = ca.SX(1)
-        if segment.has_stiffness_per_curvature:
+        if segment.stiffness_given_as_rigidity:
             both = length if before is None else length + before
             factor = (2 if before is not None or segment.clamped_at_base else 1) / both
         links.append(tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_axes))
@@ -250,7 +250,7 @@ def _cross_section(own: Mapping[str, Parameter]) -> tuple[ca.SX, ca.SX, ca.SX]:
 
 
 def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
-    per, rate = ("N m^2", "N m^2 s") if segment.has_stiffness_per_curvature else ("N m/rad", "N m s/rad")
+    per, rate = ("N m^2", "N m^2 s") if segment.stiffness_given_as_rigidity else ("N m/rad", "N m s/rad")
     length = segment.length if segment.link_lengths is None else float(np.sum(segment.link_lengths))
     small, shares = 1e-9, enumerate(_length_shares(segment))
     rows = [("length", length, "m", small, "length of the segment")]

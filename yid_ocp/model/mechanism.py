@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import snap_near_integer_entries
@@ -138,11 +138,11 @@ class Mechanism(ReprMixin):
     parameters: Parameters = field(default_factory=Parameters)
     link_chains: Mapping[str, ArcLengthChain] = field(default_factory=dict)
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         carriers = ("the world", *self.joint_names)
         rows = [("joint", "type", "moves with"), *((j.name, j.kind, carriers[j.parent_index + 1]) for j in self.joints)]
         joints, frames = count_with_noun(len(self.joints), "joint"), count_with_noun(len(self.frames), "frame")
-        return ReprTexts(f"{self.name}, {joints} and {frames}", rows)
+        return ReprLineAndTableRows(f"{self.name}, {joints} and {frames}", rows)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_hint
 
 
@@ -50,10 +50,10 @@ class Parameters(ReprMixin):
             hint = "give each part of the model its own name"
             raise ConfigError(f"parameter named twice: {', '.join(twice)}", hint=hint)
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         rows = [("parameter", "value", "unit", "lower", "upper")]
         rows += [(e.name, f"{e.value:.4g}", e.unit, f"{e.lower:g}", f"{e.upper:g}") for e in self]
-        return ReprTexts(count_with_noun(len(self), "parameter"), rows)
+        return ReprLineAndTableRows(count_with_noun(len(self), "parameter"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:

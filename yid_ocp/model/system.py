@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
@@ -81,7 +81,7 @@ class Grasp:
             rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))))
         return ca.vertcat(*rows)
 
-    def holder_minus_held_axes(self, kinematics: Kinematics) -> ca.SX:
+    def holder_minus_held_axis_directions(self, kinematics: Kinematics) -> ca.SX:
         """Holder minus held axes (0, 3 or 9 rows); unlike `constraint_residual` nonzero for opposite axes."""
         if self.kind == "point":
             return ca.SX(0, 1)
@@ -330,14 +330,14 @@ class System(ReprMixin):
             system = replace(system, effects=(*system.effects, effect))
         return system
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         kinds = {"driven": len(self.driven), "prescribed": len(self.prescribed)}
         kinds |= {"passive": self.n_coordinates - sum(kinds.values())}
         moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
         counts = f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})"
         parts = [self.mechanism.name, counts, count_with_noun(self.n_constraints, "constraint")]
         parts += [f"{effect.kind}@{effect.location}" for effect in self.effects]
-        return ReprTexts(", ".join(parts), self.parameters._summary().table_rows)
+        return ReprLineAndTableRows(", ".join(parts), self.parameters._summary().table_rows)
 
     @property
     def n_coordinates(self) -> int:

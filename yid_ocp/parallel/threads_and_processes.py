@@ -160,10 +160,10 @@ def _answer(requests: Sequence[_Request]) -> None:
         request.answers.set_result(list(islice(found, len(request.questions))))
 
 
-def call_batched_across_threads(
+def call_merged_with_other_threads(
     function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
 ) -> list[_Answer]:
-    """Answers of a function to `questions`, in one call with those of concurrent `map_with_batched_calls` items."""
+    """Answers of a function to `questions`, in one call with those of concurrent `map_with_merged_calls` items."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
@@ -171,8 +171,8 @@ def call_batched_across_threads(
     return found
 
 
-def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Results of a function for all items, run concurrently; their `call_batched_across_threads` become one call.
+def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+    """Results of a function for all items, run concurrently; their `call_merged_with_other_threads` become one call.
 
     As many run as there are threads to use. Which questions meet depends on the items alone. No item may hold a lock
     while it asks.

@@ -248,7 +248,7 @@ class PathSimulator:
         begin, steps, path = self.start_equilibrium.state, len(self.node_times) - 1, self.joint_positions(w)
         return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
 
-    def frame_position_trajectories(self, frames: FramePositionEvaluator, state: Array) -> Array:
+    def frame_positions_along_states(self, frames: FramePositionEvaluator, state: Array) -> Array:
         """Positions of frames along states (N, nx), shape (N, frames, 3) [m]."""
         q = state[:, : self.step.system.n_coordinates]
         return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
@@ -309,7 +309,7 @@ class PlannedMotion:
         """Trajectories (N + 1, 3) [m] of the system's points, and of a target point if there is one, by name."""
         system = self.simulator.step.system
         names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
-        places = self.simulator.frame_position_trajectories(FramePositionEvaluator(system, names), self.rollout.state)
+        places = self.simulator.frame_positions_along_states(FramePositionEvaluator(system, names), self.rollout.state)
         return {name: places[:, i] for i, name in enumerate(names)}
 
     @property

@@ -87,9 +87,9 @@ def plan_motion_to_target(
     path = SplinePath(options.duration, options.n_spline_coefficients)
     mover = PathSimulator(step, values, start, path, options.hold_duration)
     point, inside = _points(system, options)
-    place = _place(options, mover.frame_position_trajectories(point, start.state[None])[0, 0])
+    place = _place(options, mover.frame_positions_along_states(point, start.state[None])[0, 0])
     if inside is not None:
-        _check_box(options, inside, mover.frame_position_trajectories(inside, start.state[None])[0], place)
+        _check_box(options, inside, mover.frame_positions_along_states(inside, start.state[None])[0], place)
     check_standstill_limits(step, values, start, options.limits, "where the motion begins")
     end = solve_equilibrium_at_point_target(step, values, start, point, place, options.position_tolerance)
     check_standstill_limits(step, values, end, options.limits, "where it ends")
@@ -198,7 +198,7 @@ def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array)
     """Whether half the time step moves the point neither from where it arrives nor from rest."""
     pairs = ((rows.simulator, 1), (finer, 2))
     own, other = (
-        mover.frame_position_trajectories(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs
+        mover.frame_positions_along_states(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs
     )
     change = (other - own)[rows.simulator.standstill_node_indices]
     place = np.linalg.norm(change[:, 0], axis=1).max()
@@ -247,7 +247,7 @@ def _outcome(
     if len(known.parameter_names):
         slope = _point_slopes(rows, shot.w, known)[-1]
         std = np.sqrt(np.maximum(np.diag(slope @ known.covariance @ slope.T), 0.0))
-    own = mover.frame_position_trajectories(rows.point, rollout.state)
+    own = mover.frame_positions_along_states(rows.point, rollout.state)
     end = mover.standstill_node_indices
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)

@@ -23,7 +23,7 @@ from yid_ocp.errors import ConfigError, DataError, SolverError
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
-from yid_ocp.parallel import map_with_batched_calls
+from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.planning.joint_paths import (
     FramePositionEvaluator,
     PathSimulator,
@@ -35,7 +35,7 @@ from yid_ocp.planning.joint_paths import (
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.problem.signal_filters import effort_filter_with_path_cutoff
+from yid_ocp.problem.signal_filters import twice_applied_effort_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 
 _PLANNED_RECORDING_NAME = "planned"
@@ -64,9 +64,9 @@ class ParameterizedExperiment:
         Raises `ConfigError` if no joint moves or clamps follow measured points, `ModelError` without an equilibrium.
         """
         system, episode = problem.system, problem.episodes[0]
-        if problem.options.clamp_poses_from_points or not (system.driven or system.prescribed):
+        if problem.options.clamp_pose_definitions_from_points or not (system.driven or system.prescribed):
             said, allowed = "no joint moves whose motion could be planned", "a robot whose arms move"
-            if problem.options.clamp_poses_from_points:
+            if problem.options.clamp_pose_definitions_from_points:
                 said = "the ends of a cable follow measured points: there is no joint whose motion could be planned"
             raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
@@ -296,7 +296,7 @@ class ParameterizedExperiment:
             return evaluation.residual[problem.residual_rows.data]
 
         still = residual(-1)
-        columns = [found - still for found in map_with_batched_calls(residual, range(nc * waves.shape[1]))]
+        columns = [found - still for found in map_with_merged_calls(residual, range(nc * waves.shape[1]))]
         blur = np.stack(columns, axis=1) / _PATH_DIFFERENCE_STEP
         known = blur.T @ blur
         if errors is not None and errors.has_encoder_measurements:
@@ -315,13 +315,13 @@ class ParameterizedExperiment:
             there = self.search_problem_sensitivities(moved.reshape(w.shape))
             return None if there is None else (there - rows) / _SPLINE_DIFFERENCE_STEP
 
-        found = map_with_batched_calls(one, range(w.size))
+        found = map_with_merged_calls(one, range(w.size))
         return None if any(part is None for part in found) else np.array(found)
 
 
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
-    joints, low_pass = problem.episodes[0].recording.joints, effort_filter_with_path_cutoff(problem.options.path_cutoff)
+    joints, low_pass = problem.episodes[0].recording.joints, twice_applied_effort_filter(problem.options.path_cutoff)
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:

@@ -149,7 +149,7 @@ class EpisodePredictor:
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
         recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
-        if self._follows_momenta and self.model_functions.effect_momentum_shift.is_active(theta, wanted):
+        if self._follows_momenta and self.model_functions.effect_momentum_shift_functions.is_active(theta, wanted):
             return False
         slopes += self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
@@ -177,7 +177,7 @@ class EpisodePredictor:
         rows = slice(2 * self.system.n_coordinates, None)
         recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
-        shift, measured = self.model_functions.effect_momentum_shift, episode.measured_driven_angles
+        shift, measured = self.model_functions.effect_momentum_shift_functions, episode.measured_driven_angles
         return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
@@ -209,7 +209,7 @@ class EpisodePredictor:
         if (lag := corrections.joint_delay_or_lag("torque_lag", theta, wanted)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
-            left = errors.remaining_estimated_torque_error
+            left = errors.estimated_torque_error_to_subtract
             torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true_angles_and_efforts(

@@ -23,7 +23,7 @@ from yid_ocp.problem.initial_state_fit import PrecomputedInitialState
 from yid_ocp.problem.measurements import (
     SensorMeasurements,
     TimeGrid,
-    measurements_on_grid,
+    measurements_located_on_grid,
     measurements_with_paper_weights,
     recording_time_grid,
 )
@@ -35,7 +35,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles_at_nodes,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_with_path_cutoff
+from yid_ocp.problem.signal_filters import LowPassFilter, twice_applied_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
@@ -113,7 +113,7 @@ class InputErrorModel:
         return self.torque_bias + self.torque_noise
 
     @property
-    def remaining_estimated_torque_error(self) -> Array:
+    def estimated_torque_error_to_subtract(self) -> Array:
         """Part of the torque error that remains to be subtracted once effects on torques apply, (N, nu) [N m]."""
         return self.estimated_torque_error - self.transmitted_torque_noise
 
@@ -231,7 +231,9 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     if system.driven and recording.joints is None:
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
     low_pass = LowPassFilter(options.path_cutoff)
-    path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, options.clamp_poses_from_points)
+    path = prescribed_coordinates_at_nodes(
+        recording, system, grid, low_pass, options.clamp_pose_definitions_from_points
+    )
     arm = smooth = np.zeros((grid.steps + 1, 0))
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
@@ -263,7 +265,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if options.arm_tracking_feedback == "proportional":
         loop = proportional_tracking_feedback(step, episode.measured_driven_angles, options.arm_tracking_feedback_gains)
     else:
-        plain = functions.effect_momentum_shift.theta_without_effects(theta)
+        plain = functions.effect_momentum_shift_functions.theta_without_effects(theta)
         known = episode.smoothed_driven_angles, episode.torque, plain
         loop = lqr_tracking_feedback(step, *known, functions.arms_only_integrator_step)
     return replace(episode, tracking_feedback=loop)
@@ -328,7 +330,7 @@ def _samples(
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.node_times,
         grid.time_step,
-        effort_filter_with_path_cutoff(options.path_cutoff),
+        twice_applied_effort_filter(options.path_cutoff),
         LowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
     )
@@ -337,7 +339,7 @@ def _samples(
         found = [data for data in found if data.sensor.has_paper_weight]
     # places before efforts, which follow from the motion
     found.sort(key=lambda data: bool(data.sensor.effort_joints))
-    samples = tuple(measurements_on_grid(data, grid, recording.name) for data in found)
+    samples = tuple(measurements_located_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
         what = "the recording holds no measurement that the model could be compared with"
         raise DataError(what, where=recording.name, hint="check `sensors` and the names of the recorded points")

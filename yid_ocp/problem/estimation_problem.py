@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.problem.episode_prediction import EpisodePredictor, with_seen_equilibrium_and_denoised_loads
@@ -40,7 +40,7 @@ from yid_ocp.problem.unknown_vector import (
     check_free_parameters,
     check_parameter_bounds,
     estimated_initial_state_names,
-    max_initial_state_offsets,
+    max_allowed_initial_state_offsets,
     soft_logarithm_and_slope,
     stated_prior_jacobian,
     stated_prior_stds,
@@ -160,14 +160,16 @@ class EstimationProblem(ReprMixin):
         made._set(**{**same, **changes})
         return made
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         free = f"{len(self.free)} of {count_with_noun(len(self.system.parameters), 'parameter')} free"
         seen = sum(samples.n_residuals for episode in self.episodes for samples in episode.measurements)
         used, held = (count_with_noun(len(entries), "recording") for entries in (self.episodes, self.held_out))
         rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
         table = zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
         rows += [(name, *(f"{value:.4g}" for value in own)) for name, *own in table]
-        return ReprTexts(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
+        return ReprLineAndTableRows(
+            f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows
+        )
 
     # -- what it is made of -------------------------------------------------------------------------------------------
 
@@ -184,7 +186,7 @@ class EstimationProblem(ReprMixin):
         """Lower and upper bounds of the unknown vector, two arrays (nx,)."""
         parts = (self.shared_parameters, self.local_parameters)
         (low, high), (own_low, own_high) = (self.system.parameters.bounds(part) for part in parts)
-        wide = max_initial_state_offsets(self.system, self.unknowns.initial_state_names)
+        wide = max_allowed_initial_state_offsets(self.system, self.unknowns.initial_state_names)
         pack = self.unknowns.pack_same_for_all_recordings
         return pack(low, own_low, -wide), pack(high, own_high, wide)
 
@@ -361,7 +363,7 @@ class EstimationProblem(ReprMixin):
 
     # -- without data -------------------------------------------------------------------------------------------------
 
-    def simulate_noisy_recording(
+    def simulate_synthetic_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
     ) -> Recording:
         """Simulate a synthetic recording with the inputs of one recording and, if given, other parameter values.
@@ -472,7 +474,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
     short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
-    limit = max_initial_state_offsets(predictor.system, predictor.unknowns.initial_state_names)
+    limit = max_allowed_initial_state_offsets(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

@@ -10,14 +10,14 @@ from typing import Protocol
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.measurements import (
     ResidualAndJacobian,
     SensorMeasurements,
     huber_loss_and_residual_factors,
     whitened_for_sensor_biases,
-    whitened_sensitivities_to_standardized_biases,
+    whitened_measurement_sensitivities_to_biases,
 )
 
 EquilibriumGuesses = tuple[Array | None, ...]
@@ -80,10 +80,10 @@ class Evaluation(ReprMixin):
     message: str
     episode_predictions: tuple[EpisodePrediction, ...]
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         slopes = "" if self.jacobian is None else f", by {count_with_noun(self.jacobian.shape[1], 'unknown')}"
         said = f"cost {self.cost:.6g} of {count_with_noun(len(self.residual), 'residual')}{slopes}"
-        return ReprTexts(said if self.ok else f"failed, {self.message}")
+        return ReprLineAndTableRows(said if self.ok else f"failed, {self.message}")
 
     @property
     def equilibrium_guesses(self) -> EquilibriumGuesses:
@@ -118,7 +118,7 @@ def whitened_episode_residual(
 
     Constant sensor errors count as noise, see `whitened_for_sensor_biases`.
     """
-    by_constants = whitened_sensitivities_to_standardized_biases(episode.measurements)
+    by_constants = whitened_measurement_sensitivities_to_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
     plain = _sensor_whitened_residual(episode.measurements, result)

@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.statics import internal_coordinates_at_held_configuration
+from yid_ocp.integrator.statics import steady_effect_internal_coordinates
 from yid_ocp.integrator.step import Step, generalized_momentum_from_velocity
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
@@ -82,7 +82,9 @@ class InitialStateFitter:
         )
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self.fitted_parameters))
         kinematics = forward_kinematics(system.mechanism, e.q1)
-        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.holder_minus_held_axes(kinematics) for grasp in system.grasps))
+        aligned = ca.vertcat(
+            ca.SX(0, 1), *(grasp.holder_minus_held_axis_directions(kinematics) for grasp in system.grasps)
+        )
         internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
         held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
@@ -161,7 +163,7 @@ class InitialStateFitter:
         q0 = q - velocity * first * step.time_step
         q0[list(system.prescribed_coordinate_indices)] = path[0]
         momentum = generalized_momentum_from_velocity(step, q0, velocity, theta)
-        state = np.concatenate([q0, momentum, internal_coordinates_at_held_configuration(step, q0, theta)])
+        state = np.concatenate([q0, momentum, steady_effect_internal_coordinates(step, q0, theta)])
         own = dict(zip(self.fitted_parameters, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
         if START_SPEED_PARAMETER_NAME in system.parameters:
             own[START_SPEED_PARAMETER_NAME] = _speed(frames[first], frames[then], (then - first) * step.time_step)

@@ -217,7 +217,7 @@ class SensorMeasurements:
         return result
 
 
-def measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) -> SensorMeasurements:
+def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -> SensorMeasurements:
     """Locate a sensor's samples between the nodes of a rollout; `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
@@ -273,7 +273,7 @@ def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
-def whitened_sensitivities_to_standardized_biases(samples: Sequence[SensorMeasurements]) -> Array:
+def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasurements]) -> Array:
     """Derivatives (r, m) of whitened measurements with respect to constant sensor errors of unit variance.
 
     Those of the residual, prediction minus measurement, have the opposite sign.
@@ -296,7 +296,7 @@ def subtract_estimated_biases(
 
     `predicted` has the shape (M, k) for each.
     """
-    slopes = whitened_sensitivities_to_standardized_biases(samples)
+    slopes = whitened_measurement_sensitivities_to_biases(samples)
     if not slopes.shape[1]:
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)

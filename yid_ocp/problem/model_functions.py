@@ -17,7 +17,7 @@ from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
     EffectMomentumShift,
     JointMotionWithSensitivities,
-    compile_driven_joints_step,
+    compile_driven_arms_only_step,
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
@@ -321,7 +321,7 @@ class ModelFunctions:
         self._start_fit = CasadiLockedCache[None, InitialStateFitter](
             lambda _: InitialStateFitter(step, start_parameters)
         )
-        self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_joints_step(step))
+        self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_arms_only_step(step))
         self._momentum = CasadiLockedCache[None, EffectMomentumShift](lambda _: EffectMomentumShift(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
@@ -348,7 +348,7 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def effect_momentum_shift(self) -> EffectMomentumShift:
+    def effect_momentum_shift_functions(self) -> EffectMomentumShift:
         """Calculator of the momentum that effects add to the tracking filter's reference at every step."""
         return self._momentum(None)
 

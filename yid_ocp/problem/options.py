@@ -118,7 +118,7 @@ class ProblemOptions:
         float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of the efforts compared with them", "Hz")
     ] = 10.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
-    clamp_poses_from_points: tuple[ClampPoseDefinition, ...] = ()
+    clamp_pose_definitions_from_points: tuple[ClampPoseDefinition, ...] = ()
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)
@@ -161,6 +161,6 @@ class ProblemOptions:
     cable_topology: CableTopology | None = field(default=None, compare=False, repr=False)
 
     @property
-    def all_data_issues_are_warnings(self) -> bool:
+    def no_data_issue_exceeds_warning(self) -> bool:
         """Whether no data quality issue of the recordings is more severe than a warning."""
         return all(doubt.weight == "warning" for doubt in self.data_issues)

@@ -10,7 +10,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
-from yid_ocp.display import ReprMixin, ReprTexts
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin
 from yid_ocp.errors import DataError, SolverError, nearest_name_hint
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -158,9 +158,9 @@ class ChannelPrediction(ReprMixin):
         """Root mean square error in the channel's unit; for a point, that of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         samples = f"{len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"
-        return ReprTexts(f"{self.channel} of '{self.recording}', {samples}")
+        return ReprLineAndTableRows(f"{self.channel} of '{self.recording}', {samples}")
 
 
 def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[ChannelPrediction, ...]:
@@ -291,7 +291,7 @@ def _channel_groups(
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
     """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
     original = next(entry for entry in source.points if entry.name == group.name)
-    clamps = predictor.options.clamp_poses_from_points
+    clamps = predictor.options.clamp_pose_definitions_from_points
     followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point_name, clamp.z_axis_point_name))
     names = tuple(name for name in followed if name in original.names and name not in group.names)
     if not names:

@@ -128,7 +128,7 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def effort_filter_with_path_cutoff(cutoff: float) -> LowPassFilter:
+def twice_applied_effort_filter(cutoff: float) -> LowPassFilter:
     """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
     return LowPassFilter(cutoff, 2)
 

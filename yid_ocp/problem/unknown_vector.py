@@ -138,7 +138,7 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
     return {name: size for effect in effects for name, size in effect.max_abs_unknown_initial_states.items()}
 
 
-def max_initial_state_offsets(system: System, names: Sequence[str]) -> Array:
+def max_allowed_initial_state_offsets(system: System, names: Sequence[str]) -> Array:
     """Largest absolute offset of each estimated initial state component; infinite for coordinates and momenta."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])

@@ -17,7 +17,7 @@ import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.issues import Issue
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.inference.linearized_residual import is_stationary_point
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
@@ -142,7 +142,7 @@ class Solution(ReprMixin):
     problem: EstimationProblem | None = None
     checks: EstimateChecks | None = None
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
         words, rows = {}, [("parameter", "value", "unit", "")]
         for name, e in free.items():
@@ -154,7 +154,7 @@ class Solution(ReprMixin):
         how = f"{self.status.value.replace('_', ' ')} by {self.solver_name}"
         left_out = ("of discretisation",) if self.checks is None else self.checks.uncounted_errors
         uncounted = f"± without the error {' and '.join(left_out)}" if left_out and free else ""
-        return ReprTexts(", ".join(filter(None, (how, *told, more, fit, uncounted))), rows)
+        return ReprLineAndTableRows(", ".join(filter(None, (how, *told, more, fit, uncounted))), rows)
 
     @property
     def n_iterations(self) -> int:
@@ -272,7 +272,7 @@ class AcceptedIterateRecorder:
         if self.callback is not None:
             self.callback(self.history[-1])
 
-    def solver_result_at(
+    def solver_result_with_iterates(
         self, status: Status, message: str, x: Array, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> SolverResult:
         """Solver result of a search that ended at the unknown vector `x`, with the iterates recorded so far."""

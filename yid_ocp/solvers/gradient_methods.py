@@ -82,10 +82,10 @@ class GaussNewton(SolverWithCheckedSettings):
         now = evaluate(x)
         recorder.n_evaluations += 1
         if not now.ok or now.jacobian is None:
-            return recorder.solver_result_at(Status.FAILED, now.message, x)
+            return recorder.solver_result_with_iterates(Status.FAILED, now.message, x)
 
         def ended(status: Status, message: str) -> SolverResult:
-            return recorder.solver_result_at(status, message, x, now.equilibrium_guesses)
+            return recorder.solver_result_with_iterates(status, message, x, now.equilibrium_guesses)
 
         mu, rejected = self.initial_damping, 0
         while True:
@@ -169,7 +169,7 @@ class SingleShooting(SolverWithCheckedSettings):
         cost, gradient, first = problem.cost_and_gradient(start)
         recorder.n_evaluations += 1
         if not first.ok:
-            return recorder.solver_result_at(Status.FAILED, first.message, start)
+            return recorder.solver_result_with_iterates(Status.FAILED, first.message, start)
         unit, warm = max(cost, 1e-300), first.equilibrium_guesses
         seen: dict[bytes, tuple[float, Array]] = {start.tobytes(): (cost, gradient)}
 
@@ -197,7 +197,7 @@ class SingleShooting(SolverWithCheckedSettings):
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(result.status, Status.STALLED)
-        return recorder.solver_result_at(status, str(result.message).lower(), best.x, warm)
+        return recorder.solver_result_with_iterates(status, str(result.message).lower(), best.x, warm)
 
 
 @SOLVERS.register("steepest_descent")
@@ -241,11 +241,11 @@ class SteepestDescent(SolverWithCheckedSettings):
         cost, gradient, evaluation = problem.cost_and_gradient(x)
         recorder.n_evaluations += 1
         if not evaluation.ok:
-            return recorder.solver_result_at(Status.FAILED, evaluation.message, x)
+            return recorder.solver_result_with_iterates(Status.FAILED, evaluation.message, x)
 
         def ended(status: Status, message: str) -> SolverResult:
             best = min(recorder.history, key=lambda entry: entry.cost)
-            return recorder.solver_result_at(status, message, best.x, evaluation.equilibrium_guesses)
+            return recorder.solver_result_with_iterates(status, message, best.x, evaluation.equilibrium_guesses)
 
         # the first trial moves the unknowns by about a tenth of their size
         length = 0.1 * float(np.linalg.norm(problem.unknown_scales)) / max(float(np.linalg.norm(gradient)), 1e-300)

@@ -143,7 +143,7 @@ class MultipleShooting(SolverWithCheckedSettings):
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
             message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
-            return recorder.solver_result_at(Status.FAILED, message + "gauss_newton", start)
+            return recorder.solver_result_with_iterates(Status.FAILED, message + "gauss_newton", start)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
         watch = _Watch(problem, program, functions, ridge, recorder)
         solver = program.make_solver(
@@ -193,7 +193,7 @@ class MultipleShooting(SolverWithCheckedSettings):
         x, nodes = intervals.initial_guess(start)
 
         def ended(status: Status, message: str) -> SolverResult:
-            return recorder.solver_result_at(status, message, x, intervals.equilibrium_guesses)
+            return recorder.solver_result_with_iterates(status, message, x, intervals.equilibrium_guesses)
 
         recorder.n_evaluations += 1
         now = intervals.linearize(x, nodes)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import SolverError, nearest_name_hint
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.solvers.program_terms import (
@@ -124,10 +124,10 @@ class NonlinearProgram(ReprMixin):
     p: ca.MX
     user_terms: tuple[_UserTerms, ...] = ()
 
-    def _summary(self) -> ReprTexts:
+    def _summary(self) -> ReprLineAndTableRows:
         rows = [("block", "entries"), *((name, str(block.index.size)) for name, block in self.variables.items())]
         equalities = count_with_noun(sum(term.n_values for term in self.constraint_terms), "equation")
-        return ReprTexts(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
+        return ReprLineAndTableRows(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
     def named_block(self, name: str) -> _VectorBlock:
         """Indices, row names and unit of a named block; with one recording, `[NAME]` may be left out.

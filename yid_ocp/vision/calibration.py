@@ -33,8 +33,8 @@ from yid_ocp.vision.camera_registration import (
     RobustCostDerivatives,
     SurfaceVisibilityFractions,
     initial_camera_states,
+    pooled_surface_visibility_fractions,
     robust_gradient_and_hessian,
-    surface_visibility_in_frames,
 )
 from yid_ocp.vision.point_cloud import weighted_median
 
@@ -196,7 +196,7 @@ class CameraCalibrationOptions:
     depth_offset_prior_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of an offset of its depth", "m")
     ] = 0.01
-    min_visible_arm_fraction: Annotated[
+    min_arm_coverage_over_frames: Annotated[
         float,
         Gt(0),
         Le(1),
@@ -326,9 +326,9 @@ class _Calibrator:
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = surface_visibility_in_frames(self.arm, chosen, state, _RAY_REACH)
+        presence = pooled_surface_visibility_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
-        if not presence.there >= self.options.min_visible_arm_fraction * free:
+        if not presence.there >= self.options.min_arm_coverage_over_frames * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
             hint = "check the told pose, the robot's description and which recording belongs to the frames"
             raise _UntoldError(f"{seen}, wherever camera and clock are put", hint)
@@ -373,7 +373,7 @@ class _Calibrator:
         for trial in tried:
             for reach in _STAGE_REACHES:
                 trial = self._rounds(trial, few, reach, False, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
-            presence = surface_visibility_in_frames(self.arm, few, trial, 0.5 * _RAY_REACH)
+            presence = pooled_surface_visibility_fractions(self.arm, few, trial, 0.5 * _RAY_REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
             if most > _GOOD_START_FRACTION:
@@ -402,7 +402,7 @@ class _Calibrator:
             return robust_gradient_and_hessian(rows, reach)
 
         for _ in range(rounds):
-            hessian, gradient, _ = cost(state).data_normal_equations_and_weight(self.precision)
+            hessian, gradient, _ = cost(state).data_hessian_gradient_and_weight(self.precision)
             pull = gradient + self.precision @ state.difference_from(self.told)
             step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
             state = state.with_state_increment(step)

@@ -240,7 +240,7 @@ class RobustCostDerivatives:
     # frame, which both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
 
-    def data_normal_equations_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
+    def data_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
         """Weighted Hessian and gradient of the data, and the weight; `precision`: inverse covariance of the prior."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
@@ -250,7 +250,7 @@ class RobustCostDerivatives:
 
     def state_covariance(self, precision: Array) -> Array:
         """Covariance of the minimum of data and prior, shape (10, 10)."""
-        hessian, _, weight = self.data_normal_equations_and_weight(precision)
+        hessian, _, weight = self.data_hessian_gradient_and_weight(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
@@ -371,7 +371,7 @@ class SurfaceVisibilityFractions:
     samples: int
 
 
-def surface_visibility_in_frames(
+def pooled_surface_visibility_fractions(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
 ) -> SurfaceVisibilityFractions:
     """Shares of the arm's surface in view that clouds contain within `within` [m], occlude, or see through."""

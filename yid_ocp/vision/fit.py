@@ -203,9 +203,9 @@ class ShapeFitter:
             # a part of the object is not where this has it: something like it stood nearer to where the search began
             if left[0].any() and left[1].any():
                 other = self._attempt(sight, [self._rested(best.q, failed), *begun], left)
-                if other[1].length_weighted_visible_coverage(self._lengths) > evidence.length_weighted_visible_coverage(
+                if other[1].covered_fraction_of_visible_links(
                     self._lengths
-                ):
+                ) > evidence.covered_fraction_of_visible_links(self._lengths):
                     best, evidence = other
         return self._judged(best, evidence, self._rivals(best, evidence, sight), sight)
 
@@ -250,7 +250,7 @@ class ShapeFitter:
             name
             for name, mine in own.items()
             if mine @ evidence.visibly_empty_fraction > 0
-            and evidence.length_weighted_visible_coverage(mine) < self.options.min_tube_length_coverage
+            and evidence.covered_fraction_of_visible_links(mine) < self.options.min_tube_length_coverage
         }
 
     def _without(
@@ -494,7 +494,7 @@ def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOption
             corners += [start, kinematics.frame_position(f"{segment.name}_{i}_tip")]
     rows, gaps = [ca.SX(0, 1)], [ca.SX(0, 1)]
     for grasp in system.grasps:
-        residual, alignment = grasp.constraint_residual(kinematics), grasp.holder_minus_held_axes(kinematics)
+        residual, alignment = grasp.constraint_residual(kinematics), grasp.holder_minus_held_axis_directions(kinematics)
         gaps.append(residual[:3])
         rows.append(residual[:3] / options.grasp_position_std)
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown

@@ -81,7 +81,7 @@ class TrackOptions:
             "m",
         ),
     ] = 0.008
-    min_visible_length_coverage: Annotated[
+    min_covered_visible_length_fraction: Annotated[
         UnitIntervalFloat,
         OptionInfo("a frame with points on a smaller share of the object's visible length is dropped"),
     ] = 0.6
@@ -148,7 +148,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > options.max_frame_bend_angle:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-    if fit.visible_length_coverage < options.min_visible_length_coverage:
+    if fit.visible_length_coverage < options.min_covered_visible_length_fraction:
         return f"{_NO_FIT}: only {100 * fit.visible_length_coverage:.0f} % of its visible length has points of its own"
     return ""
 
@@ -197,7 +197,7 @@ def tracked_states_and_points(
     fits, of = list(good.values()), list(columns)
     t = np.array([frames[k].joint_time for k in good])
     position = np.array([fit.point_positions[of] for fit in fits])
-    by_sizes = np.array([sizes.point_std_from_dimensions(fit.dimension_equations.point_jacobian[of]) for fit in fits])
+    by_sizes = np.array([sizes.point_std_due_to_dimensions(fit.dimension_equations.point_jacobian[of]) for fit in fits])
     std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), options.min_point_std), by_sizes)
     velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
     # a point is where it was at some time of the exposure, which is uniform over that

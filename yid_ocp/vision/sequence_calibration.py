@@ -229,7 +229,7 @@ class TubeDimensionEstimates:
                 lines.append(f"{name} seems to be wrong: {found}, {said}. Measure it again, or {remedy}")
         return tuple(lines)
 
-    def point_std_from_dimensions(self, points: Array) -> Array:
+    def point_std_due_to_dimensions(self, points: Array) -> Array:
         """Stds (np, 3) [m] of points due to wrong or uncertain tube dimensions; `points`: derivatives (np, 3, 2 s).
 
         The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.

@@ -108,7 +108,7 @@ class ShapeFitQuality:
     end_offsets: Array
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
-    def length_weighted_visible_coverage(self, lengths: Array) -> float:
+    def covered_fraction_of_visible_links(self, lengths: Array) -> float:
         """Share of the visible length of links, lengths (K,) [m], with points of their own; 0 if none is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
@@ -395,6 +395,6 @@ class FrameShapeFit(ShapeFitQuality):
     @property
     def visible_length_coverage(self) -> float:
         """Fraction of the shape's visible length that has points."""
-        return self.length_weighted_visible_coverage(
+        return self.covered_fraction_of_visible_links(
             np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
         )

@@ -77,7 +77,7 @@ def track_object(
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_sequence_calibration()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
-    return tracker.track_result_from_frames(*tracker.select_root_end_and_frames(frames), common)
+    return tracker.track_result_from_frame_reports(*tracker.mark_outlying_frames_and_root_end(frames), common)
 
 
 @dataclass(eq=False)
@@ -325,12 +325,12 @@ class FrameTracker:
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def select_root_end_and_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+    def mark_outlying_frames_and_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Frames with outlying ones dropped, and how the root end was chosen."""
         rooted, note = frame_selection.with_consistent_root_end(frames, self.options)
         return frame_selection.mark_outlying_frames(rooted, self.options), note
 
-    def track_result_from_frames(
+    def track_result_from_frame_reports(
         self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration
     ) -> TrackResult:
         """Tracking result of the frames; `DataError` if none is good."""

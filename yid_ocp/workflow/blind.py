@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import EMBEDDED_CONFIG_FILE_NAME, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
@@ -52,11 +52,11 @@ log = logging.getLogger(__name__)
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `blind` and return its exit code."""
     runs = [
-        load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
+        load_config(path, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
         for path in arguments.configs or [None]
     ]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
-        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG_FILE_NAME))
+        runs.append(load_config(None, arguments.overrides, EMBEDDED_CONFIG_FILE_NAME))
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     purpose = blind.ALLOWED_ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
@@ -195,7 +195,7 @@ class _Proof:
         for name, text in configs.items():
             write_text(self.config_file(name), text)
         files = {name: self.config_file(name) for name in configs}
-        experiments, chains = blind_experiments_and_divisible_names(files, self.seed, self.purpose)
+        experiments, chains = blind_experiments_and_refinable_subset(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
         plan = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
@@ -435,7 +435,7 @@ def _require_compatible(run: RunSettings) -> None:
         raise run.config_error("a blind proof moves driven arms", "model", "arms", "mode", allowed=allowed)
 
 
-def blind_experiments_and_divisible_names(
+def blind_experiments_and_refinable_subset(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, BlindExperiment], frozenset[str]]:
     """Virtual experiments by name, and the names of those whose object's links can be divided further.

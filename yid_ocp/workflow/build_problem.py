@@ -83,7 +83,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         for name, s in run.model.moving_clamps.items()
     )
     if cable is not None and isinstance(run.model.object, ClampedObject):
-        clamps = cable.clamp_poses_from_points
+        clamps = cable.clamp_pose_definitions_from_points
         for name in {group.name for group in groups}:
             said = sensors.get(name, SensorOptions())
             sensors[name] = said if said.points is not None else replace(said, points=cable.free_vertex_names)
@@ -94,7 +94,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     return replace(
         run.problem,
         sensors=sensors,
-        clamp_poses_from_points=clamps,
+        clamp_pose_definitions_from_points=clamps,
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
@@ -246,7 +246,7 @@ def _check_recordings(
     return *kept, tuple(doubts)
 
 
-def all_recording_quality_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
+def recording_quality_issues_with_model(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
     """All data quality issues of one uncut recording; errors as `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
@@ -341,7 +341,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
     lengths = ca.vertcat(ca.SX(0), *(length for segment in system.segment_layouts for length in segment.link_lengths))
     size = float(ca.Function("size", [system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))
     wanted = any(samples.sensor.point_names for episode in problem.episodes for samples in episode.measurements)
-    if not size or not wanted or problem.options.clamp_poses_from_points:
+    if not size or not wanted or problem.options.clamp_pose_definitions_from_points:
         return []
     found: list[Issue] = []
     for i, episode in enumerate(problem.episodes):

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.estimate_history import pool_estimates
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
-from yid_ocp.diagnosis.baseline import BaselineRunData, with_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import (
@@ -49,7 +49,7 @@ _STORE_FORMAT = "yid-refits/1"
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `diagnose` and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
+    settings = load_config(arguments.config, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
@@ -88,7 +88,7 @@ def run_diagnose(
                 thresholds=run.diagnosis,
                 progress=logged,
                 known_fits=NominalSolutionAndRefitStore(nominal, refits),
-                baseline=BaselineRunData.from_runs(runs, without),
+                baseline=EarlierRunsBaseline.from_runs(runs, without),
                 exclude=run.diagnosis.exclude,
             )
         except KeyboardInterrupt:
@@ -100,7 +100,9 @@ def run_diagnose(
         prediction_outputs.write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
-        moving = not last.problem.options.clamp_poses_from_points and bool(system.driven or system.prescribed)
+        moving = not last.problem.options.clamp_pose_definitions_from_points and bool(
+            system.driven or system.prescribed
+        )
         x = last.problem.vector(last.values)
         own = {
             "model": _final_model_to_dict(finding),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis import friction_ladder
-from yid_ocp.analysis.friction_ladder import FrictionLawFit, motion_kind_mean_and_std_error
+from yid_ocp.analysis.friction_ladder import FrictionLawFit, mean_and_std_error_over_motion_kinds
 from yid_ocp.config.settings import FrictionLawSettings, RunSettings
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError
@@ -68,9 +68,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
 
 
 def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-    mean, error = motion_kind_mean_and_std_error(fit.left_out_errors, kinds)
+    mean, error = mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)
     beyond = {name: own - best.left_out_errors[name] for name, own in fit.left_out_errors.items()}
-    difference, paired = motion_kind_mean_and_std_error(beyond, kinds)
+    difference, paired = mean_and_std_error_over_motion_kinds(beyond, kinds)
     return {
         "mean_error": mean,
         "standard_error": error,

@@ -16,7 +16,7 @@ from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitCommandObject, comma_separated_numbers, init_command_object_templates
+from yid_ocp.model.objects.base import InitCommandObject, comma_separated_numbers, init_command_object_factories
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
@@ -68,7 +68,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 
 def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject | None:
     """The described object, if any; `ConfigError` for a number that is missing or impossible, and names its option."""
-    templates, word = init_command_object_templates(), arguments.object
+    templates, word = init_command_object_factories(), arguments.object
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
             if getattr(arguments, name):

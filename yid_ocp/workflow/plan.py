@@ -94,7 +94,7 @@ def configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapp
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
     [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system
-    clamps = () if cable is None else cable.clamp_poses_from_points
+    clamps = () if cable is None else cable.clamp_pose_definitions_from_points
     grid = recording_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
         path = prescribed_coordinates_at_nodes(recording, system, grid, LowPassFilter(run.problem.path_cutoff), clamps)

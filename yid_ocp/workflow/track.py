@@ -46,7 +46,7 @@ from yid_ocp.vision.surface_meshes import ObservedScene, VirtualFramesWithTruth
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import all_recording_quality_issues, issues_to_plain_data
+from yid_ocp.workflow.build_problem import issues_to_plain_data, recording_quality_issues_with_model
 from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path
@@ -75,14 +75,14 @@ def _run_track(
         try:
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.settings, system)
-                doubts = [] if recording is None else all_recording_quality_issues(run, system, recording)
+                doubts = [] if recording is None else recording_quality_issues_with_model(run, system, recording)
                 progress.begin_stage("finding what is common to the frames")
                 common = tasks.estimate_sequence_calibration()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
-                frames, note = tracker.select_root_end_and_frames(done)
+                frames, note = tracker.mark_outlying_frames_and_root_end(done)
                 try:
-                    found = tracker.track_result_from_frames(frames, note, common)
+                    found = tracker.track_result_from_frame_reports(frames, note, common)
                 except DataError as error:
                     refused = error
         except YidError:
@@ -101,7 +101,7 @@ def _run_track(
             write_recording(tracked, folder.path / "recording.h5")
             # what was tracked may be elsewhere than the object reaches, where the model says where it stands
             if settings.options.root_placement == "model":
-                own = all_recording_quality_issues(run, system, tracked)
+                own = recording_quality_issues_with_model(run, system, tracked)
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
             theta = system.parameters.vector()
             shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)

@@ -64,18 +64,18 @@ class ClampPoseDefinition:
 class CableTopology:
     """Topology of a branched cable: vertices along the parent and child branches, and their undeformed positions."""
 
-    parent_branch_point_names: tuple[str, ...]  # from clamp to clamp; the clamps hold the first and last two vertices
-    child_branch_point_names: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
+    parent_branch_vertex_names: tuple[str, ...]  # from clamp to clamp; the clamps hold the first and last two vertices
+    vertex_names_by_child_branch: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
     undeformed_positions: Mapping[str, ArrayLike]  # position of every unloaded vertex, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
-        free = self.parent_branch_point_names[2:-2]
+        free = self.parent_branch_vertex_names[2:-2]
         if not free:
-            what = f"the parent has {len(self.parent_branch_point_names)} vertices"
+            what = f"the parent has {len(self.parent_branch_vertex_names)} vertices"
             allowed = "5 or more: two held at each end"
             raise ModelError(what, where="cable", allowed=allowed)
-        for name, vertices in self.child_branch_point_names.items():
+        for name, vertices in self.vertex_names_by_child_branch.items():
             if len(vertices) < 2 or vertices[0] not in free:
                 what = f"child '{name}' does not leave the parent at one of its free vertices"
                 raise ModelError(what, where="cable", allowed=", ".join(free))
@@ -90,14 +90,14 @@ class CableTopology:
     def vertex_names(self) -> tuple[str, ...]:
         """Names of all vertices, those of the parent branch first."""
         return (
-            *self.parent_branch_point_names,
-            *(vertex for chain in self.child_branch_point_names.values() for vertex in chain[1:]),
+            *self.parent_branch_vertex_names,
+            *(vertex for chain in self.vertex_names_by_child_branch.values() for vertex in chain[1:]),
         )
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
         """Names of the four clamped vertices, the first and last two of the parent branch."""
-        return (*self.parent_branch_point_names[:2], *self.parent_branch_point_names[-2:])
+        return (*self.parent_branch_vertex_names[:2], *self.parent_branch_vertex_names[-2:])
 
     @property
     def free_vertex_names(self) -> tuple[str, ...]:
@@ -107,7 +107,7 @@ class CableTopology:
     @property
     def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
         """Vertex names of every branch by segment name, the parent branch first."""
-        return {self.parent_segment: self.parent_branch_point_names, **self.child_branch_point_names}
+        return {self.parent_segment: self.parent_branch_vertex_names, **self.vertex_names_by_child_branch}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
@@ -115,9 +115,9 @@ class CableTopology:
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
-    def clamp_poses_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
+    def clamp_pose_definitions_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Definitions of the poses of the two clamps, at the start and at the end."""
-        a, b, *_, y, z = self.parent_branch_point_names
+        a, b, *_, y, z = self.parent_branch_vertex_names
         start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
         return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
 
@@ -141,7 +141,7 @@ class InitCommandObject:
 
 
 @dataclass(frozen=True)
-class InitCommandObjectTemplate:
+class InitCommandObjectFactory:
     """Template for one word of `init --object`: how the object is built and which numbers it requires.
 
     `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
@@ -196,7 +196,7 @@ class ObjectKind:
 
     # whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition
     default_link_refinement: ClassVar[bool] = False
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {}  # words of `init --object`
+    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("what the object is")]
@@ -228,7 +228,7 @@ class ObjectKind:
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Factor on a per-joint parameter that keeps its segment's stiffness if each link is divided; 1 for others."""
         owner, _, quantity = parameter.rpartition(".")
-        per_joint = {segment.name for segment in self.build_segments() if not segment.has_stiffness_per_curvature}
+        per_joint = {segment.name for segment in self.build_segments() if not segment.stiffness_given_as_rigidity}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
@@ -284,6 +284,6 @@ class MountedObjectKind(ObjectKind):
 OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
-def init_command_object_templates() -> dict[str, InitCommandObjectTemplate]:
+def init_command_object_factories() -> dict[str, InitCommandObjectFactory]:
     """Templates of all object kinds, by their word for `init --object`."""
-    return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}
+    return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_factories.items()}

@@ -121,7 +121,9 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of a cable's length parameters by name, from the lengths [m] of its edges."""
-    values = {f"{START_CLAMP}.length": lengths[cable.parent_branch_point_names[0], cable.parent_branch_point_names[1]]}
+    values = {
+        f"{START_CLAMP}.length": lengths[cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[1]]
+    }
     for name, chain in cable.vertex_names_by_branch.items():
         first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
@@ -144,7 +146,7 @@ def clamped_cable_system(
         item = _with_rest_angles(item)
     if options.shape_memory_fraction is not None:
         item = _with_memory(item, options.shape_memory_fraction)
-    clamps = _start_clamp(lengths[cable.parent_branch_point_names[0], cable.parent_branch_point_names[1]], cable)
+    clamps = _start_clamp(lengths[cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[1]], cable)
     clamps = clamps.with_attached_mechanism(floating_joint_mechanism(END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
     if options.end_clamp_grasp_kind == "weld":
@@ -211,9 +213,9 @@ def _with_vertices(
     last = tree.joint_index(item.segment_layouts[0].link_joints[-1][-1])
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
-    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_branch_point_names)])
+    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_branch_vertex_names)])
     whole = ArcLengthChain(
-        (cable.parent_branch_point_names[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
+        (cable.parent_branch_vertex_names[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
     )
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
@@ -229,15 +231,15 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     frames = {
         **clamp.frames,
-        cable.parent_branch_point_names[0]: carrier,
-        cable.parent_branch_point_names[1]: tip,
+        cable.parent_branch_vertex_names[0]: carrier,
+        cable.parent_branch_vertex_names[1]: tip,
         _START_EDGE_FRAME: tip,
     }
     return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
 def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
-    parent = cable.parent_branch_point_names
+    parent = cable.parent_branch_vertex_names
     turns = edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
@@ -266,7 +268,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             twist=branch.twist_rigidity,
             damping=branch.bend_damping,
             twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
-            has_stiffness_per_curvature=True,
+            stiffness_given_as_rigidity=True,
             has_link_length_parameters=options.has_edge_lengths_per_recording,
         )
         segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
@@ -285,8 +287,8 @@ class Cable(CableOptions, ObjectKind):
 model:
   object:
     kind: cable
-    parent_branch_point_names: [p0, p1, p2, p3, p4, p5]
-    child_branch_point_names: {side: [p2, s1, s2]}
+    parent_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
+    vertex_names_by_child_branch: {side: [p2, s1, s2]}
     undeformed_shape_file: undeformed.csv
     end_clamp_grasp_kind: axis
 """,
@@ -294,19 +296,19 @@ model:
 model:
   object:
     kind: cable
-    parent_branch_point_names: [p0, p1, p2, p3, p4, p5]
+    parent_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
-    child_branch_point_names: {side: [p2, s1, s2]}
+    vertex_names_by_child_branch: {side: [p2, s1, s2]}
     branch_properties:
       side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     }
 
     kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
-    parent_branch_point_names: Annotated[
+    parent_branch_vertex_names: Annotated[
         tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")
     ]
-    child_branch_point_names: Annotated[
+    vertex_names_by_child_branch: Annotated[
         Mapping[str, tuple[str, ...]],
         OptionInfo("points of every branch, the first one the parent's at which it leaves"),
     ] = field(default_factory=dict)
@@ -318,7 +320,7 @@ model:
 
     def topology(self) -> CableTopology:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
-        found = CableTopology(self.parent_branch_point_names, dict(self.child_branch_point_names), undeformed)
+        found = CableTopology(self.parent_branch_vertex_names, dict(self.vertex_names_by_child_branch), undeformed)
         for name in self.branch_properties:
             if name not in found.vertex_names_by_branch:
                 hint = nearest_name_hint(name, found.vertex_names_by_branch)

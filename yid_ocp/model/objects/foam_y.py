@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObjectKind
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectKind
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -46,8 +46,8 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 class FoamY(MountedObjectKind):
     """The source paper's foam letter Y; without a mount its foot stands where it does in the paper."""
 
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
-        "foam_y": InitCommandObjectTemplate(4, _init_object)
+    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
+        "foam_y": InitCommandObjectFactory(4, _init_object)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: foam_y": """\

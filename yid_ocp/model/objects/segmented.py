@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObjectKind
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectKind
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -44,7 +44,7 @@ class FlexibleSegmentSettings:
     ] = None
     rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = _NO_TURN
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
-    has_stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
+    stiffness_given_as_rigidity: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
     has_link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = (
@@ -58,13 +58,13 @@ class FlexibleSegmentSettings:
             raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)
         n = link_division
         # a rigidity does not depend on the number of links, a stiffness per joint does
-        factor = 1 if self.has_stiffness_per_curvature else n
+        factor = 1 if self.stiffness_given_as_rigidity else n
         lengths, index = self.link_lengths, self.parent_link_index
         same = (
             "mass",
             "radius",
             "parent",
-            "has_stiffness_per_curvature",
+            "stiffness_given_as_rigidity",
             "clamped_at_base",
             "joint_axes",
             "cross_section_size",
@@ -93,7 +93,7 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
     section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
-    return FlexibleSegmentSettings(has_stiffness_per_curvature=True, clamped_at_base=more.get("parent") is None, **more)
+    return FlexibleSegmentSettings(stiffness_given_as_rigidity=True, clamped_at_base=more.get("parent") is None, **more)
 
 
 def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
@@ -175,10 +175,10 @@ class SegmentedObject(MountedObjectKind):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
-        "cable": InitCommandObjectTemplate(8, _cable),
-        "beam": InitCommandObjectTemplate(6, _beam),
-        "tree": InitCommandObjectTemplate(4, _tree, has_branches=True),
+    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
+        "cable": InitCommandObjectFactory(8, _cable),
+        "beam": InitCommandObjectFactory(6, _beam),
+        "tree": InitCommandObjectFactory(4, _tree, has_branches=True),
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: segments": """\
@@ -196,7 +196,7 @@ model:
     kind: segments
     segments:
       beam: {length: 0.52, mass: 0.33, cross_section_size: [0.001, 0.08], links: 8, joint_axes: y, \
-has_stiffness_per_curvature: true, clamped_at_base: true}
+stiffness_given_as_rigidity: true, clamped_at_base: true}
 """,
     }
 

@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, Segment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObjectKind
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectKind
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -39,8 +39,8 @@ class TaperedRod(MountedObjectKind):
     """
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
-        "tapered_rod": InitCommandObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
+    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
+        "tapered_rod": InitCommandObjectFactory(8, _init_object, _FURTHER_NUMBERS)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: tapered_rod": """\
@@ -62,7 +62,7 @@ parameters:
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Build the rod as one segment with the base's radius; `build` then tapers its links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
-        rod = Segment(_SEGMENT, *sizes, damping=damping, has_stiffness_per_curvature=True, clamped_at_base=True)
+        rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_given_as_rigidity=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
