@@ -154,8 +154,9 @@ def _inspect(parser: argparse.ArgumentParser) -> None:
 
 
 def _import(parser: argparse.ArgumentParser) -> None:
-    files = "CSV, C3D, MCAP, rosbag (file or folder), LeRobot dataset (folder), or a recording"
-    parser.add_argument("file", metavar="FILE", help=files)
+    files = "CSV, C3D, MCAP, rosbag (file or folder), LeRobot dataset (folder), or a recording; several of one run, "
+    files += "such as joints and motion capture, become one recording"
+    parser.add_argument("files", metavar="FILE", nargs="+", help=files)
     parser.add_argument("--out", metavar="RECORDING.h5", help="recording to write; needed without --preview")
     _switch(parser, "--preview", "show what there is, and the command that imports it, and write nothing")
     text = "its section `import` says how; a flag goes before what stands there"
@@ -174,6 +175,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
         ("--columns", "columns", "COLUMN=MEANING", "of a table: t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),
         ("--units", "units", "UNIT", "deg, mm, ms, or QUANTITY=UNIT, of what is not SI"),
         ("--torque-constants", "torque_constants", "JOINT=N_M_PER_A", "where the efforts are currents; * is any text"),
+        ("--clock-offset", "clock_offsets", "FILE=SECONDS", "of several files: added to the times of one, by its stem"),
         ("--gears", "gears", "JOINT=RATIO", "turns of the motor per turn of the joint"),
     )
     for flag, key, shape, text in listed:

@@ -10,6 +10,7 @@ import pytest
 from recording_examples import joints_of, table
 
 from yid_ocp.data import readers
+from yid_ocp.data.column_names import column_meanings
 from yid_ocp.data.readers import READERS, preview_file, read_any
 from yid_ocp.data.readers.csv import CsvOptions, read_csv
 from yid_ocp.data.recording import JointGroup, Recording, validated_recording
@@ -103,7 +104,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "empty": ("", {}, "the table is empty", ""),
     "no header": ("0,1\n1,2\n", {}, "no header row", ""),
     "no rows": ("t,q_a\n", {}, "no rows", ""),
-    "other delimiter": ("t;q_a\n0;1\n", {}, "one column, 't;q_a'", "delimiter=';'"),
+    "other delimiter": ("t;q_a\n0;1\n", {"delimiter": ","}, "one column, 't;q_a'", "delimiter=';'"),
     "one column": ("t\n0\n", {}, "one column, 't'", ""),
     "long delimiter": (GOOD, {"delimiter": "::"}, "the delimiter is '::'", ""),
     "repeated column": ("t,q_a,q_a\n0,1,1\n", {}, "two columns are called 'q_a'", ""),
@@ -223,18 +224,17 @@ def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "columns", "delimiter"),
+    ("text", "columns"),
     [
-        ("t;q_a;label;tip_x;tip_y;tip_z\n" + "".join(f"{k};{k};x;1;2;3\n" for k in range(4)), {"label": "skip"}, ";"),
-        ("t,angle\n" + "".join(f"{k},{k}\n" for k in range(4)), {"angle": "CHANNEL:angle"}, ","),
-        ("".join(f"{k},1,2\n" for k in range(4)), {"1": "t", "2": "CHANNEL:JOINT", "3": "CHANNEL:JOINT"}, ","),
+        ("t;q_a;label;tip_x;tip_y;tip_z\n" + "".join(f"{k};{k};x;1;2;3\n" for k in range(4)), {"label": "skip"}),
+        ("t,bend\n" + "".join(f"{k},{k}\n" for k in range(4)), {"bend": "skip"}),
+        ("".join(f"{k},1,2\n" for k in range(4)), {"1": "t", "2": "skip", "3": "skip"}),
     ],
     ids=["text among it", "unknown name", "no header"],
 )
-def test_the_preview_of_a_table(text: str, columns: dict[str, str], delimiter: str, tmp_path: Path) -> None:
+def test_the_preview_of_a_table(text: str, columns: dict[str, str], tmp_path: Path) -> None:
     contents = preview_file(table(tmp_path, text))
     assert contents.reader_options["columns"] == columns
-    assert contents.reader_options.get("delimiter", ",") == delimiter
     assert ("header" in contents.reader_options) == text.startswith("0")
 
 
@@ -266,10 +266,86 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     contents = preview_file(path)
     assert "columns" not in contents.reader_options
     assert [source.imported_as for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
-    # q0 is none of them, and q_1 is what it was
-    path.write_text("t,q0\n0,1\n1,2\n", encoding="utf-8")
-    with pytest.raises(DataError, match="meaning of column 'q0' is not known"):
+    # a name that says nothing is not guessed
+    path.write_text("t,j0\n0,1\n1,2\n", encoding="utf-8")
+    with pytest.raises(DataError, match="meaning of column 'j0' is not known"):
         read_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "meanings"),
+    [
+        ("timestamp,pos_a,vel_a,tau_a", "t position:a velocity:a effort:a"),
+        ("Time [ms],q1_deg,dq1,tau_1", "t position:1 velocity:1 effort:1"),
+        ("time_s,a.pos,a.vel,a_effort", "t position:a velocity:a effort:a"),
+        ("time (s),Q0,QD0,torque0", "t position:0 velocity:0 effort:0"),
+        ("__time,/joint_states/a/position,/joint_states/a/velocity,/joint_states/a/effort",
+         "t position:a velocity:a effort:a"),
+        ("%time,field.position0,field.velocity0,field.effort0", "t position:0 velocity:0 effort:0"),
+        ("time,q[0],dq[0],tau_J[0]", "t position:0 velocity:0 effort:0"),
+        ("timestamp,actual_q_0,actual_qd_0,target_q_0", "t position:0 velocity:0 position_command:0"),
+        ("t,tip X,tip Y,tip Z", "t x:tip y:tip z:tip"),
+        ("t,tip_x [mm],tip_y [mm],tip_z [mm]", "t x:tip y:tip z:tip"),
+        ("t,x,y,z", "t x:marker y:marker z:marker"),
+        ("frame,tip_qw,j0", "None None None"),
+    ],
+)  # fmt: skip
+def test_columns_are_understood_as_loggers_and_mocap_call_them(header: str, meanings: str) -> None:
+    found, _ = column_meanings(header.split(","))
+    assert " ".join(":".join(filter(None, m)) if m else "None" for m in found) == meanings
+
+
+def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -> None:
+    path = table(tmp_path, "Time [ms],q1_deg,tip_x [mm],tip_y [mm],tip_z [mm]\n0,90,100,200,300\n10,45,100,200,300\n")
+    recording = read_csv(path)
+    assert joints_of(recording).t == pytest.approx([0, 0.01])
+    assert joints_of(recording).position[:, 0] == pytest.approx(np.radians([90, 45]))
+    assert recording.points[0].position[0, 0] == pytest.approx([0.1, 0.2, 0.3])
+    assert read_any(path, units={"points": "cm"}).points[0].position[0, 0] == pytest.approx([1, 2, 3])
+
+
+RIGID = "Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error"
+EXPORTS = {
+    "motive.csv": (
+        "Format Version,1.23,Take Name,rod,Length Units,Meters,Coordinate Space,Global\n\n,Type,"
+        + ",".join(["Rigid Body"] * 8 + ["Marker"] * 3)
+        + "\n,Name,"
+        + ",".join(["base"] * 8 + ["tip"] * 3)
+        + f"\n,ID,1\n,,{RIGID},Position,Position,Position\nFrame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X,Y,Z\n"
+        "0,0.00,0,0,0,1,1,2,3,0,0.1,0.2,0.3\n1,0.01,0,0,0,1,1,2,3,0,,,\n",
+        "OptiTrack",
+        ("base", "tip"),
+    ),
+    "vicon.csv": (
+        "Trajectories\n100\n,,rod:base,,,rod:tip,,\nFrame,Sub Frame,X,Y,Z,X,Y,Z\n,,mm,mm,mm,mm,mm,mm\n"
+        "1,0,1000,2000,3000,100,200,300\n2,0,1000,2000,3000,,,\n",
+        "Vicon",
+        ("base", "tip"),
+    ),
+    "qtm.tsv": (
+        "NO_OF_FRAMES\t2\nNO_OF_MARKERS\t2\nFREQUENCY\t100\nDATA_INCLUDED\t3D\nMARKER_NAMES\tbase\ttip\n"
+        "1000\t2000\t3000\t100\t200\t300\n1000\t2000\t3000\t0.000\t0.000\t0.000\n",
+        "Qualisys",
+        ("base", "tip"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are_nan(name: str, tmp_path: Path) -> None:
+    text, program, names = EXPORTS[name]
+    (tmp_path / name).write_text(text)
+    [group] = read_any(tmp_path / name).points
+    assert (group.names, group.sensor) == (names, program)
+    assert group.t == pytest.approx([0, 0.01])
+    np.testing.assert_allclose(group.position[0], [[1, 2, 3], [0.1, 0.2, 0.3]])
+    np.testing.assert_array_equal(np.isnan(group.position[1]).all(axis=1), [False, True])
+    kept = read_any(tmp_path / name, points={"tip": "w_rod"})
+    assert kept.points[0].names == ("w_rod",)
+    assert [source.name for source in preview_file(tmp_path / name).sources] == list(names)
+    (tmp_path / name).write_text(text.splitlines()[0] + "\n")
+    with pytest.raises(DataError):
+        read_any(tmp_path / name)
 
 
 # ------------------------------------------------------------------------------------------------------- any format

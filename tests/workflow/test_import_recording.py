@@ -125,11 +125,70 @@ def test_a_bad_import_says_what_is_wrong_and_writes_nothing(
     assert sorted(entry.name for entry in tmp_path.iterdir()) == before
 
 
+def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_preview(
+    odd: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t = np.arange(0, 2, 0.01)
+    rows = "".join(f"{x:.3f},{math.sin(3 * x):.6f},{3 * math.cos(3 * x):.6f},{k % 3}\n" for k, x in enumerate(t))
+    (odd / "joints.csv").write_text("timestamp,pos_a,vel_a,tau_a\n" + rows)
+    rows = "".join(
+        f"{x:.3f},{500 * math.cos(math.sin(3 * x)):.3f},{500 * math.sin(math.sin(3 * x)):.3f},0\n" for x in t
+    )
+    (odd / "mocap.csv").write_text("time,tip X,tip Y,tip Z\n" + rows)
+    assert main(["import", "joints.csv", "mocap.csv", "--preview"]) == 0
+    *_, said = capsys.readouterr().out.strip().splitlines()
+    assert main(shlex.split(said)[1:]) == 0
+    told = capsys.readouterr().out
+    assert "position [rad], velocity [rad/s], effort [N m]" in told
+    assert "on one clock" in told
+    recording = read_recording(odd / "joints_merged.h5")
+    assert recording.joints is not None
+    assert recording.joints.names == ("a",)
+    assert recording.points[0].position[0, 0] == pytest.approx([0.5, 0, 0])
+    assert all(file_sha256(odd / name) in recording.source for name in ("joints.csv", "mocap.csv"))
+    words = ["--units", "mm", "--points", "tip=w_rod", "--joints", "a=elbow", "--columns", "tau_a=skip"]
+    assert main(["import", "joints.csv", "mocap.csv", "--out", "both.h5", *words, "--clock-offset", "mocap=0.5"]) == 0
+    recording = read_recording(odd / "both.h5")
+    assert recording.joints is not None
+    assert (recording.joints.names, recording.joints.effort) == (("elbow",), None)
+    assert (recording.point_names, recording.points[0].t[0]) == (("w_rod",), 0.5)
+    for flags, what in (
+        (["--columns", "x=skip"], "no file has a column 'x'"),
+        (["--episode", "1"], "none of the files"),
+    ):
+        assert main(["import", "joints.csv", "mocap.csv", "--out", "no.h5", "--units", "mm", *flags]) == 2
+        assert what in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("t,q_a\n0,0\n1,0.5\n", "joints has 2 samples"),
+        ("t,q_a\n" + "".join(f"{10 * k},{0.1 * k % 1}\n" for k in range(99)), "in milliseconds it would be 100 Hz"),
+        ("t,q_a\n" + "".join(f"{0.01 * k},0.2\n" for k in range(99)), "no joint turns by 0.01 rad"),
+        ("t,q_a\n" + "".join(f"{0.01 * k},{k % 45}\n" for k in range(99)), "--units position=deg"),
+    ],
+    ids=["two samples", "milliseconds", "no motion", "degrees"],
+)
+def test_doubts_are_said_at_import(text: str, said: str, odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (odd / "run.csv").write_text(text)
+    assert main(["import", "run.csv", "--out", "run.h5"]) == 0
+    assert said in capsys.readouterr().out
+
+
+def test_no_command_is_suggested_that_would_fail(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (odd / "run.csv").write_text("t,bend\n0,1\n1,2\n")
+    assert main(["import", "run.csv", "--preview"]) == 0
+    told = capsys.readouterr().out
+    assert "to import it, something has to be said first" in told
+    assert "yid-ocp import" not in told
+
+
 def test_every_flag_is_a_key_of_the_section() -> None:
     from yid_ocp.config.settings import ImportSettings
     from yid_ocp.options import dataclass_options
 
     known: Callable[..., object] = build_argument_parser().parse_args
     given = vars(known(["import", "x"]))
-    others = {"command", "run", "file", "out", "preview", "config", "quiet", "verbose", "json"}
+    others = {"command", "run", "files", "out", "preview", "config", "quiet", "verbose", "json"}
     assert set(given) - others == set(dataclass_options(ImportSettings))

@@ -238,7 +238,9 @@ class ImportSettings:
     skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether lines that are no numbers are left out")] = (
         None
     )
-    delimiter: Annotated[str | None, OptionInfo("of a table: one character between cells; a comma when absent")] = None
+    delimiter: Annotated[
+        str | None, OptionInfo("of a table: one character between cells; found in the first line when absent")
+    ] = None
     units: Annotated[
         _Texts,
         OptionInfo(
@@ -251,6 +253,9 @@ class ImportSettings:
     ] = None
     gears: Annotated[
         _Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent")
+    ] = None
+    clock_offsets: Annotated[
+        _Numbers, OptionInfo("of several files: what is added to the times of each, by the stem of its name", "s")
     ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
     clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None

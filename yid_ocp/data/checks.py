@@ -110,7 +110,7 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
     """
     recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_sampling_kind)
     # nothing else can be said in times that are not seconds
-    found = list(_units_of_time(recording)) or chain(
+    found = [*_few_samples(recording), *_units_of_time(recording)] or chain(
         _common_clock(recording),
         _dropped(recording, driving),
         _velocities(recording),
@@ -139,6 +139,14 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
                 advice += f" (divide by {1 / size:.0e})"
                 break
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
+
+
+def _few_samples(recording: Recording) -> Iterator[Issue]:
+    for group in recording.joint_and_point_groups:
+        count, least = len(group.t), QUALITY_LIMITS.min_samples
+        if count < least:
+            what, advice = f"{group.name} has {count_with_noun(count, 'sample')}", "record some seconds of motion"
+            yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 
 def _common_clock(recording: Recording) -> Iterator[Issue]:

@@ -36,6 +36,7 @@ class _QualityLimits:
     min_stuck_samples: int = 12
     max_unseen_rotation: float = 0.03
     min_clipped_samples: int = 8
+    min_samples: int = 8
     min_joint_motion: float = 0.01
     min_point_travel: float = 0.002
     min_shared_samples: int = 50
@@ -91,6 +92,7 @@ ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = {
     "clock_jump": "the clock jumps",
     "gap": "a gap in what drives the model",
     "dropped_samples": "many samples are missing",
+    "few_samples": "too few samples",
     "standstill": "nothing moves",
     "stuck": "a channel repeats one value",
     "quantised": "a channel has steps larger than its noise",

@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from yid_ocp.data import Recording
+from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS
 from yid_ocp.data.readers import FilePreview
+from yid_ocp.data.readers.base import mean_sample_rate
 from yid_ocp.inference.uncertainty import goodness_of_fit_message
+from yid_ocp.sensors.base import channel_kinds_for_group_name
 
 TableRows = list[Sequence[str]]
 _StatementKind = Literal["note", "verdict", "conclusion"]
@@ -186,9 +188,22 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 def recording_summary_lines(recording: Recording) -> list[str]:
     """Text lines on the contents of a recording."""
-    rows = [(group.name, str(len(group.t)), ", ".join(group.names)) for group in recording.all_groups]
-    table = aligned_table_lines([("group", "samples", "names"), *rows])
+    rows: TableRows = [("group", "samples", "Hz", "s", "channels", "names")]
+    for group in recording.all_groups:
+        rate, span = mean_sample_rate(group.t), f"{group.t[-1] - group.t[0]:.4g}"
+        sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", span
+        rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), ", ".join(group.names)))
+    table = aligned_table_lines(rows)
     return [*table, "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
+
+
+def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) -> list[str]:
+    if isinstance(group, JointGroup):
+        return [f"{name} [{JOINT_CHANNEL_UNITS[name]}]" for name in group.values_by_channel]
+    if isinstance(group, PointGroup):
+        return ["position [m]"]
+    kinds = {kind.quantity: kind.unit for kind in channel_kinds_for_group_name(group.name)}
+    return [f"{name} [{kinds[name]}]" for name in group.values_by_quantity]
 
 
 def third_party_file_summary_lines(contents: FilePreview) -> list[str]:

@@ -138,11 +138,14 @@ def propose_config_choices(
 
     `ConfigError` where no recorded joint is in the URDF, or there is no such frame; others as `read_urdf`.
     """
+    allowed = "joint states of the robot, which say how it was moved"
+    for other in recordings:
+        if other.joints is None:
+            hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
+            raise ConfigError("the recording has no joints", where=other.name, allowed=allowed, hint=hint)
     first = recordings[0]
     recorded = first.joints
-    if recorded is None:
-        allowed = "joint states of the robot, which say how the object was moved"
-        raise ConfigError("the recording has no joints", where=first.name, allowed=allowed)
+    assert recorded is not None
     whole = read_urdf(robot)
     known = [name for name in whole.joint_names if name in recorded.names]
     if not known:

@@ -1,8 +1,9 @@
-"""The command `import`: converts files of other tools to a recording, or previews their contents."""
+"""The command `import`: converts files of other tools to a recording, merges several, or previews their contents."""
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
@@ -12,16 +13,32 @@ from typing import Any
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, preview_file, read_any, write_recording
-from yid_ocp.data.readers.base import parse_quantity_units
-from yid_ocp.errors import ConfigError
+from yid_ocp.data.checks import recording_quality_issues
+from yid_ocp.data.merge import merge_recordings
+from yid_ocp.data.readers import reader_option_names
+from yid_ocp.data.readers.base import (
+    CURRENT_UNITS,
+    SelectionAndUnitOptions,
+    convert_to_si_and_validate,
+    guess_units,
+    parse_quantity_units,
+)
+from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.files import named_attributes
 from yid_ocp.progress import Progress
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
+from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
 _LISTS = ("joint_topics", "joints")
-_MAPPINGS: Mapping[str, type] = {"points": str, "columns": str, "torque_constants": float, "gears": float}
+_MAPPINGS: Mapping[str, type] = {
+    "points": str,
+    "columns": str,
+    "torque_constants": float,
+    "gears": float,
+    "clock_offsets": float,
+}
 _SINGLE = (
     "command_topic",
     "pose_axis_point_distance",
@@ -33,28 +50,15 @@ _SINGLE = (
     "point_sensor_name",
     "frame",
 )
-_FLAGS = {"joint_topics": "--joint-topic"}  # of options whose flag is not their name
+_FLAGS = {"joint_topics": "--joint-topic", "clock_offsets": "--clock-offset"}  # of options whose flag is not their name
 _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `import` and return its exit code."""
-    file, asked = arguments.file, reader_options_from_arguments(arguments)
+    files, asked = arguments.files, reader_options_from_arguments(arguments)
     if arguments.preview:
-        with stderr_progress_display(arguments) as progress:
-            progress.begin_stage(f"reading {file}")
-            contents = preview_file(file, progress)
-        if arguments.json:
-            keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
-            sources = [named_attributes(own, keys) for own in contents.sources]
-            told = {"sources": sources, "options": contents.reader_options, "notes": contents.notes}
-            print_json({"format": _RESULT_FORMAT, "recording": None, **told})
-            return EXIT_DONE
-        lines = third_party_file_summary_lines(contents)
-        if not has_native_recording_suffix(file):
-            lines += ["", "to import it:", f"  {_import_command_line(file, {**contents.reader_options, **asked})}"]
-        print("\n".join(lines))
-        return EXIT_DONE
+        return _preview(arguments, asked)
     if arguments.out is None:
         allowed = "--out RECORDING.h5, or --preview to look only"
         raise ConfigError("nothing says where to write the recording", where="--out", allowed=allowed)
@@ -62,12 +66,123 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
     with stderr_progress_display(arguments) as progress:
         options = {name: value for name, value in said.items() if value is not None} | asked
-        recording = read_third_party_recording(file, options, progress)
+        offsets = options.pop("clock_offsets", None)
+        if len(files) > 1:
+            recording = replace(_merged(files, options, offsets, progress), name=Path(arguments.out).stem)
+        elif offsets:
+            raise ConfigError("a clock offset is between files, and there is one", where="--clock-offset")
+        else:
+            recording = read_third_party_recording(files[0], options, progress)
         write_recording(recording, arguments.out)
-    out = arguments.out
-    result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording)}
-    print_result(arguments, result, lambda: recording_summary_lines(recording), f"recording: {out}", out)
+    out, doubts = arguments.out, recording_doubt_lines(recording)
+    result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording), "doubts": doubts}
+    lines = [*recording_summary_lines(recording), *doubts]
+    print_result(arguments, result, lambda: lines, f"recording: {out}", out)
     return EXIT_DONE
+
+
+def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
+    """Print what files hold, what each would become, and the command that imports it where one does."""
+    found, said = list[dict[str, Any]](), list[str]()
+    for file in arguments.files:
+        with stderr_progress_display(arguments) as progress:
+            progress.begin_stage(f"reading {file}")
+            contents = preview_file(file, progress)
+            keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
+            sources = [named_attributes(own, keys) for own in contents.sources]
+            options = {**contents.reader_options, **asked}
+            found.append({"sources": sources, "options": contents.reader_options, "notes": contents.notes})
+            lines = third_party_file_summary_lines(contents)
+            if not has_native_recording_suffix(file):
+                lines += _proposal_lines([file], options, progress)
+        said += [*([f"{file}:"] if len(arguments.files) > 1 else []), *lines, ""]
+    if len(arguments.files) > 1:
+        options = _combined([*(own["options"] for own in found), asked])
+        with stderr_progress_display(arguments) as progress:
+            said += _proposal_lines(arguments.files, options, progress)
+    if arguments.json:
+        more = found[0] if len(found) == 1 else {"files": dict(zip(arguments.files, found, strict=True))}
+        print_json({"format": _RESULT_FORMAT, "recording": None, **more})
+    else:
+        print("\n".join(said).rstrip())
+    return EXIT_DONE
+
+
+def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Options of several files together, the entries of mappings and lists one after another."""
+    combined: dict[str, Any] = {}
+    for name, value in ((name, value) for options in proposals for name, value in options.items()):
+        held = combined.get(name)
+        if isinstance(value, Mapping):
+            combined[name] = {**(held or {}), **value}
+        elif isinstance(value, (list, tuple)):
+            combined[name] = [*(held or ()), *(entry for entry in value if entry not in (held or ()))]
+        else:
+            combined[name] = value
+    return combined
+
+
+def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: Progress) -> list[str]:
+    """The command that imports files, tried, and doubts about what it would make; else what is missing."""
+    try:
+        if len(files) > 1:
+            own = {name: value for name, value in options.items() if name != "clock_offsets"}
+            recording = _merged(files, own, options.get("clock_offsets"), progress)
+        else:
+            recording = read_any(files[0], progress=progress, **options)
+    except DataError as error:
+        more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
+        return ["", f"to import it, something has to be said first: {error.what}", *more]
+    doubts = recording_doubt_lines(recording)
+    what = "it" if len(files) == 1 else "them as one recording"
+    return [*doubts, "", f"to import {what}:", f"  {_import_command_line(files, options)}"]
+
+
+def recording_doubt_lines(recording: Recording) -> list[str]:
+    """Sentences on what a recording by itself makes doubtful: units, clocks, few samples, no motion, channels."""
+    found = recording_quality_issues(recording, lambda group: SensorOptions())
+    said = [f"in doubt ({issue.certainty_word}): {issue.what}; {issue.advice}" for issue in found]
+    known = {issue.cause for issue in found}
+    units, reasons = guess_units(recording)
+    for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
+        if not (quantity == "t" and "time_unit" in known):
+            said.append(f"in doubt (likely): {reason}; import again with --units {quantity}={unit}")
+    return ["", *said] if said else []
+
+
+def _merged(
+    files: Sequence[str], options: Mapping[str, Any], offsets: Mapping[str, float] | None, progress: Progress
+) -> Recording:
+    """One recording of several files; an option counts for every file whose format or columns know it.
+
+    Joints and points are chosen, and currents become torques, once all are together.
+    """
+    known = {file: () if has_native_recording_suffix(file) else reader_option_names(file) for file in files}
+    for name in options:
+        if not any(name in own for own in known.values()):
+            raise DataError(f"none of the files takes the option '{name}'", where=_flag(name), hint="leave it out")
+    late = {name: options[name] for name in ("joints", "points", "torque_constants", "gears") if name in options}
+    units = dict(options.get("units") or {})
+    if units.get("effort") in CURRENT_UNITS:
+        late["units"] = {"effort": units.pop("effort")}
+    columns, matched = options.get("columns") or {}, set[str]()
+    parts = []
+    for file in files:
+        own = {name: value for name, value in options.items() if name in known[file] and name not in late}
+        own |= {"units": units} if units and "units" in known[file] else {}
+        if columns and "columns" in known[file]:
+            names = [source.name for source in preview_file(file).sources]
+            own["columns"] = {key: value for key, value in columns.items() if fnmatch.filter(names, key)}
+            matched |= set(own["columns"])
+        parts.append(read_third_party_recording(file, own, progress))
+    if missing := set(columns) - matched:
+        raise DataError(f"no file has a column '{min(missing)}'", where="--columns", hint="--preview lists them")
+    stems = [Path(file).stem for file in files]
+    if len(set(stems)) < len(stems):
+        raise DataError("two of the files have one name", where=", ".join(files), hint="rename one of them")
+    parts = [replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)]
+    merged = merge_recordings(parts, offsets)
+    return convert_to_si_and_validate(merged, ", ".join(files), SelectionAndUnitOptions(**late))
 
 
 def recording_contents_summary(recording: Recording) -> dict[str, Any]:
@@ -126,8 +241,8 @@ def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
     return pairs
 
 
-def _import_command_line(file: str | Path, options: Mapping[str, Any]) -> str:
-    words = ["yid-ocp", "import", str(file)]
+def _import_command_line(files: Sequence[str], options: Mapping[str, Any]) -> str:
+    words = ["yid-ocp", "import", *map(str, files)]
     for key, value in options.items():
         if isinstance(value, bool):
             words += [_SWITCHES[key, value]] if (key, value) in _SWITCHES else []
@@ -140,4 +255,4 @@ def _import_command_line(file: str | Path, options: Mapping[str, Any]) -> str:
         elif isinstance(value, Mapping):
             text = ",".join(f"{name}={entry}" for name, entry in value.items())
         words += [_flag(key), text]
-    return shlex.join([*words, "--out", f"{Path(file).stem}.h5"])
+    return shlex.join([*words, "--out", f"{Path(files[0]).stem}{'_merged' if len(files) > 1 else ''}.h5"])

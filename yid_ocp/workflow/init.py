@@ -59,7 +59,10 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     lines = _config_lines(where, about, item, proposal, files, options)
     _write(out, "\n".join(lines) + "\n", written)
     result = {"format": "yid-init/1", "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
-    print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))
+    doubts = [line for own in recordings for line in import_recording.recording_doubt_lines(own) if line]
+    print_result(
+        arguments, result, lambda: [*_summary_lines(proposal, out), *doubts], f"configuration: {out}", str(out)
+    )
     return EXIT_DONE
 
 

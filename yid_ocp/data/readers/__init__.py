@@ -35,17 +35,22 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     """
     path = Path(path)
     known_as = _format_of(path)
-    reader = READERS[known_as]
+    reader, known = READERS[known_as], reader_option_names(path)
     parameters = inspect.signature(reader).parameters
     default = parameters["options"].default if "options" in parameters else None
-    names = [entry.name for entry in fields(default)] if default else parameters
-    known = [name for name in names if name not in ("path", "progress")]
     for name in options:
         if name not in known:
             what = f"the reader of '{known_as}' files has no option '{name}'"
             raise DataError(what, where=str(path), **unknown_name_error_arguments(name, known))
     given = {"options": replace(default, **options)} if default else options
     return reader(path, **given, **_told(reader, progress))
+
+
+def reader_option_names(path: str | os.PathLike[str]) -> list[str]:
+    """Names of the options that `read_any` takes for a file or folder of its format; errors as `read_any`."""
+    parameters = inspect.signature(READERS[_format_of(Path(path))]).parameters
+    names = [entry.name for entry in fields(parameters["options"].default)] if "options" in parameters else parameters
+    return [name for name in names if name not in ("path", "progress")]
 
 
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:

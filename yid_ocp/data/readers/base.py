@@ -60,7 +60,8 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
     "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60},
     "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "A": 1.0, "mA": 1e-3},
 }
-_CURRENTS = ("A", "mA")
+CURRENT_UNITS = ("A", "mA")
+"""Units of `effort` that are a motor's current."""
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
 _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 """Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
@@ -204,7 +205,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
                 raise DataError(what, where=where, **unknown_name_error_arguments(pattern, names))
             if not (math.isfinite(value) and value != 0):
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed="a number that is not zero")
-    if _spaceless((options.units or {}).get("effort", "")) not in _CURRENTS:
+    if _spaceless((options.units or {}).get("effort", "")) not in CURRENT_UNITS:
         if constants or gears:
             what = "torque constants or gears are given, but the efforts are no currents"
             allowed = "units effort=A or effort=mA beside them"

@@ -9,7 +9,7 @@ import re
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
@@ -17,6 +17,14 @@ from typing import Any, TextIO
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
+from yid_ocp.data.column_names import (
+    AXES,
+    MOUNTED_SENSOR_CHANNELS,
+    SENSOR_COMPONENTS,
+    ColumnMeaning,
+    column_meanings,
+)
+from yid_ocp.data.mocap_tables import MocapTable, mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -28,19 +36,7 @@ from yid_ocp.data.recording import (
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
-from yid_ocp.sensors import CHANNEL_KINDS
 
-_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
-_NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
-"""What Isaac Sim's system identification calls the columns of joints 1, 2, ..., whatever the case."""
-_AXES = ("x", "y", "z")
-_Meaning = tuple[str, str] | None
-"""Of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None for one to leave out."""
-_MOUNTED = [
-    channel for key in CHANNEL_KINDS if (channel := CHANNEL_KINDS[key]).components and channel.group != "points"
-]
-_COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
-"""Components of vectors that sensors on a link read, such as `force_x`."""
 _MOST_BAD = 0.5  # of a table's lines; beyond it the table is not understood at all
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # in cells: what a line takes beside them
@@ -58,7 +54,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     columns: Mapping[str, str] | None = None
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # leave out lines that are no rows of numbers, and count them in `notes`
-    delimiter: str = ","  # one character between cells
+    delimiter: str = ""  # one character between cells; found in the first line where empty
     clock: ClockKind = "recorded"  # whether the times were measured
     point_sensor_name: str = "unknown"  # what saw the points
     frame: str = "world"  # their frame of reference
@@ -68,27 +64,49 @@ class CsvOptions(base.SelectionAndUnitOptions):
 _DEFAULTS = CsvOptions()
 
 
-@base.READERS.register(".csv")
 def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> Recording:
     """Read a recording from a CSV table with one row per time; its points become one group `points`.
 
-    Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
-    `velocity_<joint>`, `effort_<joint>` and so on; `q1`, `dq1` and `cmd1` as in telemetry of Isaac Sim's system
-    identification, position, velocity and commanded position of joint 1; `<sensor>_force_x`, `<sensor>_torque_x` of a
-    wrist sensor, `<sensor>_angular_velocity_x`, `<sensor>_specific_force_x` of an inertial unit; else a point and an
-    axis, `<point>_x`, `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a
-    table has joints, points or such sensors together, a row in which all cells of one of them are empty is a time at
-    which only the others were measured.
+    Columns are understood by their names: `t`, `time` or `timestamp`; a channel and a joint, `q_<joint>`,
+    `position_<joint>`, `velocity_<joint>`, `effort_<joint>` and so on, also as other loggers write them: `pos_<joint>`,
+    `<joint>.vel`, `tau1`, `dq1`, `tau_J[0]`, `/joint_states/<joint>/effort`; a unit may follow, `time [ms]` or
+    `q1_deg`; `<sensor>_force_x`, `<sensor>_torque_x` of a wrist sensor, `<sensor>_angular_velocity_x`,
+    `<sensor>_specific_force_x` of an inertial unit; else a point and an axis, `<point>_x`, `<point>_y`, `<point>_z`.
+    Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are known by their headers; their points are in the
+    unit that the header states. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints,
+    points or such sensors together, a row in which all cells of one of them are empty is a time at which only the
+    others were measured.
 
     `DataError` where the file, a column, cell, option or unit cannot be understood, and as `validated_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
-    meanings, table, notes = _read_table(path, options)
-    raw = _raw(meanings, table, str(path), options)
     said = options.description, path.name, path.stem, digest
-    made = Recording(raw.joints, raw.points, *said, notes=notes, channel_groups=raw.channel_groups)
-    return base.convert_to_si_and_validate(made, str(path), options)
+    if (capture := _mocap_table(path)) is not None:
+        if options.columns:
+            what, hint = "the columns of a motion capture export are named by its header", "choose markers with points"
+            raise DataError(what, where=str(path), hint=hint)
+        sensor = capture.points.sensor if options.point_sensor_name == "unknown" else options.point_sensor_name
+        group = replace(capture.points, sensor=sensor, frame=options.frame)
+        made, units = Recording(None, (group,), *said, notes=capture.notes), {"points": capture.unit}
+    else:
+        meanings, units, table, notes = _read_table(path, options)
+        raw = _raw(meanings, table, str(path), options)
+        made = Recording(raw.joints, raw.points, *said, notes=notes, channel_groups=raw.channel_groups)
+    return base.convert_to_si_and_validate(made, str(path), replace(options, units={**units, **(options.units or {})}))
+
+
+def _mocap_table(path: Path) -> MocapTable | None:
+    """Contents of an export of a motion capture program; None where the table is none."""
+    delimiter = _delimiter(path)
+    read = mocap_table_reader(next(_rows(path, delimiter), (1, []))[1])
+    return None if read is None else read(_rows(path, delimiter), str(path))
+
+
+def _delimiter(path: Path) -> str:
+    """What stands between the cells of the first line that has several; a comma where nothing does."""
+    _, first = next(_rows(path, ","), (1, []))
+    return next((mark for mark in "\t; " if mark in first[0].strip()), ",") if len(first) == 1 else ","
 
 
 def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
@@ -98,8 +116,8 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     joint_names = tuple(dict.fromkeys(joint for _, joint in found))
     used = dict.fromkeys(["position", *(channel for channel, _ in found)]) if found else {}
     channels = {name: _gather(meanings, table, [(name, joint) for joint in joint_names], where) for name in used}
-    point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in _AXES))
-    wanted = [(axis, name) for name in point_names for axis in _AXES]
+    point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in AXES))
+    wanted = [(axis, name) for name in point_names for axis in AXES]
     position = _gather(meanings, table, wanted, where).reshape(len(table), len(point_names), 3)
     mounted = _mounted_sensors(meanings, table, where)
     is_alone = bool(joint_names) + bool(point_names) + len(mounted) < 2
@@ -129,11 +147,13 @@ def _mounted_sensors(
 ) -> dict[str, tuple[tuple[str, ...], dict[str, Array]]]:
     """Names of sensors on links, and values (M, k, components) by quantity, by group."""
     found: dict[str, tuple[tuple[str, ...], dict[str, Array]]] = {}
-    for channel in _MOUNTED:
+    for channel in MOUNTED_SENSOR_CHANNELS:
         parts = [f"{channel.quantity}_{axis}" for axis in channel.components]
         if not any(kind in parts for kind, _ in meanings):
             continue
-        of_group = [f"{c.quantity}_{axis}" for c in _MOUNTED if c.group == channel.group for axis in c.components]
+        of_group = [
+            f"{c.quantity}_{axis}" for c in MOUNTED_SENSOR_CHANNELS if c.group == channel.group for axis in c.components
+        ]
         names = tuple(dict.fromkeys(name for kind, name in meanings if kind in of_group))
         values = _gather(meanings, table, [(part, name) for name in names for part in parts], where)
         held = found.setdefault(channel.group, (names, {}))[1]
@@ -141,15 +161,17 @@ def _mounted_sensors(
     return found
 
 
-@base.FILE_PREVIEWERS.register(".csv")
 def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     """What a table holds: columns, what their names say, and units that its values look like."""
     path = Path(path)
     file_sha256(path)
-    options, first = dict[str, Any](), next(_rows(path, ","), (1, []))[1]
-    delimiter = next((mark for mark in ";\t " if mark in first[0].strip()), ",") if len(first) == 1 else ","
-    if delimiter != ",":
-        options["delimiter"] = delimiter
+    if (capture := _mocap_table(path)) is not None:
+        group = capture.points
+        count, rate = np.isfinite(group.position).all(axis=2).sum(axis=0), base.mean_sample_rate(group.t)
+        listed = zip(group.names, count, strict=True)
+        kept = (base.TopicOrColumnSummary(name, "marker", int(n), rate, f"point {name}") for name, n in listed)
+        return base.FilePreview(tuple(kept), {}, capture.notes)
+    options, delimiter = dict[str, Any](), _delimiter(path)
     lines = _rows(path, delimiter)
     names = [cell.strip() for cell in next(lines, (1, []))[1]]
     head = next(lines, None)
@@ -175,14 +197,11 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
     if bad:
         options["skip_bad_lines"] = True
-    meanings = [_conventional_meaning(name) for name in names]
+    meanings, said = column_meanings(names)
     if "header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
         meanings[0] = ("t", "")
-    unknown = {}
-    for name, meaning, ok in zip(names, meanings, numeric, strict=True):
-        if not meaning:  # one to be filled in
-            guess = "CHANNEL:JOINT" if name.isdecimal() else f"CHANNEL:{name}"
-            unknown[name] = guess if ok else base.SKIPPED_COLUMN_MEANING
+    meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # of two alike, the first
+    unknown = {name: base.SKIPPED_COLUMN_MEANING for name, meaning in zip(names, meanings, strict=True) if not meaning}
     if "header" in options and meanings[0]:
         unknown = {names[0]: "t", **unknown}
     if unknown:
@@ -192,7 +211,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     sources = []
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
-        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "its name does not say what it is"
+        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out: its name says nothing"
         rate = base.mean_sample_rate(t) if ok else math.nan
         sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
     notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
@@ -201,10 +220,16 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         units, why = base.guess_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
+    notes += [f"{quantity} is in {unit}, by the header" for quantity, unit in said.items()]
+    units = {quantity: unit for quantity, unit in units.items() if quantity not in said}
     if units:
         options["units"] = units
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
+
+for _suffix in (".csv", ".tsv", ".txt"):
+    base.READERS.register(_suffix)(read_csv)
+    base.FILE_PREVIEWERS.register(_suffix)(_preview_csv)
 
 _ALLOWED = "one header row with names such as t, q_<joint>, effort_<joint>, <point>_x"
 
@@ -240,9 +265,11 @@ def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
         yield line
 
 
-def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]], Array, tuple[str, ...]]:
-    """The columns that mean something: meanings, table, shape (rows, columns), in its own units, and what was bad."""
-    lines = _rows(path, options.delimiter)
+def _read_table(
+    path: Path, options: CsvOptions
+) -> tuple[list[tuple[str, str]], dict[str, str], Array, tuple[str, ...]]:
+    """The columns that mean something: meanings, units of the header, table (rows, columns), and what was bad."""
+    lines = _rows(path, options.delimiter or _delimiter(path))
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
@@ -250,7 +277,7 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
     if not options.header:
         names = [str(i + 1) for i in range(len(first))]
         lines = chain([(number, first)], lines)
-    meanings = _meanings(names, options.columns or {}, f"{path}, line {number}")
+    meanings, units = _meanings(names, options.columns or {}, f"{path}, line {number}")
     for line, cells in lines:
         try:
             numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))
@@ -272,7 +299,7 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
     if bad:
         listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
         notes = (f"{len(bad)} of {n_lines} lines were bad and left out (line {listed})",)
-    return [meaning for meaning in meanings if meaning], table, notes
+    return [meaning for meaning in meanings if meaning], units, table, notes
 
 
 def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> None:
@@ -302,7 +329,7 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Meaning], where: str) -> list[float]:
+def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
     if len(cells) != len(header):
         raise DataError(f"the row has {len(cells)} cells", where=where, allowed=f"{len(header)} cells, as the header")
     numbers = []
@@ -316,7 +343,10 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Me
     return numbers
 
 
-def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> list[_Meaning]:
+def _meanings(
+    header: Sequence[str], columns: Mapping[str, str], where: str
+) -> tuple[list[ColumnMeaning], dict[str, str]]:
+    """Meaning of every column, given or by its name, and the units that names state."""
     given: dict[str, str] = {}
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         pattern = re.escape(key).replace(r"\*", "(.*)")
@@ -326,14 +356,16 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             raise DataError(what, where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
-    meanings: dict[str, _Meaning] = {}
+    meanings: dict[str, ColumnMeaning] = {}
     meant: dict[tuple[str, str], str] = {}
-    for name in header:
-        own = _given_meaning(name, given[name], where) if name in given else _conventional_meaning(name)
+    by_name, units = column_meanings(header)
+    for name, conventional in zip(header, by_name, strict=True):
+        own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name not in given:
-            allowed = f"t, {', '.join(f'{prefix}<joint>' for prefix in _PREFIXES)}, <point>_x, <point>_y, <point>_z"
-            skipped = f"{name}={base.SKIPPED_COLUMN_MEANING} to leave it out"
-            hint = f"rename it, or say what it is: columns {name}=position:JOINT, or {skipped}"
+            channels = ", ".join(f"{channel}_<joint>" for channel in JOINT_CHANNEL_UNITS)
+            allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z"
+            skipped = f"{name}={base.SKIPPED_COLUMN_MEANING} to leave it out (--preview proposes that)"
+            hint = f"rename it, or say what it is: --columns {name}=position:JOINT, or {skipped}"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' mean the same, {' '.join(own).strip()}"
@@ -343,32 +375,16 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         meanings[name] = own
     if ("t", "") not in meant:
         raise DataError("the table has no column of times", where=where, allowed="t or time", hint="columns NAME=t")
-    return list(meanings.values())
+    return list(meanings.values()), units
 
 
-def _conventional_meaning(column: str) -> _Meaning:
-    if column.lower() in ("t", "time"):
-        return "t", ""
-    numbered = re.fullmatch(r"([a-z]+)([1-9]\d*)", column.lower())
-    if numbered and numbered[1] in _NUMBERED:
-        return _NUMBERED[numbered[1]], numbered[2]
-    for prefix in sorted(_PREFIXES, key=len, reverse=True):
-        if column.startswith(prefix) and column != prefix:
-            return _PREFIXES[prefix], column.removeprefix(prefix)
-    for component in sorted(_COMPONENTS, key=len, reverse=True):
-        if (name := column.removesuffix(f"_{component}")) not in ("", column):
-            return component, name
-    point, _, axis = column.rpartition("_")
-    return (axis, point) if point and axis in _AXES else None
-
-
-def _given_meaning(column: str, given: str, where: str) -> _Meaning:
+def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
     if given == base.SKIPPED_COLUMN_MEANING:
         return None
     if given == "t":
         return "t", ""
     kind, _, name = given.partition(":")
-    known = (*JOINT_CHANNEL_UNITS, *_AXES, *_COMPONENTS)
+    known = (*JOINT_CHANNEL_UNITS, *AXES, *SENSOR_COMPONENTS)
     if not name or kind not in known:
         what, choice = f"column '{column}' is given the meaning '{given}'", f"one of {', '.join(known)}"
         allowed = (

@@ -1,0 +1,217 @@
+"""Merging recordings of one run by several devices, such as a robot's joints and a motion capture system's points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import signal
+
+from yid_ocp.arrays import Array
+from yid_ocp.data.issues import median_sample_period
+from yid_ocp.data.readers.base import mean_sample_rate, merge_on_fastest_clock
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
+from yid_ocp.errors import DataError, unknown_name_error_arguments
+
+_MIN_SHARED_FRACTION = 0.5  # of the shorter recording; two clocks that overlap by less are taken as unrelated
+_MIN_EXPLAINED = 0.9  # of the points' motion by the joints, from which on it says how two clocks lie
+_MAX_LEFT_RATIO = 0.7  # of what is left unexplained with and without a lag, below which the lag is said
+_MIN_SAID_LAG = 0.02  # [s]
+_LAG_SEARCH = 0.3  # of a sensor on a shared clock, and around what speeds say [s]
+_MIN_TURN, _MIN_TRAVEL, _MIN_SAMPLES, _MIN_SEEN_FRACTION = 0.05, 0.005, 20, 0.5  # [rad], [m]
+_LARGEST_START = 1e6  # from which on times are counted from the first sample [s]
+
+
+class _MotionLag(NamedTuple):
+    """How much later points move than joints [s], and the share of their motion that angles explain there."""
+
+    lag: float
+    explained: float
+
+
+def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str, float] | None = None) -> Recording:
+    """Merge recordings of one run into one, named after the first, with notes on clocks, offsets and interpolation.
+
+    Clocks that overlap are one clock, and nothing is shifted; if points then move later or earlier than the joints, a
+    note says by how much. Clocks that have nothing in common are aligned by the motion, where the angles explain the
+    positions. Joints of several recordings come to the fastest clock; points and other sensors keep theirs.
+
+    Parameters
+    ----------
+    clock_offsets : mapping of recording name to float, optional
+        What is added to its times [s]; such a recording is not aligned by anything else.
+
+    `DataError` where two recordings have a joint in common, clocks cannot be aligned, or an offset names no recording.
+    """
+    offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
+    where = ", ".join(names)
+    for name in offsets:
+        if name not in names:
+            what = f"a clock offset is given for '{name}', which is no file of these"
+            raise DataError(what, where="clock_offsets", **unknown_name_error_arguments(name, names))
+    lead = next((recording for recording in recordings if recording.joints is not None), recordings[0])
+    first = _with_times_shifted(lead, offsets.get(lead.name, 0.0))
+    shifted, notes = list[Recording](), list[str]()
+    for recording in recordings:
+        if recording.name in offsets:
+            shift, said = offsets[recording.name], "as asked"
+        else:
+            shift, said = (0.0, "") if recording is lead else _shift(first, recording)
+        if said:
+            notes.append(f"times of {recording.name} were shifted by {shift:+.10g} s: {said}" if shift else said)
+        shifted.append(_with_times_shifted(recording, shift))
+    begin = min(float(group.t[0]) for recording in shifted for group in recording.all_groups)
+    if abs(begin) > _LARGEST_START:
+        shifted = [_with_times_shifted(recording, -begin) for recording in shifted]
+        notes.append(f"times count from the first sample, at {begin:.9g} s")
+    joints, more = _merged_joints([(r.name, r.joints) for r in shifted if r.joints is not None], where)
+    own = [note for recording in recordings for note in recording.notes]
+    merged = Recording(
+        joints,
+        _with_unique_names(shifted, [r.points for r in shifted]),
+        next((r.description for r in recordings if r.description), ""),
+        "; ".join(r.source for r in recordings if r.source),
+        recordings[0].name,
+        notes=(*own, *notes, *more),
+        channel_groups=_with_unique_names(shifted, [r.channel_groups for r in shifted]),
+    )
+    return validated_recording(merged, where=where)
+
+
+def _span(recording: Recording) -> tuple[float, float]:
+    clocks = [group.t for group in recording.all_groups]
+    return float(min(t[0] for t in clocks)), float(max(t[-1] for t in clocks))
+
+
+def _shift(first: Recording, other: Recording) -> tuple[float, str]:
+    """What to add to the times of `other`, and why; `DataError` where nothing says."""
+    (begin, end), (start, stop) = _span(first), _span(other)
+    overlap = min(end, stop) - max(begin, start)
+    shared = overlap >= _MIN_SHARED_FRACTION * min(end - begin, stop - start)
+    said = f"{first.name} and {other.name} are taken as on one clock: they have {overlap:.4g} s in common"
+    seen, joints = _seen_path(other), first.joints
+    best = at_zero = None
+    if seen is not None and joints is not None and len(joints.t) >= _MIN_SAMPLES:
+        t, path = seen[0] + (0.0 if shared else begin - start), seen[1]
+        period = max(0.005, median_sample_period(joints.t), median_sample_period(t))
+        coarse = _speed_lag(_speed(joints.t, joints.position, period), _speed(t, path, period), period)
+        found = [_motion_lag(joints, t, path, period, around) for around in ((0.0, coarse) if shared else (coarse,))]
+        best = max((one for one in found if one is not None), key=lambda one: one.explained, default=None)
+        at_zero = _motion_lag(joints, t, path, period, 0.0, reach=0.0)
+    if shared:
+        if best is None or best.explained < _MIN_EXPLAINED or abs(best.lag) < _MIN_SAID_LAG:
+            return 0.0, said
+        if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
+            late = f"{abs(best.lag):.2g} s {'later' if best.lag > 0 else 'earlier'}"
+            said += f"; its points follow the angles best {late} ({best.explained:.1%} of the motion): the sensor is "
+            said += f"late, the object swings behind, or clocks differ (--clock-offset {other.name}={-best.lag:.2g})"
+        return 0.0, said
+    if best is None or best.explained < _MIN_EXPLAINED:
+        spans = f"{first.name} has {begin:.10g} to {end:.10g} s, {other.name} {start:.10g} to {stop:.10g} s"
+        what = f"the clocks of {first.name} and {other.name} have nothing in common"
+        hint = f"--clock-offset {other.name}=SECONDS adds to its times; {begin - start:.10g} lets both begin at once"
+        raise DataError(what, where=spans, allowed="clocks that overlap, or motion that both saw", hint=hint)
+    why = "the clocks have nothing in common, and there its points follow the angles best "
+    why += f"({best.explained:.1%} of the motion), to some hundredths of a second, which are left to `check`"
+    return begin - start - best.lag, why
+
+
+def _motion_lag(
+    joints: JointGroup, t: Array, path: Array, period: float, around: float, reach: float = _LAG_SEARCH
+) -> _MotionLag | None:
+    """Lag near `around` at which positions (M, columns) at times t fit a linear function of the angles best.
+
+    None for little data. `reach` is how near [s]. Kinematics are not linear, but more terms would fit a periodic motion
+    at any lag.
+    """
+    moving = joints.position[:, np.ptp(joints.position, axis=0) > _MIN_TURN]
+    lags = around + period * np.arange(-round(reach / period), round(reach / period) + 1)
+    inside = (t - lags[-1] > joints.t[0]) & (t - lags[0] < joints.t[-1])
+    if not moving.shape[1] or inside.sum() < max(_MIN_SAMPLES, 5 * moving.shape[1]):
+        return None
+    t, path = t[inside], path[inside] - path[inside].mean(axis=0)
+    explained = []
+    for lag in lags:
+        q = np.stack([np.interp(t - lag, joints.t, column) for column in moving.T], axis=1)
+        q -= q.mean(axis=0)
+        left = path - q @ np.linalg.lstsq(q, path, rcond=1e-9)[0]
+        explained.append(1.0 - float(np.sum(left**2) / np.sum(path**2)))
+    best = int(np.argmax(explained))
+    return _MotionLag(float(lags[best]), explained[best])
+
+
+def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
+    """Times and coordinates (M, columns) of the points that were seen most of the time, where all of these were."""
+    for group in recording.points:
+        whole = group.position.reshape(len(group.t), -1)
+        whole = whole[:, np.isfinite(whole).mean(axis=0) > _MIN_SEEN_FRACTION]
+        rows = np.isfinite(whole).all(axis=1)
+        if whole.shape[1] and rows.sum() >= _MIN_SAMPLES and np.ptp(whole[rows], axis=0).max() > _MIN_TRAVEL:
+            return group.t[rows], whole[rows]
+    return None
+
+
+def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) -> float:
+    """How much later one speed on an even clock goes as another [s], from values and times of the first samples."""
+    (x, x_start), (y, y_start) = a, b
+    lags = signal.correlation_lags(len(y), len(x))
+    ones_x, ones_y = np.ones(len(x)), np.ones(len(y))
+    count, sum_x, sum_y, sum_xx, sum_yy, sum_xy = (
+        signal.correlate(second, first, method="fft")
+        for first, second in ((ones_x, ones_y), (x, ones_y), (ones_x, y), (x * x, ones_y), (ones_x, y * y), (x, y))
+    )
+    n = np.maximum(np.rint(count), 1.0)
+    spread = np.sqrt(np.maximum((sum_xx - sum_x**2 / n) * (sum_yy - sum_y**2 / n), 1e-12))
+    enough = n >= _MIN_SHARED_FRACTION * min(len(x), len(y))
+    correlation = np.where(enough, (sum_xy - sum_x * sum_y / n) / spread, -math.inf)
+    return float(lags[int(np.argmax(correlation))] * period + (y_start - x_start))
+
+
+def _speed(t: Array, values: Array, period: float) -> tuple[Array, float]:
+    """Speed of all columns together on an even clock, smoothed over 50 ms, and the time at which it begins."""
+    even = np.arange(t[0], t[-1], period)
+    path = np.stack([np.interp(even, t, column) for column in values.T], axis=1)
+    width = max(1, round(0.05 / period))
+    path = np.apply_along_axis(np.convolve, 0, path, np.ones(width) / width, "valid")
+    return np.linalg.norm(np.diff(path, axis=0), axis=1) / period, float(t[0] + 0.5 * width * period)
+
+
+def _with_times_shifted(recording: Recording, shift: float) -> Recording:
+    def moved(group: Any) -> Any:
+        return replace(group, t=group.t + shift)
+
+    if not shift:
+        return recording
+    joints = None if recording.joints is None else moved(recording.joints)
+    points, channels = (tuple(map(moved, groups)) for groups in (recording.points, recording.channel_groups))
+    return replace(recording, joints=joints, points=points, channel_groups=channels)
+
+
+def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup | None, tuple[str, ...]]:
+    if not groups:
+        return None, ()
+    owners: dict[str, str] = {}
+    for source, joint in ((source, joint) for source, group in groups for joint in group.names):
+        if owners.setdefault(joint, source) != source:
+            what = f"the joint '{joint}' is in {owners[joint]} and in {source}"
+            hint = "import them one by one as recordings of their own, or keep other joints with --joints"
+            raise DataError(what, where=where, allowed="every joint in one file", hint=hint)
+    merged, notes = merge_on_fastest_clock(groups, where)
+    rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
+    return merged, notes if len(groups) == 1 else (f"joints: {rates}", *notes)
+
+
+def _with_unique_names(recordings: Sequence[Recording], groups: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
+    """Groups of all recordings; those of one name get that of their recording too."""
+    names = [group.name for group in chain.from_iterable(groups)]
+    made: list[PointGroup | SensorChannelGroup] = []
+    for recording, own in zip(recordings, groups, strict=True):
+        for group in own:
+            made.append(
+                group if names.count(group.name) == 1 else replace(group, name=f"{group.name}_{recording.name}")
+            )
+    return tuple(made)
