@@ -93,7 +93,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
     assert (set(channel), channel["unit"]) == ({"rmse", "unit", "n"}, "N m")
     assert 0.005 < channel["rmse"] < 0.02
     held_out = result["held_out"][0]
-    assert set(held_out) == {"recording", "rmse", "baselines"}
+    assert set(held_out) == {"recording", "rmse", "baselines", "expected"}
     assert held_out["rmse"]["joints.effort.shoulder"] < 0.1 * held_out["baselines"]["zero"]["joints.effort.shoulder"]
     assert len(result["inputs"]) == 4
     assert all(len(digest) == 64 for digest in result["inputs"].values())

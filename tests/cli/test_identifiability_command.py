@@ -129,7 +129,7 @@ def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(carri
     first = done.out.strip().splitlines()[0]
     assert first.startswith("the model does not explain the recordings (chi2 per degree of freedom is "), command
     assert first.endswith("run `yid-ocp diagnose`")
-    assert "not to be trusted" in done.out
+    assert "in doubt" in done.out
     result = done.result
     own = result["methods"]["gauss_newton"] if command == "compare" else result
     assert own["fit"]["explains"] is False

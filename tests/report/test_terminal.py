@@ -94,7 +94,7 @@ def test_a_solve_says_what_is_not_found():
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
     lost = solved(parameters={"a": parameter("not_identifiable") | {"std": None}, "b": parameter("identifiable")})
     lines = told("yid-solve/1", lost)
-    assert line_of(lines, "a").split() == ["a", "2", "N", "m/rad", "cannot", "be", "found", "3", "0", "to", "inf"]
+    assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "0", "to", "inf"]
     assert "±" not in "".join(lines[1:-4])
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
@@ -104,9 +104,15 @@ def test_a_solve_says_what_is_not_found():
 def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_but_for_a_better_guess():
     worse = {"recording": "run", "channel": "w_T2", "rmse": 0.05, "unit": "m", "baseline": "stays", "guess": 0.02}
     said = solved(fit=BAD, parameters={"a": parameter("not_trusted")})
-    first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7, 1 is noise alone): "
-    first += "no number is to be trusted; run `yid-ocp diagnose`"
-    assert told("yid-solve/1", said)[0] == first
+    first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7, 1 is noise alone); run "
+    first += "`yid-ocp diagnose`"
+    # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
+    lines = told("yid-solve/1", said)
+    numbers = "beyond this model these mean something, with the ± that the misfit implies: a = 2 ± 0.1 N m/rad"
+    assert lines[:2] == [first, numbers]
+    unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
+    assert "beyond this model no number means anything" in told("yid-solve/1", unsure)[1]
+    assert "beyond this model" not in told("yid-solve/1", unsure | {"fit": BAD | {"believed": False}})[1]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
     lines = told("yid-solve/1", said)
     assert lines[0] == "worse than a guess without a model: w_T2 of run, 50 mm against 20 mm (stays)"
@@ -114,8 +120,38 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in lines[:6]
     assert "the model does not explain the recordings, so agreement of methods says nothing of the truth" in lines
+    assert line_of(lines, "a  ").split()[-2:] == ["in", "doubt"]
     judgement = information(parameters={"a": judged("not_trusted")}, fit=BAD)
     assert told("yid-identifiability/1", judgement)[0] == first
+
+
+@pytest.mark.parametrize(
+    ("error", "noise", "fit", "said"),
+    [
+        (0.012, 0.010, GOOD, ": no gap, as torque errors of the stated size carry the motion away, by 10 mm (rms)"),
+        (0.012, 0.002, GOOD, ": a gap, as errors of sensors and torques explain 2 mm; run `yid-ocp diagnose`"),
+        (0.003, 0.002, GOOD, None),
+        (0.003, 0.002, BAD, "; noise makes 2 mm of it"),
+    ],
+)
+def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
+    channel = "points.p"
+    entry = {"recording": "r", "rmse": {channel: error}, "baselines": {"stays": {channel: 0.03}}}
+    residuals = {channel: {"rmse": 0.0018, "unit": "m", "n": 9}}
+    lines = told("yid-solve/1", solved(fit=fit, residuals=residuals, held_out=[entry | {"expected": {channel: noise}}]))
+    head = f"held out, points is predicted to {1e3 * error:.3g} mm (rms), 1.8 mm where it was fitted, beside 30 mm by "
+    text = " ".join(line.strip() for line in lines[:5])
+    assert (head in text) == (said is not None)
+    assert said is None or said in text
+
+
+def test_an_interval_is_shown_of_every_number_that_is_known():
+    """Where none is stated it follows from the ±, within the bounds."""
+    sure, near = parameter("identifiable"), parameter("weak", 0.1)
+    lines = told("yid-solve/1", solved(parameters={"a": sure, "b": near, "c": parameter("not_identifiable")}))
+    assert "1.804 to 2.196" in line_of(lines, "a")
+    assert "0 to 0.296" in line_of(lines, "b")
+    assert line_of(lines, "c").split()[1:4] == ["–", "0.1", "N"]
 
 
 def test_a_solve_says_which_estimates_a_finer_model_moves():

@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from small_problems import pendulum_step
+from small_problems import pendulum_step, taken
 
 from yid_ocp.analysis import baseline_comparison
+from yid_ocp.analysis.baseline_comparison import predict_held_out_with_expected_errors
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
@@ -242,3 +243,22 @@ def test_a_guess_is_not_judged_by_the_sample_that_made_it():
     assert np.isnan(guess[1, 3:]).all()
     assert np.array_equal(guess[1:, :3], np.ones((2, 3)))
     assert np.array_equal(guess[[0, 2], 3:], np.full((2, 3), 5.0))
+
+
+def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
+    """Errors of the stated size, drawn by the simulation: the root mean square of what they do is what is expected."""
+    step = pendulum_step(urdf_folder, driven=("shoulder",), prescribed=("elbow",))
+    source = taken(step, 1)
+    points = tuple(replace(group, std=1e-3) for group in source.points)
+    source = replace(source, joints=replace(source.joints, effort_bias_std=0.5), points=points)
+    options = ProblemOptions(path_cutoff=np.inf, arm_tracking_feedback="none")
+    truth = EstimationProblem(step, [source], ("elbow.mass",), options)
+    made = [replace(truth.simulate_synthetic_recording(seed=seed), name=f"held_{seed}") for seed in range(10)]
+    problem = EstimationProblem(step, [source], ("elbow.mass",), options, held_out=made)
+    pairs, expected = predict_held_out_with_expected_errors(problem, problem.initial_unknowns)
+    found = [baseline_comparison._prediction_error_entry(problem, *pair)["rmse"] for pair in pairs]
+    channel = next(name for name in expected["held_0"] if name.endswith(".tip"))
+    errors = np.sqrt(np.mean([own[channel] ** 2 for own in found]))
+    noise = np.sqrt(np.mean([own[channel] ** 2 for own in expected.values()]))
+    assert noise > 4e-3, "torques matter here more than sensors"
+    assert 0.6 < errors / noise < 1.6

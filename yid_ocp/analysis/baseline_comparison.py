@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.solvers import Solution
 
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
+_N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the torques
 _START_FRAMES = 2  # frames from which the baselines of a cable start, as its own start state does
 
 
@@ -65,6 +67,50 @@ def _prediction_error_entry(
             if errors := _errors(samples, predicted, fixed):
                 entry["baselines"].setdefault(name, {}).update(errors)
     return entry
+
+
+def predict_held_out_with_expected_errors(
+    problem: EstimationProblem, x: Array
+) -> tuple[list[tuple[Episode, EpisodePrediction | str]], dict[str, dict[str, float]]]:
+    """Held-out predictions as of `predict_held_out`, and the error that noise makes of each, by recording and channel.
+
+    Root mean square of what sensors add and of what torque errors as large as stated do to the motion, drawn a few
+    times. `x` is the unknown vector, shape (nx,).
+    """
+    predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
+    pairs: list[tuple[Episode, EpisodePrediction | str]] = []
+    expected: dict[str, dict[str, float]] = {}
+    for episode, theta, offset in problem.held_out_prediction_inputs(x):
+        outcome = predict(episode, theta, offset, False)
+        pairs.append((episode, outcome))
+        if isinstance(outcome, str):
+            continue
+        drawn: list[EpisodePrediction | str] = []
+        if (errors := episode.input_errors) is not None:
+            for _ in range(_N_TORQUE_ERROR_DRAWS):
+                samples = rng.standard_normal((int(errors.sample_of_step[-1]) + 1, len(errors.torque_std)))
+                white = errors.torque_std * samples[errors.sample_of_step]
+                bias = errors.torque_bias + errors.torque_bias_std * rng.standard_normal(len(errors.torque_std))
+                moved = replace(errors, torque_bias=bias, torque_noise=errors.torque_noise + white)
+                drawn.append(predict(replace(episode, input_errors=moved), theta, offset, False))
+        expected[episode.name] = _expected_errors(episode, outcome, drawn)
+    return pairs, expected
+
+
+def _expected_errors(
+    episode: Episode, outcome: EpisodePrediction, drawn: Sequence[EpisodePrediction | str]
+) -> dict[str, float]:
+    found = {}
+    able = [own for own in drawn if not isinstance(own, str)]
+    for k, samples in enumerate(episode.measurements):
+        square = np.where(np.isfinite(samples.value), samples.std, np.nan) ** 2
+        for own in able:
+            square = square + (own.predicted_outputs[k] - outcome.predicted_outputs[k]) ** 2 / len(able)
+        of_channel = square.reshape(len(square), len(samples.sensor.channel_names), -1).sum(axis=2)
+        for c, channel in enumerate(samples.sensor.channel_names):
+            if np.isfinite(of_channel[:, c]).any():
+                found[channel] = float(np.sqrt(np.nanmean(of_channel[:, c])))
+    return found
 
 
 def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) -> tuple[str, float, float] | None:

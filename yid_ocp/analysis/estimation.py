@@ -7,7 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 from yid_ocp.analysis import discretisation
-from yid_ocp.analysis.baseline_comparison import prediction_errors_and_units, worse_than_baseline_issues
+from yid_ocp.analysis.baseline_comparison import (
+    predict_held_out_with_expected_errors,
+    prediction_errors_and_units,
+    worse_than_baseline_issues,
+)
 from yid_ocp.analysis.cable_memory import choose_cable_memory_fit
 from yid_ocp.analysis.clock_checks import drift_and_overstated_noise_issues
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
@@ -72,12 +76,13 @@ def checked_solution(problem: EstimationProblem, solution: Solution, progress: P
     data_std = solution.std
     solution, checks = _with_discretisation_errors(problem, solution, progress)
     progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
-    held_out = tuple(problem.predict_held_out(solution.x))
+    held_out, expected = predict_held_out_with_expected_errors(problem, solution.x)
     solution, issues = _checked_solution_and_issues(problem, solution, held_out)
     checks = replace(
         checks,
         data_std=data_std,
-        held_out_predictions=held_out,
+        held_out_predictions=tuple(held_out),
+        expected_prediction_errors=expected,
         data_issues=issues,
         step_stability=stability,
     )

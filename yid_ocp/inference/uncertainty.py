@@ -439,7 +439,7 @@ VERDICT_SENTENCE_TEXTS: Mapping[str, str] = {
     "weak": "is weakly determined",
     "not_identifiable": "cannot be found",
     "at_bound": "is at its bound",
-    "not_trusted": "is not to be trusted",
+    "not_trusted": "is in doubt",
 }
 """Sentence predicate for a parameter of each verdict."""
 VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VERDICT_SENTENCE_TEXTS.items()}
@@ -452,8 +452,7 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}"
     if explains:
         return f"the model explains the recordings to within their noise ({size})"
-    said = f"the model does not explain the recordings ({size}, 1 is noise alone)"
-    return f"{said}: no number is to be trusted; run `yid-ocp diagnose`"
+    return f"the model does not explain the recordings ({size}, 1 is noise alone); run `yid-ocp diagnose`"
 
 
 def value_and_uncertainty_text(value: float, std: float | None, interval: ConfidenceInterval | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -38,6 +39,7 @@ _BASELINE_DESCRIPTIONS = {
     "linear_carry": "the clamps' motion carried along the cable",
 }
 _MAX_DIRECTIONS = 8
+_MAX_NOISE_RATIO = 2.0  # of an error over what noise makes, or over that of the fit, from which on a sentence says why
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters of which `inspect` speaks; result.json has all
 
 
@@ -46,14 +48,23 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary of a fit."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
-    yield from () if failed else misfit_summary_blocks(result["fit"])
+    if not failed:
+        yield from misfit_summary_blocks(result["fit"], free)
+        yield from (SummaryStatement(text, "conclusion") for text in _prediction_sentences(result))
     yield from issue_summary_blocks(result)
     rows: TableRows = [("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds")]
     for name, entry in free.items():
         std = "" if failed or entry["std"] is None or entry["verdict"] == "at_bound" else f"{entry['std']:.2g}"
-        interval = "" if failed or entry["interval"] is None else interval_text(*entry["interval"])
+        interval = "" if failed else _interval_cell(entry, entry["std"])
         verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
-        own = (f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
+        own = (
+            "–" if not failed and entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}",
+            std,
+            interval,
+            entry["unit"],
+            verdict,
+            f"{entry['initial']:.4g}",
+        )
         rows.append((name, *own, parameter_bounds_text(entry, 4)))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     rows = [("channel", "error (rms)", "unit", "samples")]
@@ -76,27 +87,84 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
 
 
+def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
+    """The 95 % interval of an estimate, value ± 1.96 std within its bounds where none is stated; empty if unknown."""
+    if entry["interval"] is not None:
+        return interval_text(*entry["interval"])
+    if std is None or entry["verdict"] == "not_identifiable":
+        return ""
+    lower, upper = (entry.get(key) for key in ("lower", "upper"))
+    low, high = entry["value"] - 1.96 * std, entry["value"] + 1.96 * std
+    return interval_text(low if lower is None else max(low, lower), high if upper is None else min(high, upper))
+
+
+def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
+    """How well each group of held-out channels is predicted, beside the best guess without a model and the noise.
+
+    Said where the model does not explain what it was fitted to, and where noise does not explain its prediction.
+    """
+    groups = dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"])
+    for group in groups:
+        channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]
+        unit, fitted = (
+            result["residuals"][channels[0]]["unit"],
+            _rms([result["residuals"][c]["rmse"] for c in channels]),
+        )
+        entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
+        if not entries:
+            continue
+        error, noise = (
+            _rms([e[key][c] for e in entries for c in channels if c in e.get(key, {})]) for key in ("rmse", "expected")
+        )
+        names = [
+            n for n in entries[0]["baselines"] if all(set(channels) <= set(e["baselines"].get(n, {})) for e in entries)
+        ]
+        guesses = {name: _rms([e["baselines"][name][c] for e in entries for c in channels]) for name in names}
+        best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
+        sizes = [
+            " ".join(format_error_value_and_unit(x, unit)).rstrip()
+            for x in (error, fitted, noise, guesses.get(best or ""))
+        ]
+        beside = f", beside {sizes[3]} by the best guess without a model ({best})" if best else ""
+        text = f"held out, {group} is predicted to {sizes[0]} (rms), {sizes[1]} where it was fitted{beside}"
+        if noise is None or error is None or fitted is None:
+            continue
+        if not result["fit"]["explains"]:
+            yield f"{text}; noise makes {sizes[2]} of it"
+        elif error > _MAX_NOISE_RATIO * noise:
+            yield f"{text}: a gap, as errors of sensors and torques explain {sizes[2]}; run `yid-ocp diagnose`"
+        elif error > _MAX_NOISE_RATIO * fitted:
+            yield f"{text}: no gap, as torque errors of the stated size carry the motion away, by {sizes[2]} (rms)"
+
+
+def _rms(values: Sequence[float]) -> float | None:
+    return math.sqrt(statistics.fmean(x**2 for x in values)) if values else None
+
+
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Errors of each shown channel, in each recording and over three or more, with those of guesses without a model."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
-    found: dict[str, list[tuple[str, str, float, dict[str, float]]]] = {}
+    found: dict[str, list[tuple[str, str, float, float | None, dict[str, float]]]] = {}
     errors = []
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
             guesses = {name: own[channel] for name, own in entry["baselines"].items() if channel in own}
-            errors.append((entry["recording"], channel, entry["rmse"][channel], guesses))
+            noise = entry.get("expected", {}).get(channel)
+            errors.append((entry["recording"], channel, entry["rmse"][channel], noise, guesses))
             found.setdefault(channel, []).append(errors[-1])
     for channel, own in found.items():
         if len(own) > 2:
             guessed = [guesses for *_, guesses in own]
             shared = [name for name in guessed[0] if all(name in each for each in guessed)]
             medians = {name: statistics.median(each[name] for each in guessed) for name in shared}
-            errors.append((f"median of {len(own)}", channel, statistics.median(rmse for *_, rmse, _ in own), medians))
-    rows: TableRows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
-    for recording, channel, rmse, guesses in errors:
+            errors.append((f"median of {len(own)}", channel, statistics.median(one[2] for one in own), None, medians))
+    rows: TableRows = [("held-out recording", "channel", "error (rms)", "by noise", "unit", "without a model")]
+    for recording, channel, rmse, noise, guesses in errors:
         unit = channel_or_group_unit(units, channel)
         without = (f"{format_error_value_and_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
-        rows.append((recording, channel, *format_error_value_and_unit(rmse, unit), ", ".join(without)))
+        error, shown = format_error_value_and_unit(rmse, unit)
+        by_noise = "" if noise is None else format_error_value_and_unit(noise, unit)[0]
+        rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     for entry in result["held_out"]:
@@ -149,10 +217,11 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 # elsewhere a curvature tells nothing of how sure it is, nor where noise is left out
                 ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
                 known = (found["std"], found["interval"]) if ended else (None, None)
-                cells.append(value_and_uncertainty_text(found["value"], *known))
+                lost = own["verdict"] == "not_identifiable"
+                cells.append("–" if lost else value_and_uncertainty_text(found["value"], *known))
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
-    yield from misfit_summary_blocks(judged["fit"])
+    yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})
     yield from (SummaryStatement(text, "conclusion") for text in _objections_to_agreement(result))
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
@@ -227,10 +296,12 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval", "unit", "verdict")]
     for name, entry in parameters.items():
         spread = (_relative(entry[key]) for key in ("std_relative", "std_relative_unknown", "std_alone"))
-        interval = "" if entry["interval"] is None else interval_text(*entry["interval"])
+        relative = entry["std_relative"]
+        interval = _interval_cell(entry, None if relative is None else relative * abs(entry["value"]))
         verdict = VERDICT_TABLE_TEXTS[entry["verdict"]]
-        rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], verdict))
-    yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"])
+        value = "–" if entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}"
+        rows.append((name, value, *spread, interval, entry["unit"], verdict))
+    yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]

@@ -13,13 +13,18 @@ from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording,
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS
 from yid_ocp.data.readers import FilePreview
 from yid_ocp.data.readers.base import mean_sample_rate
-from yid_ocp.inference.uncertainty import goodness_of_fit_message
+from yid_ocp.inference.uncertainty import (
+    MAX_IDENTIFIABLE_RELATIVE_STD,
+    goodness_of_fit_message,
+    value_and_uncertainty_text,
+)
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 
 TableRows = list[Sequence[str]]
 _StatementKind = Literal["note", "verdict", "conclusion"]
 _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings side by side
+_MAX_NUMBERS_BEYOND_MODEL = 6  # numbers that a sentence lists; the table has all
 MAX_CHANNELS_SHOWN_SINGLY = 4  # a group of more points is shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
@@ -120,8 +125,13 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
         yield SummaryStatement(text, "verdict")
 
 
-def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Conclusions on a poor fit: a model-free guess predicts better, or the model does not explain the recordings."""
+def misfit_summary_blocks(
+    fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
+) -> SummaryBlockOrTextIterator:
+    """Conclusions on a poor fit: where a guess predicts better, what is not explained, and which numbers count still.
+
+    Of `parameters` those count that are known to 10 % by a standard deviation that includes the misfit.
+    """
     worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
@@ -131,6 +141,22 @@ def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(f"and so for {left} more channels, in result.json" if left > 0 else "", "conclusion")
     if not fit["explains"]:
         yield SummaryStatement(goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
+        doubted = {name: entry for name, entry in parameters.items() if entry["verdict"] == "not_trusted"}
+        if doubted and fit["believed"]:
+            known = []
+            for name, entry in doubted.items():
+                std = (
+                    entry["std"]
+                    if "std" in entry
+                    else entry["std_relative"] and entry["std_relative"] * abs(entry["value"])
+                )
+                if std is not None and std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry["value"]):
+                    known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
+            left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
+            shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
+            none = "beyond this model no number means anything: the misfit leaves each unsure by more than 10 %"
+            said = f"beyond this model these mean something, with the ± that the misfit implies: {shown}"
+            yield SummaryStatement(said if known else none, "conclusion")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:

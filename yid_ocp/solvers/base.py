@@ -87,6 +87,8 @@ class EstimateChecks:
         Shift of every free parameter in a finer model, for those that were tried.
     notes, uncounted_errors : tuple of str
         Why a shift is not known; discretisations whose error the standard deviations leave out.
+    expected_prediction_errors : mapping of recording to mapping of channel to float
+        Root mean square error of each held-out prediction that noise of sensors and torques makes, in its unit.
     step_stability : mapping
         Growth of alternating errors at the `start` of the search and at the `estimate`.
     """
@@ -96,6 +98,7 @@ class EstimateChecks:
     notes: tuple[str, ...] = ()
     uncounted_errors: tuple[str, ...] = ()
     held_out_predictions: tuple[EpisodeAndPrediction, ...] = ()
+    expected_prediction_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     data_issues: tuple[Issue, ...] = ()
     step_stability: Mapping[str, Any] = field(default_factory=dict)
     cable_memory_message: str = ""
@@ -146,7 +149,8 @@ class Solution(ReprMixin):
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
         words, rows = {}, [("parameter", "value", "unit", "")]
         for name, e in free.items():
-            words[name] = value_and_uncertainty_text(e.value, finite_or_none(e.std), e.interval)
+            lost = e.verdict == "not_identifiable"
+            words[name] = "–" if lost else value_and_uncertainty_text(e.value, finite_or_none(e.std), e.interval)
             rows.append((name, words[name], e.unit, VERDICT_TABLE_TEXTS[e.verdict]))
         told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
         more = f"and {count_with_noun(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""

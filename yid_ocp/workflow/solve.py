@@ -97,6 +97,7 @@ def solution_to_result_dict(
 ) -> dict[str, Any]:
     """Contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = prediction_errors_and_units(problem, solution, held_out)
+    expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
     worse = channels_worse_than_naive_guess(errors, units)
     return {
         "format": _RESULT_FORMAT,
@@ -109,7 +110,9 @@ def solution_to_result_dict(
         "seconds": solution.wall_time,
         "fit": asdict(solution.goodness_of_fit) | {"worse_than_guess": worse},
         "residuals": residuals,
-        "held_out": errors[: len(held_out)],
+        "held_out": [
+            entry | {"expected": dict(expected.get(entry["recording"], {}))} for entry in errors[: len(held_out)]
+        ],
     }
 
 
