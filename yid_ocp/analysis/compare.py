@@ -140,7 +140,9 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
             continue
         entry = run.solution.parameters[name]
         gap = abs(entry.value - reference.value)
-        if gap <= max(_AGREEMENT_STDS * max(entry.std, reference.std), _AGREEMENT_RTOL * abs(reference.value)):
+        # the ± of a fit that stopped short is that of its misfit, and would agree with everything
+        std = max(entry.std, reference.std) if run.solution.status == Status.CONVERGED else reference.std
+        if gap <= max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
             continue
         if run.solution.status != Status.CONVERGED:
             why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
