@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -22,6 +23,7 @@ from pendulum_run import pendulum as pendulum
 from pendulum_run import pendulum_data as pendulum_data
 from pendulum_run import rubbing as rubbing
 from pendulum_run import solved_pendulum as solved_pendulum
+from sound_findings import assert_sound
 
 from yid_ocp.data import recording_hdf5
 from yid_ocp.integrator.step import compile_step
@@ -29,6 +31,7 @@ from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
+diagnose_module = importlib.import_module("yid_ocp.diagnosis.diagnose")  # the function hides its module
 REPOSITORY = Path(__file__).resolve().parents[1]
 ARMS = {"single": 1, "dual": 2}
 STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
@@ -55,6 +58,21 @@ def pytest_configure(config):
         folder = config.cache.mkdir("compiled")
         folder.chmod(0o700)
         os.environ["YID_OCP_CACHE"] = str(folder)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def findings_are_sound():
+    """Whatever a test diagnoses, nothing impossible is said of it."""
+    text_of = diagnose_module.diagnosis_summary_text
+
+    def checked(finding):
+        text = text_of(finding)
+        assert_sound(replace(finding, summary=text))
+        return text
+
+    diagnose_module.diagnosis_summary_text = checked
+    yield
+    diagnose_module.diagnosis_summary_text = text_of
 
 
 def pytest_collection_finish():

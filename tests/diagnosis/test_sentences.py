@@ -30,6 +30,9 @@ from factories import (
     smoothed,
     visible,
 )
+from hypothesis import given
+from hypothesis import strategies as st
+from sound_findings import assert_nothing_impossible_is_said
 
 from yid_ocp.diagnosis.diagnosis_result import (
     _event_sentences,
@@ -45,6 +48,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 SPEED, ACCELERATION, GRAVITY = "how fast it moves", "how hard it accelerates", "how it stands against gravity"
+REASONS = ("unsure", "little", "stand_in")
 NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 
 
@@ -65,6 +69,8 @@ def gaps():
         yield f"{verdict}, p = {p[0]:g} and {p[1]:g}", finding(verdict, **tests, **NO_EFFECT)
     short = {"message": "4 samples.", "next_experiment": "Longer."}
     yield "insufficient data", finding("insufficient_data", **short, **NO_EFFECT)
+    quiet = {"nominal_test": outcome(0.2, chi2=1.02), "nominal_held_out_test": outcome(0.6, chi2=0.989)}
+    yield "along a candidate alone", finding(**quiet)
     yield "no gap", finding("no_gap", next_experiment="None is needed.", **NO_EFFECT)
 
 
@@ -128,6 +134,9 @@ def unknown():
     ]:  # fmt: skip
         limits = Thresholds(min_explained_fraction=0.5)
         yield name, finding("unknown", unknown_reason=reason, thresholds=limits, **changed)
+    for reason in REASONS:
+        none = {"gap_closure": closed(math.nan, math.nan, math.nan), "transfer_checks": (carried(),)}
+        yield f"no held-out gap, {reason}", finding("unknown", unknown_reason=reason, **none)
     hurried = {"search_seconds": 12.54, "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
     yield "stopped with an effect", with_effect(FRICTION, 0.5, **hurried | {"untried": ("what is left beside a@x",)})
@@ -171,6 +180,27 @@ def said() -> dict[str, str]:
     for events in ((force,), (force, odd), (force,) * 10):
         found[f"events: {len(events)}"] = _event_sentences(EventSet(events, (_Overspeed("run_0", "elbow", 3.0),)))
     return found
+
+
+CLOSURES = st.sampled_from(
+    [closed(), closed(0.4, 0.01, 0.7), closed(math.nan, math.nan, math.nan), closed(0.5, math.nan, math.nan)]
+)
+SIZES = st.sampled_from([0.3, 0.989, 1.0, 1.05, 1.2, 40.0])
+
+
+@given(CLOSURES, SIZES, SIZES, st.sampled_from([1e-13, 1e-3, 0.5]), st.sampled_from(["effect", "no_gap", *REASONS]))
+def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
+    """Whatever a diagnosis finds: no number that is none, no gap below noise, no closure without a gap."""
+    lost = loss(held_out, held_out)
+    if lost.excess_chi2_per_sample <= 0:
+        closure = closed(math.nan, math.nan, math.nan)
+    tests = {"nominal_test": outcome(p, chi2=fitted), "nominal_held_out_test": outcome(p, chi2=held_out)}
+    nominal = fit(lost=lost, problem=SimpleNamespace(has_process_noise=False))
+    known = {**tests, "gap_closure": closure, "nominal_model": nominal}
+    verdict = how if how in ("effect", "no_gap") else "unknown"
+    none = NO_EFFECT if verdict == "no_gap" else {"transfer_checks": (carried(),)}
+    made = finding(verdict, **known, **none, **({} if verdict == how else {"unknown_reason": how}))
+    assert_nothing_impossible_is_said(made, diagnosis_summary_text(made))
 
 
 def test_a_diagnosis_says_what_is_written_down():

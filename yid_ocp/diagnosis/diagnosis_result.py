@@ -38,7 +38,12 @@ from yid_ocp.display import ReprLineAndTableRows, ReprMixin
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
 from yid_ocp.files import object_attributes_to_json_dict, to_json_types
-from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
+from yid_ocp.inference.null_test import (
+    AssumedChannelNoiseLevel,
+    NullTestResult,
+    min_bonferroni_p_value,
+    residuals_exceed_noise,
+)
 from yid_ocp.inference.smoother import SmoothedUnknownsResult
 
 _FORMAT = "yid-diagnosis/2"
@@ -332,9 +337,10 @@ _UNKNOWN_REASON_TEXTS = {
     "none": "{no} explains it (the best, {best}, is not sure to be there and to close a part).",
     "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
     "asked.",
-    "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and surely "
-    "close{s} {low:.3g} % on held-out motions; {enough:.3g} % {asked}.",
-    "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
+    "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and {sure}; "
+    "{enough:.3g} % {asked}.",
+    "stand_in": "{names} imitate{s} it ({closing}) and {are} not its cause: {apart}.",
+    "no held-out gap": "{names} may explain it, but {sure}.",
 }
 """Sentences on why the verdict is unknown, by `verdict.UnknownVerdictReason`."""
 
@@ -396,7 +402,9 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
     if finding.accepted_effects:
         text += _effects(finding)
     elif finding.verdict == "unknown":
-        size = _model_error(finding)
+        tests = (finding.nominal_test, finding.nominal_held_out_test)
+        exceeds = residuals_exceed_noise(tests, finding.thresholds.null_test_limits)
+        size = _model_error(finding) if exceeds else ""
         text += [_nameless(finding), f"What remains is model error{size}." if size else ""]
     if finding.untried:
         rest = ", ".join(finding.untried[:8]) + (", ..." if len(finding.untried) > 8 else "")
@@ -417,20 +425,23 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
 def _gap(finding: DiagnosisResult) -> str:
     """Whether there is one."""
     held, first = finding.nominal_held_out_test, finding.nominal_test
-    p = min(first.p_value, held.p_value)
+    p, limits = min(first.p_value, held.p_value), finding.thresholds
+    fitted, other = (f"{x:.3g}" if math.isfinite(x) else "not known" for x in (first.chi2_per_dof, held.chi2_per_dof))
+    sizes = f"chi2 per degree of freedom {fitted}, held out {other}"
     if finding.verdict == "insufficient_data":
         return f"The data do not suffice: {finding.message}"
     if finding.verdict == "no_gap":
-        return (
-            f"There is no gap to speak of (chi2 per degree of freedom {first.chi2_per_dof:.3g}, held out "
-            f"{held.chi2_per_dof:.3g}; p = {p:.2g})."
-        )
+        return f"There is no gap to speak of ({sizes}; p = {p:.2g})."
     best = min(finding.candidate_scores, key=lambda score: score.p_value, default=None)
-    along = ""
-    if p >= finding.thresholds.significance_level and best is not None:
-        p, along = min(1.0, best.p_value * len(finding.candidate_scores)), f" along what {best.effect.label} would do"
-    small = f"= {p:.2g}" if p > 1e-12 else "< 1e-12"
-    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small}{along})."
+    if residuals_exceed_noise((first, held), limits.null_test_limits) or best is None:
+        return f"The gap is real ({sizes}; p {_p_value_relation(p)})."
+    small = _p_value_relation(min(1.0, best.p_value * len(finding.candidate_scores)))
+    said = f"As a whole the recordings are explained to within their noise ({sizes})"
+    return f"{said}, but not along what {best.effect.label} would do (p {small})."
+
+
+def _p_value_relation(p_value: float) -> str:
+    return f"= {p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
 
 
 def _places(finding: DiagnosisResult) -> str:
@@ -451,8 +462,14 @@ def _nameless(finding: DiagnosisResult) -> str:
     """Why no effect is named, with the numbers that say so."""
     added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
     apart = [entry.both_estimates_text for entry in failed_transfer_checks(finding.transfer_checks)]
-    count = independent_assumption_count(added)
-    return _UNKNOWN_REASON_TEXTS[reason if reason != "none" or tried else "nothing"].format(
+    count, closed = independent_assumption_count(added), finding.gap_closure
+    is_closure_known = math.isfinite(closed.fraction) and math.isfinite(closed.ci_low)
+    none = "held-out motions have no gap to close"
+    sure = f"surely close{'s' if len(added) == 1 else ''} {100 * closed.ci_low:.3g} % on held-out motions"
+    case = "no held-out gap" if reason == "unsure" and not is_closure_known else reason
+    return _UNKNOWN_REASON_TEXTS[case if case != "none" or tried else "nothing"].format(
+        sure=sure if is_closure_known else none,
+        closing=f"closing {100 * closed.fraction:.3g} % on held-out motions" if is_closure_known else none,
         best=tried[0].effects[0].label if tried else "",
         names=" and ".join(entry.effect.label for entry in added),
         s="s" if len(added) == 1 else "",

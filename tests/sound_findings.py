@@ -1,0 +1,35 @@
+"""What must hold of every finding of a diagnosis, whatever it is: checked of all findings of the tests."""
+
+from __future__ import annotations
+
+import json
+import re
+
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+from yid_ocp.inference.null_test import residuals_exceed_noise
+
+
+def assert_nothing_impossible_is_said(finding: DiagnosisResult, text: str) -> None:
+    """No number that is none, no gap below noise, no closure without a gap to close."""
+    assert not re.search(r"\b(nan|inf)\b", text), text
+    tests = (finding.nominal_test, finding.nominal_held_out_test)
+    if "The gap is real" in text and finding.candidate_scores:
+        assert residuals_exceed_noise(tests, finding.thresholds.null_test_limits), text
+    if finding.verdict in ("no_gap", "insufficient_data"):
+        assert "The gap is real" not in text
+        assert not finding.accepted_effects
+    if finding.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
+        assert not re.search(r"\bclos(es|e|ing) [0-9-]", text), text
+
+
+def assert_sound(finding: DiagnosisResult) -> None:
+    """The same, and of result.json: strict numbers, no closure where there is no gap."""
+    assert_nothing_impossible_is_said(finding, finding.summary)
+    result = finding.to_dict()
+    json.dumps(result, allow_nan=False)
+    closures = [result["gap"]["closure"], *(entry["closure"] for entry in (*result["which"], *result["steps"]))]
+    if finding.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
+        assert closures == [None] * len(closures)
+    if finding.verdict in ("no_gap", "insufficient_data"):
+        assert result["gap"]["closure"] is None
+        assert result["effects"] == []
