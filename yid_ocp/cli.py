@@ -170,6 +170,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how files of other tools are read")
     listed = (
         ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are put on one clock"),
+        ("--field", "fields", "CHANNEL=/TOPIC.FIELD", "of a bag: array of any message, joints are called 1, 2, ..."),
         ("--joints", "joints", "NAME[=NEW]", "joints to keep, in this order, and what they are called in the URDF"),
         ("--points", "points", "SOURCE=POINT", "topic, TOPIC:FRAME of /tf, marker or stem, and its point: cable:100%%"),
         ("--columns", "columns", "COLUMN=MEANING", "of a table: t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),

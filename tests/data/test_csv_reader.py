@@ -291,7 +291,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_columns_are_understood_as_loggers_and_mocap_call_them(header: str, meanings: str) -> None:
-    found, _ = column_meanings(header.split(","))
+    found, _ = column_meanings(header.split(","), ["force_x"])
     assert " ".join(":".join(filter(None, m)) if m else "None" for m in found) == meanings
 
 

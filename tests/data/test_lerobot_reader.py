@@ -84,15 +84,48 @@ def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
     assert np.allclose(joints.values_by_channel["effort"][:, 0], 0.2 * np.array([2, 12, 22, 32]))
 
 
-def test_the_preview_proposes_degrees(tmp_path: Path) -> None:
+def test_the_preview_asks_for_a_unit_that_could_be_two_and_numbers_of_frames_are_no_joints(tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0")
     contents = preview_file(path)
-    assert contents.reader_options["units"]["position"] == "deg"
+    assert "units" not in contents.reader_options
     assert "2 episodes at 30 Hz, v3.0, recorded on so101" in contents.notes[0]
     by_name = {source.name: source for source in contents.sources}
     assert by_name["action"].imported_as == "position_command"
     assert not by_name["observation.images.top"].imported_as
-    assert read_any(path, **contents.reader_options).joint_names == ("shoulder_pan", "elbow_flex", "gripper")
+    assert by_name["observation.state"].imported_as == "joints shoulder_pan, elbow_flex, gripper"
+    assert by_name["frame_index"].imported_as == "t"
+    assert not by_name["index"].imported_as
+    with pytest.raises(DataError, match="the unit has to be said") as caught:
+        read_any(path, **contents.reader_options)
+    assert "-100 to 100" in caught.value.hint
+    options = {**contents.reader_options, "units": {"position": "deg", "position_command": "deg"}}
+    assert read_any(path, **options).joint_names == ("shoulder_pan", "elbow_flex", "gripper")
+
+
+@pytest.mark.parametrize(
+    ("robot", "scale", "asked"),
+    [("panda", 0.01, False), ("panda", 1.0, True), ("so100_follower", 0.01, True), ("koch", 0.01, True)],
+)
+def test_small_numbers_are_radians_unless_the_robot_never_records_them(
+    robot: str, scale: float, asked: bool, tmp_path: Path
+) -> None:
+    """Normalised units of a small motion lie where radians do: LeRobot's own arms are always asked."""
+    from pyarrow import parquet
+
+    path = write_dataset(tmp_path / "arm", "v3.0", robot_type=robot)
+    file = path / "data/chunk-000/file-000.parquet"
+    table = parquet.read_table(file)
+    for name in ("observation.state", "action"):
+        values = [[scale * x for x in row] for row in table[name].to_pylist()]
+        table = table.set_column(table.schema.get_field_index(name), name, [values])
+    parquet.write_table(table, file)
+    if asked:
+        with pytest.raises(DataError, match="the unit has to be said"):
+            read_any(path)
+        recording = read_any(path, units={"position": "rad", "position_command": "rad"})
+    else:
+        recording = read_any(path)
+    assert joints_of(recording).position[1, 0] == pytest.approx(10 * scale)
 
 
 @pytest.mark.parametrize(
@@ -105,8 +138,8 @@ def test_the_preview_proposes_degrees(tmp_path: Path) -> None:
         ({"fps": 0}, {}, "fps .* greater than 0"),
         ({"fps": "fast"}, {}, "fps .* a valid number"),
         ({"features": {"action": {}}}, {}, "no observation.state"),
-        ({}, {"joints": ["elbow"]}, "no joint 'elbow'"),
-        ({}, {"episode": 1}, "reaches 132 rad"),
+        ({}, {"joints": ["elbow"], "units": {"position": "deg"}}, "no joint 'elbow'"),
+        ({}, {"episode": 1}, "angles reach 131"),
     ],
     ids=["beyond", "negative", "lost", "version", "rate", "text", "state", "joint", "degrees"],
 )

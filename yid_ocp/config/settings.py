@@ -45,7 +45,7 @@ _GraspKind = Literal["point", "axis", "weld"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameSettings(MountSettings):
+class _FrameSettings(MountSettings):
     """An additional named frame on the robot, the object or in the world, such as a tool tip or a marker."""
 
     marker_reference_pose: Annotated[
@@ -58,7 +58,7 @@ class FrameSettings(MountSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasuredClampSettings:
+class _MeasuredClampSettings:
     """A massless clamp frame whose prescribed motion follows two recorded points."""
 
     origin_point_name: Annotated[str, OptionInfo("point at which the clamp's origin sits")]
@@ -80,7 +80,7 @@ class GraspSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointSpringSettings:
+class _JointSpringSettings:
     """A spring and damper on one joint of the robot."""
 
     stiffness: Annotated[float, Ge(0), OptionInfo("stiffness", "N m/rad or N/m")]
@@ -150,12 +150,12 @@ class ModelSettings:
         ),
     ] = None
     moving_clamps: Annotated[
-        Mapping[str, MeasuredClampSettings],
+        Mapping[str, _MeasuredClampSettings],
         OptionInfo("what moves an object without a robot, by name; a cable has its own at both ends"),
     ] = field(default_factory=dict)
     arms: Annotated[JointActuationSettings, OptionInfo("the robot's joints")] = JointActuationSettings()
     frames: Annotated[
-        Mapping[str, FrameSettings],
+        Mapping[str, _FrameSettings],
         OptionInfo(
             "more frames, by name, on robot, object or world: a tool's tip, the middle of what a hand holds, a marker"
         ),
@@ -166,7 +166,7 @@ class ModelSettings:
     grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right, gripper")] = field(
         default_factory=dict
     )
-    springs: Annotated[Mapping[str, JointSpringSettings], OptionInfo("by joint of the robot")] = field(
+    springs: Annotated[Mapping[str, _JointSpringSettings], OptionInfo("by joint of the robot")] = field(
         default_factory=dict
     )
     damping: Annotated[
@@ -215,6 +215,9 @@ class ImportSettings:
     ] = None
     command_topic: Annotated[
         str | None, OptionInfo("of a bag: topic of joint states whose positions were asked for, not measured")
+    ] = None
+    fields: Annotated[
+        _Texts, OptionInfo("of a bag: joint channel, and /TOPIC.FIELD of an array in messages of any type")
     ] = None
     joints: Annotated[
         _Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; all when absent")
@@ -346,7 +349,7 @@ class CompareSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VirtualFramesSettings:
+class _VirtualFramesSettings:
     """A MuJoCo experiment and its virtual depth camera, used when no recorded frames are given."""
 
     seed: Annotated[int, Ge(0), OptionInfo("of motion, noise and camera")] = 0
@@ -390,8 +393,8 @@ class TrackSettings:
             "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
         ),
     ] = None
-    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("what is filmed without frames")] = (
-        VirtualFramesSettings()
+    virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("what is filmed without frames")] = (
+        _VirtualFramesSettings()
     )
     write_virtual_frames: Annotated[
         bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")

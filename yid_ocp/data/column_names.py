@@ -6,19 +6,10 @@ import re
 from collections.abc import Mapping, Sequence
 
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS
-from yid_ocp.sensors import CHANNEL_KINDS
 
-AXES = ("x", "y", "z")
-ColumnMeaning = tuple[str, str] | None
+_AXES = ("x", "y", "z")
+_Meaning = tuple[str, str] | None
 """Of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None where it is left out."""
-MOUNTED_SENSOR_CHANNELS = [
-    channel for key in CHANNEL_KINDS if (channel := CHANNEL_KINDS[key]).components and channel.group != "points"
-]
-SENSOR_COMPONENTS = tuple(
-    f"{channel.quantity}_{axis}" for channel in MOUNTED_SENSOR_CHANNELS for axis in channel.components
-)
-"""Components of vectors that sensors on a link read, such as `force_x`."""
-
 _EXACT_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
 _TIME_WORDS = "t time times timestamp timestamps time_stamp stamp header_stamp sec secs seconds elapsed elapsed_time"
 _CHANNEL_WORDS: Mapping[str, str] = {
@@ -45,48 +36,51 @@ _BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
 _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS), key=len, reverse=True))})", re.I)
 
 
-def column_meanings(header: Sequence[str]) -> tuple[list[ColumnMeaning], dict[str, str]]:
-    """Meaning of every column by its name, None where that says nothing, and unit by quantity where names have one."""
-    split = [_split_unit(name) for name in header]
+def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
+    """Meaning of every column by its name, None where that says nothing, and unit by quantity where names have one.
+
+    `sensor_components` are components of vectors that sensors on a link read, such as `force_x`.
+    """
+    split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
-    meanings: list[ColumnMeaning] = []
+    meanings: list[_Meaning] = []
     units: dict[str, str] = {}
     for name, unit in split:
-        meaning = _exact_meaning(name) or _spelled_meaning(name)
-        if meaning is None and set(AXES) <= whole and name.strip().lower() in AXES:
+        meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name)
+        if meaning is None and set(_AXES) <= whole and name.strip().lower() in _AXES:
             meaning = name.strip().lower(), "marker"  # a table of one point
         meanings.append(meaning)
         if meaning and unit:
-            units.setdefault("points" if meaning[0] in AXES else meaning[0], unit)
+            units.setdefault("points" if meaning[0] in _AXES else meaning[0], unit)
     return meanings, units
 
 
-def _split_unit(column: str) -> tuple[str, str]:
+def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str]:
     """Name and unit of a column such as `time [ms]` or `q1_deg`; an empty unit where the name has none."""
     if (bracketed := _BRACKETED_UNIT.fullmatch(column)) and (unit := _UNIT_WORDS.get(bracketed[2].lower())):
         return bracketed[1], unit
-    if _exact_meaning(column) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
+    if _exact_meaning(column, sensor_components) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
         name = suffixed[1]
-        if _exact_meaning(name) or _spelled_meaning(name):
+        if _exact_meaning(name, sensor_components) or _spelled_meaning(name):
             return name, _UNIT_WORDS[suffixed[2].lower()]
     return column, ""
 
 
-def _exact_meaning(column: str) -> ColumnMeaning:
+def _exact_meaning(column: str, sensor_components: Sequence[str]) -> _Meaning:
     """Meaning in this package's own spelling, of which a joint, point or sensor keeps its name as it stands."""
     if column.lower() in _TIME_WORDS.split():
         return "t", ""
     for prefix in sorted(_EXACT_PREFIXES, key=len, reverse=True):
         if column.startswith(prefix) and column != prefix:
             return _EXACT_PREFIXES[prefix], column.removeprefix(prefix)
-    for component in sorted(SENSOR_COMPONENTS, key=len, reverse=True):
+    for component in sorted(sensor_components, key=len, reverse=True):
         if (name := column.removesuffix(f"_{component}")) not in ("", column):
             return component, name
     point, _, axis = column.rpartition("_")
-    return (axis, point) if point and axis in AXES else None
+    return (axis, point) if point and axis in _AXES else None
 
 
-def _spelled_meaning(column: str) -> ColumnMeaning:
+def _spelled_meaning(column: str) -> _Meaning:
     """Meaning of what other tools write: `pos_elbow`, `elbow.vel`, `tau1`, `tau_J[0]`, `/joint_states/elbow/effort`."""
     plain = re.sub(r"[\s./:\-\[\]%]+", "_", column).strip("_")
     if plain.lower() in _TIME_WORDS.split() or plain.lower() in ("field_header_stamp", "header_stamp_sec"):

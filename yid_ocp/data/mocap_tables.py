@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,15 +17,11 @@ _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m":
 _ALLOWED = "an export with its header as the program writes it"
 
 
-class MocapTable(NamedTuple):
-    """Points of a motion capture export in its own unit, that unit, and what a user should know."""
-
-    points: PointGroup
-    unit: str  # of the coordinates: mm, cm or m
-    notes: tuple[str, ...]
+_MocapTable = tuple[PointGroup, str, tuple[str, ...]]
+"""Points of a motion capture export in its own unit, that unit (mm, cm or m), and what a user should know."""
 
 
-def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], MocapTable] | None:
+def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
     """Function that reads a motion capture export from its rows, by its first row; None where the table is none."""
     first = first_row[0].strip() if first_row else ""
     if first == "Format Version":
@@ -36,7 +31,7 @@ def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], Mocap
     return _read_vicon if first in _VICON_SECTIONS else None
 
 
-def _read_motive(rows: _Rows, where: str) -> MocapTable:
+def _read_motive(rows: _Rows, where: str) -> _MocapTable:
     """Positions of rigid bodies and markers; rotations and errors of fits are left out."""
     head: list[list[str]] = []
     body: list[list[str]] = []
@@ -62,7 +57,7 @@ def _read_motive(rows: _Rows, where: str) -> MocapTable:
     return _made(table[:, 1], columns, table, unit, "OptiTrack", notes, where)
 
 
-def _read_vicon(rows: _Rows, where: str) -> MocapTable:
+def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
     """Markers of the section `Trajectories`."""
     lines = [[cell.strip() for cell in cells] for _, cells in rows]
     begin = next((i for i, cells in enumerate(lines) if cells[:1] == ["Trajectories"]), None)
@@ -85,7 +80,7 @@ def _read_vicon(rows: _Rows, where: str) -> MocapTable:
     return _made((table[:, 0] - table[0, 0]) / frequency, columns, table, unit, "Vicon", [], where)
 
 
-def _read_qualisys(rows: _Rows, where: str) -> MocapTable:
+def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
     """Markers; three zeros stand for one that was not seen."""
     said: dict[str, list[str]] = {}
     body: list[list[str]] = []
@@ -116,13 +111,13 @@ def _read_qualisys(rows: _Rows, where: str) -> MocapTable:
 
 def _made(
     t: Array, columns: dict[str, range], table: Array, unit: str, program: str, notes: list[str], where: str
-) -> MocapTable:
+) -> _MocapTable:
     if not columns or not len(table):
         raise _broken(where, "markers or rigid bodies with positions")
     position = np.stack([table[:, list(at)] for at in columns.values()], axis=1)
     position[np.isnan(position).any(axis=2)] = math.nan
     group = PointGroup("points", tuple(columns), t, position, None, program, clock="nominal")
-    return MocapTable(group, unit, (f"an export of {program}: {len(columns)} points in {unit}", *notes))
+    return group, unit, (f"an export of {program}: {len(columns)} points in {unit}", *notes)
 
 
 def _numbers(rows: Sequence[Sequence[str]], n_columns: int, where: str) -> Array:

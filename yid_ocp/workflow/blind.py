@@ -178,7 +178,7 @@ class _Proof:
         tasks = []
         for entry in read_input_json(self.folder / "cases" / "cases.json"):
             config, _, variation = str(entry["experiment"]).rpartition(".")
-            experiment = BlindExperiment(self.config_file(config), variation, self.seed, self.purpose)
+            experiment = _BlindExperiment(self.config_file(config), variation, self.seed, self.purpose)
             recordings = [self.folder / "cases" / name for name in (*entry["estimate"], entry["held_out"])]
             own = {"name": str(entry["name"]), "recordings": recordings, "without": entry["without"]}
             own |= {"experiment": vars(experiment), "first": self.folder / "prepared" / f"{entry['experiment']}.h5"}
@@ -244,8 +244,8 @@ class _Proof:
 def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -> dict[str, int]:
     """Task: write an experiment's first recording and the detectable size of every candidate."""
     first = Path(folder) / f"{name}.h5"
-    BlindExperiment(**experiment)._write_first_recording(first)
-    _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
+    _BlindExperiment(**experiment)._write_first_recording(first)
+    _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     detectable = ensemble.candidate_sensitivities_to_json()
     write_strict_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
@@ -255,7 +255,7 @@ def _draw_case(
     experiment: Mapping[str, Any], first: Path, detectable: Path, planned: Mapping[str, Any], folder: str
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
-    _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
+    _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     ensemble.load_candidate_sensitivities(read_input_json(detectable))
     case, label = ensemble.draw_planned_case(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
@@ -277,7 +277,7 @@ def diagnose_case_from_recordings_task(
 
     For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
     """
-    run, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
+    run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
     begun = time.perf_counter()
     try:
@@ -299,7 +299,7 @@ def _true_effect_closure(
     experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], label: Mapping[str, Any]
 ) -> float | None:
     """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
-    run, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
+    run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case = _case(name, recordings, ())
     truth = blind.CaseGroundTruth.from_dict(label)
     try:
@@ -357,7 +357,7 @@ EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
 
 
 @dataclass(frozen=True)
-class BlindExperiment:
+class _BlindExperiment:
     """A virtual experiment of a blind ensemble: configuration file, variation of it, seed and purpose."""
 
     config_file: Path
@@ -406,7 +406,7 @@ class BlindExperiment:
 
 
 @functools.lru_cache(maxsize=1)
-def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.BlindCaseGenerator]:
+def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.BlindCaseGenerator]:
     """Settings of the diagnosed model and the ensemble, kept for the next task of the same experiment."""
     del written
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
@@ -437,19 +437,19 @@ def _require_compatible(run: RunSettings) -> None:
 
 def blind_experiments_and_refinable_subset(
     configs: Mapping[str, Path], seed: int, purpose: str
-) -> tuple[dict[str, BlindExperiment], frozenset[str]]:
+) -> tuple[dict[str, _BlindExperiment], frozenset[str]]:
     """Virtual experiments by name, and the names of those whose object's links can be divided further.
 
     Variations that a configuration does not allow, as by frames on the object that is taken away, are left out.
     """
-    found: dict[str, BlindExperiment] = {}
+    found: dict[str, _BlindExperiment] = {}
     chains = set()
     for name, config in configs.items():
         whole = load_config(config).model.object is not None
         for variation, varied in EXPERIMENT_VARIATIONS.items():
             if varied.is_without_object and not whole:
                 continue  # as the others are
-            experiment = BlindExperiment(config, variation, seed, purpose)
+            experiment = _BlindExperiment(config, variation, seed, purpose)
             try:
                 system = build_system(experiment.simulation_settings())
             except YidError as error:

@@ -38,6 +38,7 @@ _MAPPINGS: Mapping[str, type] = {
     "torque_constants": float,
     "gears": float,
     "clock_offsets": float,
+    "fields": str,
 }
 _SINGLE = (
     "command_topic",
@@ -50,7 +51,11 @@ _SINGLE = (
     "point_sensor_name",
     "frame",
 )
-_FLAGS = {"joint_topics": "--joint-topic", "clock_offsets": "--clock-offset"}  # of options whose flag is not their name
+_FLAGS = {
+    "joint_topics": "--joint-topic",
+    "clock_offsets": "--clock-offset",
+    "fields": "--field",
+}  # of options whose flag is not their name
 _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
 

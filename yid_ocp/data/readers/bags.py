@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
+from yid_ocp.data.joint_messages import JOINT_MESSAGE_TYPES, joint_values_of_fields, joint_values_of_message
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limited_memory
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -30,7 +31,8 @@ _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PLACES = (_POINT_STAMPED, *_POSES)
 _WRENCH, _IMU = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Imu"
 _MOUNTED = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
-_KNOWN = (JOINT_STATE_MESSAGE_TYPE, *_PLACES, *_MOUNTED)
+_JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *JOINT_MESSAGE_TYPES)
+_KNOWN = (*_JOINT_TYPES, *_PLACES, *_MOUNTED)
 # last parts of topics that say what a message is, not what was seen
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu", "data", "data_raw")
 
@@ -135,6 +137,7 @@ class _Contents:
     states: Sequence[BagMessage]
     places: Sequence[BagMessage]
     mounted: Sequence[BagMessage]  # readings of wrist sensors and IMUs
+    topic_of_fields: str  # of messages that are read by the fields which a user named; empty for none
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,8 @@ class BagOptions(base.SelectionAndUnitOptions):
     joint_topics: Sequence[str] | None = None  # topics of the joint states; all that there are when absent
     # topic of joint states whose positions are what the controller asked for: `position_command`, held in between
     command_topic: str | None = None
+    # path of an array by joint channel, `/topic.field.field`, in messages of any type; joints are then called 1, 2, ...
+    fields: Mapping[str, str] | None = None
     # distance from a pose's origin at which NAME_x, NAME_y and NAME_z on its axes become points too [m]
     pose_axis_point_distance: float | None = None
     point_sensor_name: str = "unknown"  # what saw the points
@@ -163,7 +168,9 @@ def read_bag(
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    `sensor_msgs/JointState` becomes the joints, of several topics on one clock; stamped points,
+    `sensor_msgs/JointState` becomes the joints, of several topics on one clock; where there is none of it, Franka's
+    `FrankaState` and `FrankaRobotState` do, and `DynamicJointState` and `JointTrajectoryControllerState` of
+    `control_msgs`; `joint_topics` chooses them beside it, `fields` takes messages of any type. Stamped points,
     poses and transforms of `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference;
     `WrenchStamped` and `Imu` become a group `wrist` or `imu` per topic, on the frame of their header. Times are the
     headers' stamps (the times of recording if a message has none), from the first message on. A joint channel that is
@@ -177,11 +184,13 @@ def read_bag(
     if distance is not None and not 0 < distance < float("inf"):
         what, allowed = f"pose_axis_point_distance = {distance:g}", "a distance above 0 [m]"
         raise DataError(what, where=str(path), allowed=allowed)
-    bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress)
+    bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress, options.fields)
     groups, notes = _joints(bag, options, str(path))
     seen = _named_places(bag, options.points, str(path))
     if not groups and not seen and not bag.mounted:
-        allowed = f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}"
+        allowed = (
+            f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}, or fields of any: --field position=/TOPIC.FIELD"
+        )
         raise bag.file.no_usable_topics_error("the bag has no joint states and no points", allowed)
     places = [message for entries in seen.values() for _, message in entries]
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]
@@ -211,9 +220,9 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     bag = _contents(path, None, progress)
     names, options, notes = _names_of(bag), dict[str, Any](), list[str]()
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
-    states = bag.file.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE)
+    states = _default_joint_topics(bag.file)
     owners: dict[str, set[str]] = {}
-    for message in bag.states:
+    for message in (message for message in bag.states if message.source in states):
         for joint in message.content.name:
             owners.setdefault(joint, set()).add(message.source)
     shared = {topic for topics in owners.values() if len(topics) > 1 for topic in topics}
@@ -234,19 +243,33 @@ for _kind in (".bag", ".mcap", ".db3", "folder"):
     base.FILE_PREVIEWERS.register(_kind)(_preview_bag)
 
 
-def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Contents:
+def _contents(
+    path: Path, trees: Sequence[str] | None, progress: Progress, fields: Mapping[str, str] | None = None
+) -> _Contents:
     """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
     bag, states, places, mounted = OpenBag(path), list[BagMessage](), list[BagMessage](), list[BagMessage]()
-    lists = {JOINT_STATE_MESSAGE_TYPE: states, **dict.fromkeys(_MOUNTED, mounted)}
+    own_topic, paths = _topic_and_paths(bag, fields or {})
+    refused: DataError | None = None
+    lists = {**dict.fromkeys(_JOINT_TYPES, states), **dict.fromkeys(_MOUNTED, mounted)}
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
     with bag.read_errors_as_data_errors(), closing(bag.reader) as reader:
-        wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
+        wanted = [c for c in reader.connections if c.topic == own_topic or c.msgtype in wanted_kinds]
+        # without definitions, as in older bags of ROS 2, only common types can be read
+        wanted = [c for c in wanted if c.topic == own_topic or c.msgtype in reader.typestore.fielddefs]
         total = sum(connection.msgcount for connection in wanted)
         # an empty selection would mean all topics, images included
         for done, (connection, logged, data) in enumerate(reader.messages(wanted) if wanted else ()):
             if done % _PROGRESS_INTERVAL == 0:
                 progress.report_parts_done(done, total, "messages")
             content: Any = reader.deserialize(data, connection.msgtype)
+            if connection.topic == own_topic:
+                try:
+                    values = joint_values_of_fields(content, paths, f"{path}: {own_topic}")
+                except DataError as error:
+                    refused = error
+                    break
+                states.append(BagMessage(own_topic, int(logged), _stamp(content), values))
+                continue
             if connection.msgtype in _TREES:
                 for part in content.transforms:
                     source = f"{connection.topic}:{part.child_frame_id.strip('/')}"
@@ -255,16 +278,44 @@ def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _C
                 continue
             message = _message(connection.topic, logged, content, connection.msgtype)
             lists.get(connection.msgtype, places).append(message)
-    return _Contents(bag, states, places, mounted)
+    if refused is not None:  # outside, where errors of reading are not meant
+        raise refused
+    return _Contents(bag, states, places, mounted, own_topic)
+
+
+def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """Topic and the path by channel of fields `/topic.field.field`; an empty topic where there are none."""
+    split = {channel: text.partition(".") for channel, text in fields.items()}
+    topics = sorted({topic for topic, _, _ in split.values()})
+    where, allowed = str(bag.path), "CHANNEL=/TOPIC.FIELD, of one topic, position among them"
+    for channel, (topic, _, path) in split.items():
+        bag.check_topic_is_known(topic, [known.name for known in bag.topics], "messages")
+        if not path:
+            raise DataError(f"the field of '{channel}' has no name", where=where, allowed=allowed)
+    if len(topics) > 1 or (fields and "position" not in fields):
+        what = "fields are of several topics" if len(topics) > 1 else "no field is the position"
+        raise DataError(what, where=where, allowed=allowed)
+    return next(iter(topics), ""), {channel: path for channel, (_, _, path) in split.items()}
+
+
+def _default_joint_topics(bag: OpenBag) -> list[str]:
+    """Topics of joint states; where there are none, those of other messages that hold joints."""
+    return bag.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE) or bag.topic_names_of_types(*JOINT_MESSAGE_TYPES)
+
+
+def _stamp(content: Any) -> int:
+    header = getattr(content, "header", None)
+    return 0 if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
 def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
-    stamp = int(content.header.stamp.sec) * 10**9 + int(content.header.stamp.nanosec)
-    return BagMessage(source, int(logged), stamp, _plain(content, kind))
+    return BagMessage(source, int(logged), _stamp(content), _plain(content, kind))
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
     """What is needed of a message, in Python's types: a bag brings definitions of its own, which may be damaged."""
+    if kind in JOINT_MESSAGE_TYPES:
+        return joint_values_of_message(content, kind)
     frame = str(content.header.frame_id)
     if kind == JOINT_STATE_MESSAGE_TYPE:
         names = [str(name) for name in content.name]
@@ -334,11 +385,13 @@ class _States(NamedTuple):
 
 def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
     """Choose topics, joints and the messages that have them; with what was left out."""
-    known, command = bag.file.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE), options.command_topic
+    known, command = bag.file.topic_names_of_types(*_JOINT_TYPES), options.command_topic
     topics = options.joint_topics
+    default = [bag.topic_of_fields] if bag.topic_of_fields else _default_joint_topics(bag.file)
+    known = list(dict.fromkeys([*known, *default]))
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_known(topic, known, "joint states")
-    chosen = [topic for topic in (known if topics is None else topics) if topic != command]
+    chosen = [topic for topic in (default if topics is None else topics) if topic != command]
     wanted = None if options.joints is None else base.parse_renamings(options.joints, "joint", where)
     found, notes = [], []
     if wanted is not None:
@@ -407,10 +460,10 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
     states = sorted(entry.messages, key=seconds)
     t = np.array([seconds(message) for message in states])
     channels: dict[str, Any] = {}
-    for channel in ("position", "velocity", "effort"):
+    for channel in JOINT_CHANNEL_UNITS:
         rows = []
         for message in states:
-            values, own = getattr(message.content, channel), message.content.name
+            values, own = getattr(message.content, channel, ()), message.content.name
             if len(values) == len(own):
                 rows.append([values[own.index(name)] for name in entry.names])
             elif len(values):
@@ -503,8 +556,10 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
-    becomes, note = "", "not a type that is understood"
-    if topic.kind == JOINT_STATE_MESSAGE_TYPE:
+    becomes, note = "", "not a type that is understood; joint values: --field position=TOPIC.FIELD"
+    if topic.kind in JOINT_MESSAGE_TYPES and topic.name not in _default_joint_topics(bag.file):
+        note = f"joints, left out beside joint states: --joint-topic {topic.name}"
+    elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
         becomes, note = f"joints {', '.join(joints)}", ""
     elif topic.name in names:

@@ -17,14 +17,8 @@ from typing import Any, TextIO
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.data.column_names import (
-    AXES,
-    MOUNTED_SENSOR_CHANNELS,
-    SENSOR_COMPONENTS,
-    ColumnMeaning,
-    column_meanings,
-)
-from yid_ocp.data.mocap_tables import MocapTable, mocap_table_reader
+from yid_ocp.data.column_names import column_meanings
+from yid_ocp.data.mocap_tables import mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -36,7 +30,16 @@ from yid_ocp.data.recording import (
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
+from yid_ocp.sensors import CHANNEL_KINDS
 
+_AXES = ("x", "y", "z")
+_Meaning = tuple[str, str] | None
+"""Of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None for one to leave out."""
+_MOUNTED = [
+    channel for key in CHANNEL_KINDS if (channel := CHANNEL_KINDS[key]).components and channel.group != "points"
+]
+_COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
+"""Components of vectors that sensors on a link read, such as `force_x`."""
 _MOST_BAD = 0.5  # of a table's lines; beyond it the table is not understood at all
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # in cells: what a line takes beside them
@@ -86,9 +89,10 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
         if options.columns:
             what, hint = "the columns of a motion capture export are named by its header", "choose markers with points"
             raise DataError(what, where=str(path), hint=hint)
-        sensor = capture.points.sensor if options.point_sensor_name == "unknown" else options.point_sensor_name
-        group = replace(capture.points, sensor=sensor, frame=options.frame)
-        made, units = Recording(None, (group,), *said, notes=capture.notes), {"points": capture.unit}
+        seen, unit, remarks = capture
+        sensor = seen.sensor if options.point_sensor_name == "unknown" else options.point_sensor_name
+        group = replace(seen, sensor=sensor, frame=options.frame)
+        made, units = Recording(None, (group,), *said, notes=remarks), {"points": unit}
     else:
         meanings, units, table, notes = _read_table(path, options)
         raw = _raw(meanings, table, str(path), options)
@@ -96,7 +100,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     return base.convert_to_si_and_validate(made, str(path), replace(options, units={**units, **(options.units or {})}))
 
 
-def _mocap_table(path: Path) -> MocapTable | None:
+def _mocap_table(path: Path) -> tuple[PointGroup, str, tuple[str, ...]] | None:
     """Contents of an export of a motion capture program; None where the table is none."""
     delimiter = _delimiter(path)
     read = mocap_table_reader(next(_rows(path, delimiter), (1, []))[1])
@@ -116,8 +120,8 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     joint_names = tuple(dict.fromkeys(joint for _, joint in found))
     used = dict.fromkeys(["position", *(channel for channel, _ in found)]) if found else {}
     channels = {name: _gather(meanings, table, [(name, joint) for joint in joint_names], where) for name in used}
-    point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in AXES))
-    wanted = [(axis, name) for name in point_names for axis in AXES]
+    point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in _AXES))
+    wanted = [(axis, name) for name in point_names for axis in _AXES]
     position = _gather(meanings, table, wanted, where).reshape(len(table), len(point_names), 3)
     mounted = _mounted_sensors(meanings, table, where)
     is_alone = bool(joint_names) + bool(point_names) + len(mounted) < 2
@@ -147,13 +151,11 @@ def _mounted_sensors(
 ) -> dict[str, tuple[tuple[str, ...], dict[str, Array]]]:
     """Names of sensors on links, and values (M, k, components) by quantity, by group."""
     found: dict[str, tuple[tuple[str, ...], dict[str, Array]]] = {}
-    for channel in MOUNTED_SENSOR_CHANNELS:
+    for channel in _MOUNTED:
         parts = [f"{channel.quantity}_{axis}" for axis in channel.components]
         if not any(kind in parts for kind, _ in meanings):
             continue
-        of_group = [
-            f"{c.quantity}_{axis}" for c in MOUNTED_SENSOR_CHANNELS if c.group == channel.group for axis in c.components
-        ]
+        of_group = [f"{c.quantity}_{axis}" for c in _MOUNTED if c.group == channel.group for axis in c.components]
         names = tuple(dict.fromkeys(name for kind, name in meanings if kind in of_group))
         values = _gather(meanings, table, [(part, name) for name in names for part in parts], where)
         held = found.setdefault(channel.group, (names, {}))[1]
@@ -166,11 +168,11 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     path = Path(path)
     file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
-        group = capture.points
+        group, _, remarks = capture
         count, rate = np.isfinite(group.position).all(axis=2).sum(axis=0), base.mean_sample_rate(group.t)
         listed = zip(group.names, count, strict=True)
         kept = (base.TopicOrColumnSummary(name, "marker", int(n), rate, f"point {name}") for name, n in listed)
-        return base.FilePreview(tuple(kept), {}, capture.notes)
+        return base.FilePreview(tuple(kept), {}, remarks)
     options, delimiter = dict[str, Any](), _delimiter(path)
     lines = _rows(path, delimiter)
     names = [cell.strip() for cell in next(lines, (1, []))[1]]
@@ -197,7 +199,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
     if bad:
         options["skip_bad_lines"] = True
-    meanings, said = column_meanings(names)
+    meanings, said = column_meanings(names, _COMPONENTS)
     if "header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
         meanings[0] = ("t", "")
     meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # of two alike, the first
@@ -329,7 +331,7 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
+def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Meaning], where: str) -> list[float]:
     if len(cells) != len(header):
         raise DataError(f"the row has {len(cells)} cells", where=where, allowed=f"{len(header)} cells, as the header")
     numbers = []
@@ -343,9 +345,7 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
     return numbers
 
 
-def _meanings(
-    header: Sequence[str], columns: Mapping[str, str], where: str
-) -> tuple[list[ColumnMeaning], dict[str, str]]:
+def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> tuple[list[_Meaning], dict[str, str]]:
     """Meaning of every column, given or by its name, and the units that names state."""
     given: dict[str, str] = {}
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
@@ -356,9 +356,9 @@ def _meanings(
             raise DataError(what, where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
-    meanings: dict[str, ColumnMeaning] = {}
+    meanings: dict[str, _Meaning] = {}
     meant: dict[tuple[str, str], str] = {}
-    by_name, units = column_meanings(header)
+    by_name, units = column_meanings(header, _COMPONENTS)
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name not in given:
@@ -378,13 +378,13 @@ def _meanings(
     return list(meanings.values()), units
 
 
-def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
+def _given_meaning(column: str, given: str, where: str) -> _Meaning:
     if given == base.SKIPPED_COLUMN_MEANING:
         return None
     if given == "t":
         return "t", ""
     kind, _, name = given.partition(":")
-    known = (*JOINT_CHANNEL_UNITS, *AXES, *SENSOR_COMPONENTS)
+    known = (*JOINT_CHANNEL_UNITS, *_AXES, *_COMPONENTS)
     if not name or kind not in known:
         what, choice = f"column '{column}' is given the meaning '{given}'", f"one of {', '.join(known)}"
         allowed = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import string
@@ -9,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from yid_ocp.arrays import Array
@@ -27,6 +29,11 @@ _CHANNELS = {
 """Features beside state and action that some robots record, one number for each joint of the state."""
 _SUFFIXES = {"pos": "position", "vel": "velocity", "torque": "effort", "effort": "effort", "current": "effort"}
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
+_BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+"""Features that number frames and tasks."""
+_NEVER_RADIANS = re.compile(r"(so_?100|so_?101|koch|lekiwi|omx|hope_?jr)", re.IGNORECASE)
+"""Types of robots that LeRobot records in degrees or in normalised units, -100 to 100 of the calibrated range."""
+_MAX_RADIANS, _MAX_NORMALISED = 2.1 * math.pi, 100.5
 
 
 class _Feature(BaseModel):
@@ -68,9 +75,10 @@ def read_lerobot_episode(
 
     `observation.state` is the measured position of the joints, or position, velocity and effort where the names of its
     entries end in `.pos`, `.vel` and `.torque`, `.effort` or `.current`; `action` is the commanded position. Times are
-    frame numbers over the frames a second, a nominal clock. Images and other features are in `notes`. The other options
-    are those of `SelectionAndUnitOptions`: a gripper that is not in the model is left out with `joints`; many of these
-    robots record degrees.
+    frame numbers over the frames a second, a nominal clock. Angles that cannot be radians, or are of robots which
+    LeRobot never records in radians, are refused unless `units` says what they are. Images and other features are in
+    `notes`. The other options are those of `SelectionAndUnitOptions`: a gripper that is not in the model is left out
+    with `joints`; many of these robots record degrees.
 
     `DataError` where `pyarrow` is not installed, the dataset is not understood or has no such episode, and as
     `validated_recording`.
@@ -83,6 +91,8 @@ def read_lerobot_episode(
     own = source, f"{dataset.folder.name}_{episode:06d}", file_sha256(file)
     notes = tuple(f"{name} was left out ({why})" for name, why in left.items())
     raw, where = Recording(group, (), description, *own, notes=notes), f"{dataset.folder}, episode {episode}"
+    if "position" not in (units or {}):
+        _check_are_radians(group, dataset, where)
     return base.convert_to_si_and_validate(
         raw, where, base.SelectionAndUnitOptions(joints, None, units, torque_constants, gears)
     )
@@ -97,16 +107,43 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     group = JointGroup(names, _times(dataset, table), clock="nominal", **channels)
     sources = []
     for name, feature in dataset.info.features.items():
-        becomes = "position_command" if name == _ACTION else f"joints {', '.join(names)}"
+        becomes = {_ACTION: "position_command", _STATE: f"joints {', '.join(names)}"}.get(name, _CHANNELS.get(name, ""))
         own = (becomes, "") if name not in left else ("", left[name])
+        own = ("t", "") if name == "frame_index" else ("", "numbers frames and tasks") if name in _BOOKKEEPING else own
         sources.append(base.TopicOrColumnSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
     units, guesses = base.guess_units(Recording(group))
+    if "position" in units and _widest(group) <= _MAX_NORMALISED:  # degrees or normalised: reading asks which
+        del units["position"]
+        guesses = tuple(guess for guess in guesses if not guess.startswith("angles"))
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
     said = f"{dataset.info.total_episodes} episodes at {dataset.info.fps:g} Hz, {dataset.info.codebase_version}"
     robot = dataset.info.robot_type
     return base.FilePreview(tuple(sources), options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
+
+
+def _widest(group: JointGroup) -> float:
+    """Largest recorded angle, without grippers, whose 0 to 100 is a part of their range also beside degrees."""
+    arm = [i for i, name in enumerate(group.names) if "gripper" not in name.lower()]
+    return float(np.nanmax(np.abs(group.position[:, arm]), initial=0.0))
+
+
+def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None:
+    """Raise `DataError` where angles are in degrees or normalised units, or the robot's are never in radians."""
+    widest, robot = _widest(group), dataset.info.robot_type or ""
+    if widest <= _MAX_RADIANS and not _NEVER_RADIANS.search(robot):
+        return
+    of = f", and a {robot} is not recorded in radians" if _NEVER_RADIANS.search(robot) else ""
+    what = f"angles reach {widest:.3g}{of}: the unit has to be said"
+    allowed = "--units deg, or --units position=rad where they are radians after all"
+    hint = "--units deg"
+    if widest <= _MAX_NORMALISED:
+        hint = (
+            "--units deg if the robot was recorded with use_degrees=true; else these are -100 to 100 of the calibrated "
+        )
+        hint += "range, which are no angles: record again with use_degrees=true"
+    raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def _dataset(folder: Path) -> _Dataset:
@@ -213,7 +250,7 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
         channels[channel] = state[:, at]
     left = {}
     for name in dataset.info.features:
-        if name in (_STATE, "timestamp", "frame_index", "episode_index", "index", "task_index"):
+        if name == _STATE or name in _BOOKKEEPING:
             continue
         target = "position_command" if name == _ACTION else _CHANNELS.get(name)
         if target is None:

@@ -1,0 +1,160 @@
+"""Joint values of bags whose messages bring their own definitions: Franka's, ros2_control's, and any by its fields."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_examples import joints_of
+from ros_bags import SECOND, START, Bag
+
+from yid_ocp.cli import main
+from yid_ocp.data import preview_file, read_any, read_recording
+from yid_ocp.errors import DataError
+
+DEFINITIONS = {
+    "franka_msgs/msg/FrankaState": (
+        "std_msgs/Header header\nfloat64[7] q\nfloat64[7] dq\nfloat64[7] q_d\nfloat64[7] tau_J\n"
+        "float64[7] tau_ext_hat_filtered\nfloat64[6] O_F_ext_hat_K"
+    ),
+    "franka_msgs/msg/FrankaRobotState": (
+        "std_msgs/Header header\nsensor_msgs/JointState measured_joint_state\n"
+        "sensor_msgs/JointState desired_joint_state\nsensor_msgs/JointState tau_ext_hat_filtered"
+    ),
+    "control_msgs/msg/InterfaceValue": "string[] interface_names\nfloat64[] values",
+    "control_msgs/msg/DynamicJointState": (
+        "std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values"
+    ),
+    "control_msgs/msg/JointTrajectoryControllerState": (
+        "std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint desired\n"
+        "trajectory_msgs/JointTrajectoryPoint actual\ntrajectory_msgs/JointTrajectoryPoint error"
+    ),
+    "lab_msgs/msg/Inner": "float64[] q\nfloat64[] torque\nstring label",
+    "lab_msgs/msg/Arm": "lab_msgs/Inner state\nfloat64 temperature",
+}
+ANGLES = np.arange(7.0)
+JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
+
+
+def state(bag: Bag, names: Any, position: Any = (), velocity: Any = (), effort: Any = ()) -> Any:
+    own = {"position": np.array(position), "velocity": np.array(velocity), "effort": np.array(effort)}
+    return bag.of("sensor_msgs/msg/JointState", bag.header(0), list(names), **own)
+
+
+def fields_of(bag: Bag, kind: str, k: int) -> dict[str, Any]:
+    """Angles 0.01 k + joint, speeds 2, torques 3, external 4, commands 0.5 more than the angles; of seven joints."""
+    q, one, header = 0.01 * k + 0.1 * ANGLES, np.ones(7), bag.header(START + k * SECOND // 100)
+    if kind == "franka_msgs/msg/FrankaState":
+        own = {"q": q, "dq": 2 * one, "q_d": q + 0.5, "tau_J": 3 * one, "tau_ext_hat_filtered": 4 * one}
+        return {"header": header, **own, "O_F_ext_hat_K": np.zeros(6)}
+    if kind == "franka_msgs/msg/FrankaRobotState":
+        measured, wanted = state(bag, JOINTS, q, 2 * one, 3 * one), state(bag, JOINTS, q + 0.5)
+        external = state(bag, JOINTS, (), (), 4 * one)
+        own = {"measured_joint_state": measured, "desired_joint_state": wanted, "tau_ext_hat_filtered": external}
+        return {"header": header, **own}
+    if kind == "control_msgs/msg/DynamicJointState":
+        values = [
+            bag.of("control_msgs/msg/InterfaceValue", ["effort", "position", "velocity"], np.array([3.0, x, 2.0]))
+            for x in q
+        ]
+        values.append(bag.of("control_msgs/msg/InterfaceValue", ["force"], np.array([1.0])))
+        return {"header": header, "joint_names": [*JOINTS, "sensor"], "interface_values": values}
+    if kind == "lab_msgs/msg/Arm":
+        inner = bag.of("lab_msgs/msg/Inner", q, 3 * one, "x")
+        return {"state": inner, "temperature": 20.0}
+    duration = bag.of("builtin_interfaces/msg/Duration", 0, 0)
+    point = "trajectory_msgs/msg/JointTrajectoryPoint"
+    actual, desired, error = (
+        bag.of(point, x, v, np.zeros(0), e, duration)
+        for x, v, e in ((q, 2 * one, 3 * one), (q + 0.5, 0 * one, np.zeros(0)), (q, q, np.zeros(0)))
+    )
+    return {"header": header, "joint_names": JOINTS, "desired": desired, "actual": actual, "error": error}
+
+
+def write(folder: Path, kind: str, storage: str = "mcap", beside: bool = False) -> Path:
+    with Bag(folder, storage) as bag:
+        from rosbags.typesys import get_types_from_msg
+
+        for name, text in DEFINITIONS.items():
+            bag.store.register(get_types_from_msg(text, name))
+        for k in range(30):
+            bag.put("/arm", kind, START + k * SECOND // 100, **fields_of(bag, kind, k))
+            if beside:
+                message = state(bag, ["a"], [0.1 * k])
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(START + k * SECOND // 100, SECOND)
+                own = {name: getattr(message, name) for name in ("header", "name", "position", "velocity", "effort")}
+                bag.put("/joint_states", "sensor_msgs/msg/JointState", START + k * SECOND // 100, **own)
+    return bag.path
+
+
+CONTROL = ("control_msgs/msg/DynamicJointState", "control_msgs/msg/JointTrajectoryControllerState")
+CASES = [
+    ("franka_msgs/msg/FrankaState", "bag", {"external_effort": 4.0}, 0.5),
+    ("franka_msgs/msg/FrankaRobotState", "mcap", {"external_effort": 4.0}, 0.5),
+    (CONTROL[0], "mcap", {}, None),
+    (CONTROL[1], "mcap", {}, 0.5),
+]
+
+
+@pytest.mark.parametrize(("kind", "storage", "more", "command"), CASES, ids=[case[0].split("/")[2] for case in CASES])
+def test_joints_of_messages_of_real_labs(
+    kind: str, storage: str, more: dict[str, float], command: float | None, tmp_path: Path
+) -> None:
+    path = write(tmp_path, kind, storage)
+    joints = joints_of(read_any(path))
+    assert joints.names == tuple(JOINTS)
+    assert joints.t == pytest.approx(0.01 * np.arange(30))
+    assert np.allclose(joints.position, 0.01 * np.arange(30)[:, None] + 0.1 * ANGLES)
+    for channel, value in {"velocity": 2.0, "effort": 3.0, **more}.items():
+        assert np.all(joints.values_by_channel[channel] == value)
+    if command is not None:
+        assert joints.position_command is not None
+        assert np.allclose(joints.position_command, joints.position + command)
+    assert preview_file(path).sources[0].imported_as == f"joints {', '.join(JOINTS)}"
+
+
+def test_joint_states_go_before_them_unless_they_are_chosen(tmp_path: Path) -> None:
+    path = write(tmp_path, CONTROL[0], beside=True)
+    assert joints_of(read_any(path)).names == ("a",)
+    assert {source.name: source.imported_as for source in preview_file(path).sources}["/arm"] == ""
+    assert joints_of(read_any(path, joint_topics=["/arm"])).names == tuple(JOINTS)
+
+
+def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = write(tmp_path, "lab_msgs/msg/Arm")
+    assert main(["import", str(path), "--preview"]) == 0
+    told = capsys.readouterr().out
+    assert "something has to be said first" in told
+    assert "--field position=" in told
+    assert "\n  yid-ocp import" not in told
+    words = [
+        "--field",
+        "position=/arm.state.q",
+        "--field",
+        "effort=/arm.state.torque",
+        "--joints",
+        "1=shoulder,2=elbow",
+    ]
+    assert main(["import", str(path), "--preview", *words]) == 0
+    *_, said = capsys.readouterr().out.strip().splitlines()
+    assert main(shlex.split(said)[1:]) == 0
+    joints = joints_of(read_recording(tmp_path / f"{path.stem}.h5"))
+    assert joints.names == ("shoulder", "elbow")
+    assert np.allclose(joints.position[:, 1], 0.01 * np.arange(30) + 0.1)
+    assert np.all(joints.values_by_channel["effort"] == 3.0)
+    for fields, what in (
+        ({"position": "/arm.state.p"}, "no field 'state.p'"),
+        ({"position": "/arm.state.label"}, "holds no numbers"),
+        ({"position": "/hand.q"}, "no messages on the topic '/hand'"),
+        ({"position": "/arm"}, "has no name"),
+        ({"effort": "/arm.state.torque"}, "no field is the position"),
+        ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "no channel of joints"),
+    ):
+        with pytest.raises(DataError, match=what):
+            read_any(path, fields=fields)
