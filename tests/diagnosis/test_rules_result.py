@@ -22,7 +22,8 @@ from factories import (
     visible,
 )
 
-from yid_ocp.diagnosis.diagnosis_result import _UNKNOWN_REASON_TEXTS, _ranked_candidates
+from yid_ocp.diagnosis.diagnosis_messages import _UNKNOWN_REASON_TEXTS
+from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
 from yid_ocp.diagnosis.verdict import UnknownVerdictReason
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel
 

@@ -34,7 +34,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sound_findings import assert_nothing_impossible_is_said
 
-from yid_ocp.diagnosis.diagnosis_result import (
+from yid_ocp.diagnosis.diagnosis_messages import (
     _event_sentences,
     _separating_experiment,
     diagnosis_summary_text,

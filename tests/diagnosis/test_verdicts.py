@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text
+from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text
 from yid_ocp.errors import YidError
 from yid_ocp.problem import ProblemOptions, SensorOptions
 from yid_ocp.progress import Progress

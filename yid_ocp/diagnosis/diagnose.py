@@ -16,14 +16,13 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
-from yid_ocp.diagnosis.diagnosis_result import (
-    DiagnosisResult,
-    NominalParameterChange,
+from yid_ocp.diagnosis.diagnosis_messages import (
     diagnosis_summary_text,
     held_out_truncation_message,
     insufficient_data_message,
     recommended_experiment_text,
 )
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
     KEPT_HELD_OUT_DURATION_FRACTIONS,

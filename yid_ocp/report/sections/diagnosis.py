@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.diagnosis import DiagnosisResult
-from yid_ocp.diagnosis.diagnosis_result import ignored_after_overspeed_messages
+from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages
 from yid_ocp.diagnosis.localise import smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.inference.smoother import SmoothedUnknownsResult
