@@ -152,6 +152,19 @@ def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
     run = proposed(moved(SHORT, effort=True))
     assert run.sensors["joints.effort"].use is False
     assert not run.model.effects
+    # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
+    limit = 50.0
+    assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * limit)
+    text = Path("run.yaml").read_text()
+    assert "use: true looks for friction and payload of the arm" in text
+    assert "# friction: {law: coulomb}" in text
+    looked = text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:")
+    Path("friction.yaml").write_text(looked)
+    asked = load_config("friction.yaml")
+    assert "joint_coulomb@roll.tau_c" in build_system(asked).parameters
+    stated = moved(SHORT, effort=True)
+    known = proposed(replace(stated, joints=replace(stated.joints, effort_bias_std=0.2)))
+    assert known.sensors["joints.effort"].bias_std is None
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:

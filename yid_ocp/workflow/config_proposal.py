@@ -33,6 +33,7 @@ _JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03  # A joint [rad/s] or a point 
 _REST_WINDOW = 0.1  # over which speeds are taken [s]; up to twice that of slow sensors
 _MIN_FRICTION_TRAVEL = 0.02  # A joint that turns less than this says nothing of its own friction [rad]
 _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
+_TORQUE_BIAS_FRACTION = 0.01  # of a joint's effort limit, as the constant error of its torque where none is stated
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 _POSITION_STEP_PERCENT = 5  # places along a segment are told apart in so many percent
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
@@ -42,7 +43,7 @@ _KEYS = (
     "joints left_out=unused_joints not_recorded=unrecorded_joints holder=holder_frame grasps mode=arm_mode time_step"
 )
 _MORE_KEYS = "mode_why=arm_mode_reason start=initial_state start_why=initial_state_reason cutoff=path_cutoff"
-_LAST_KEYS = "clocks=clock_descriptions still=still_joints motor=motor_preset firmware_gain"
+_LAST_KEYS = "clocks=clock_descriptions still=still_joints motor=motor_preset firmware_gain torque_bias_std"
 """Keys of `yid-init/1`, with the attribute where it has another name."""
 
 
@@ -95,6 +96,9 @@ class ProposedConfigChoices:
     motor_preset: str | None  # of its servos, where the robot is known
     firmware_gain: float | None  # its usual proportional gain, where the motor is known and no recording states one
     has_object: bool  # false for an arm alone
+    torque_bias_std: Mapping[
+        str, float
+    ]  # a guess by joint [N m]; empty where the recording states it, or has no effort
 
     def to_dict(self) -> dict[str, Any]:
         """The proposal as plain data, under the keys of `yid-init/1`."""
@@ -191,6 +195,7 @@ def propose_config_choices(
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
         *_motor_and_gain(robot, mode, recordings),
         bool(branches),
+        _torque_bias_std(tree, recorded, joints),
     )
 
 
@@ -201,6 +206,13 @@ def _motor_and_gain(robot: str, mode: str, recordings: Sequence[Recording]) -> t
         return None, None
     stated = any(r.joints is not None and r.joints.proportional_gain is not None for r in recordings)
     return found[0], None if stated else found[1]
+
+
+def _torque_bias_std(tree: Mechanism, recorded: JointGroup, joints: Sequence[str]) -> dict[str, float]:
+    if recorded.effort is None or recorded.effort_bias_std is not None:
+        return {}
+    limits = {name: tree.joints[tree.joint_index(name)].effort_limit for name in joints}
+    return {name: _TORQUE_BIAS_FRACTION * limit for name, limit in limits.items() if 0 < limit < math.inf}
 
 
 # -- arms -------------------------------------------------------------------------------------------------------------

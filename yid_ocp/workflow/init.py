@@ -336,7 +336,7 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
 
 
 def _friction(proposal: ProposedConfigChoices) -> Iterator[str]:
-    about = "of geared arms, its sizes free; which law, `yid-ocp friction` says"
+    about = "of geared arms, its sizes free; `yid-ocp friction` tries every law of the ladder"
     moving = [name for name in proposal.joints if name not in proposal.still_joints]
     if proposal.motor_preset:
         law = {"law": "load"} | ({"joints": moving} if proposal.still_joints else {})
@@ -344,7 +344,7 @@ def _friction(proposal: ProposedConfigChoices) -> Iterator[str]:
     elif moving and not proposal.has_object and proposal.is_identified_from_efforts:
         law = {"law": "coulomb"} | ({"joints": moving} if proposal.still_joints else {})
         yield _line("  ", "friction", _value(law), about)
-    elif proposal.arm_mode == "servo" or proposal.is_identified_from_efforts:
+    elif proposal.arm_mode == "servo" or "joints.effort" in proposal.noise_by_group:
         yield _line("  ", "# friction", "{law: coulomb}", about)
 
 
@@ -391,8 +391,15 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
         if frames := {place.point: place.frame for place in places if place.frame and place.frame != place.point}:
             entries.append(f"frames: {_value(frames)}")
         told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts
-        if group == "joints.effort" and told_by_points:
-            entries, said = ["use: false", *entries], "true once friction and payload of the arm are in the model"
+        if group == "joints.effort":
+            if proposal.torque_bias_std and not proposal.is_identified_from_efforts:
+                biases = {joint: float(f"{std:.2g}") for joint, std in proposal.torque_bias_std.items()}
+                values = _number(next(iter(biases.values()))) if len(set(biases.values())) == 1 else _value(biases)
+                entries.append(f"bias_std: {values}")
+                said += "; bias_std of its constant error: a guess, 1 % of the effort limit"
+            if told_by_points:
+                entries = ["use: false", *entries]
+                said = "use: true looks for friction and payload of the arm; bias_std: 1 % of the effort limit"
         is_mounted = places and "." in group
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
             why = "torques with noise move the arms: set mode: prescribed to use it"
