@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -110,6 +111,30 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     keys = [line for line in text.splitlines() if line.strip() and not line.strip().startswith(("#", "joints:"))]
     bare = [line for line in keys if "#" not in line and not line.rstrip().endswith(":")]
     assert len(bare) <= 6, bare  # what has no comment is said by the line above it
+
+
+def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Arm, unbent object and markers in motion, markers under the names of their frames, so that lines join the two."""
+    assert init(*CABLE) == 0
+    assert "picture of what was guessed: run.html" in capsys.readouterr().out
+    page = Path("run.html").read_text()
+    [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
+    model, measured = (scene[0] if isinstance(scene, list) else scene)["motions"]
+    assert set(measured["points"]) == {"cable:50%", "w_cable"}
+    assert set(measured["points"]) <= set(model["points"])
+    # a straight stick that is seen where it is: points and frames meet all the time
+    for name, at in measured["points"].items():
+        seen, told = (
+            np.array([row[3 * k : 3 * k + 3] for row in own["places"]], float)
+            for own, k in ((measured, at), (model, model["points"][name]))
+        )
+        assert np.nanmax(np.abs(seen - told)) < 30  # tenths of a millimetre
+    # a page that is there already is not written over
+    Path("run.yaml").unlink()
+    assert init(*CABLE) == 2
+    assert "is there already" in capsys.readouterr().err
 
 
 def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None:

@@ -330,7 +330,7 @@ def _compared() -> dict[str, Solver]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareSettings:
+class _CompareSettings:
     """Solvers to compare, each with its own settings."""
 
     methods: Annotated[
@@ -457,7 +457,7 @@ class RunSettings:
     solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("how the cost is lowered")] = field(
         default_factory=GaussNewton
     )
-    compare: Annotated[CompareSettings, OptionInfo("which methods are compared")] = CompareSettings()
+    compare: Annotated[_CompareSettings, OptionInfo("which methods are compared")] = _CompareSettings()
     diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = DiagnosisSettings()
     track: Annotated[TrackSettings, OptionInfo("how a camera's frames are tracked")] = TrackSettings()
     plan: Annotated[PlanSettings, OptionInfo("which motion is planned")] = PlanSettings()

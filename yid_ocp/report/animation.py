@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any
 
@@ -164,12 +164,32 @@ def animation_of_trajectories(
     return Animation(title, t, tuple(motions))
 
 
-def recording_animation(title: str, system: System, theta: Array, recording: Recording) -> Animation | None:
-    """Animation of a recording alone; None where it holds no positions."""
+def recording_animation(
+    title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
+) -> Animation | None:
+    """Animation of a recording alone; None where it holds no positions.
+
+    With `has_straight_object` beside it the model on the recorded angles, its object and marked frames as unbent.
+    """
     clock = max((group.t for group in recording.joint_and_point_groups), key=len)
     told = ConfigurationTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
     motion = _measured_motion(told, recording, t := _frame_times(clock))
-    return Animation(title, t, (motion,)) if motion.sticks or motion.point_indices else None
+    if not (motion.sticks or motion.point_indices):
+        return None
+    if not has_straight_object:
+        return Animation(title, t, (motion,))
+    unbent = replace(told, name="model on the recorded angles, nothing bent")
+    return Animation(title, t, (_model_motion(unbent, _with_recorded_angles(told, recording, t)), motion))
+
+
+def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t: Array) -> Array:
+    """Configurations (F, n) at times t, with the angles that were recorded."""
+    q, joints = told._q_at(t), recording.joints
+    for name, column in () if joints is None else zip(joints.names, joints.position.T, strict=True):
+        if name in told.system.mechanism.joint_names:
+            assert joints is not None
+            q[:, told.system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
+    return q
 
 
 def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Array) -> _AnimatedMotion:
@@ -179,11 +199,7 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     sticks: list[_Stick] = []
     places = np.full((len(t), 0, 3), np.nan)
     if joints is not None and joints.position is not None and moved and moved <= {*joints.names}:
-        q = told._q_at(t)
-        for name, column in zip(joints.names, joints.position.T, strict=True):
-            if name in system.mechanism.joint_names:
-                q[:, system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
-        moved_arms = _model_motion(told, q)
+        moved_arms = _model_motion(told, _with_recorded_angles(told, recording, t))
         sticks, places = [own for own in moved_arms.sticks if not own.is_object_part], moved_arms.positions
     seen: dict[str, Array] = {}
     fresh: dict[str, BoolArray] = {}

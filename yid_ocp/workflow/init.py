@@ -21,6 +21,9 @@ from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.progress import Progress
+from yid_ocp.report.animation import recording_animation
+from yid_ocp.report.html import write_report
+from yid_ocp.report.sections import ReportData
 from yid_ocp.version import package_version
 from yid_ocp.workflow import import_recording
 from yid_ocp.workflow.build import build_system
@@ -45,7 +48,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     proposal = propose_config_choices(robot, recordings, segments, **asked)
     made = _split(made, recordings, proposal, out)
     written = {file: raw for file, raw in made.items() if raw is not None}
-    for file in (out, *written):
+    for file in (out, out.with_suffix(".html"), *written):
         if file.exists() and not arguments.replace:
             raise OutputError("the file is there already", where=str(file), hint="choose another --out, or --replace")
 
@@ -58,10 +61,20 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     about = about if item is None else f"A {arguments.object.replace('_', ' ')} moved by {where}."
     lines = _config_lines(where, about, item, proposal, files, options)
     _write(out, "\n".join(lines) + "\n", written)
-    result = {"format": "yid-init/1", "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
+    result: dict[str, Any] = {
+        "format": "yid-init/1",
+        "configuration": str(out),
+        "recordings": files,
+        "proposal": proposal.to_dict(),
+    }
+    result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
     doubts = [line for own in recordings for line in import_recording.recording_doubt_lines(own) if line]
     print_result(
-        arguments, result, lambda: [*_summary_lines(proposal, out), *doubts], f"configuration: {out}", str(out)
+        arguments,
+        result,
+        lambda: [*_summary_lines(proposal, out, result["picture"] is not None), *doubts],
+        f"configuration: {out}",
+        str(out),
     )
     return EXIT_DONE
 
@@ -165,7 +178,7 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
     write_text(out.parent / _SCHEMA_FILE, json.dumps(config_json_schema(), indent=1) + "\n")
 
 
-def _summary_lines(proposal: ProposedConfigChoices, out: Path) -> list[str]:
+def _summary_lines(proposal: ProposedConfigChoices, out: Path, has_picture: bool) -> list[str]:
     held = ", ".join(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     lines = [
         f"joints: {', '.join(proposal.joints)}",
@@ -175,7 +188,29 @@ def _summary_lines(proposal: ProposedConfigChoices, out: Path) -> list[str]:
     ]
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
-    return [*lines, "", f"next: yid-ocp check {out}, then yid-ocp solve {out}", ""]
+    picture = [f"picture of what was guessed: {out.with_suffix('.html')}"] if has_picture else []
+    return [*lines, *picture, "", f"next: yid-ocp check {out}, then yid-ocp solve {out}", ""]
+
+
+def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices) -> Recording:
+    """The recording with its points called as the frames at which they are guessed to sit."""
+    points = []
+    for group in recording.points:
+        places = {place.point: place.frame or place.point for place in proposal.point_placements.get(group.name, ())}
+        names = tuple(places.get(name, name) for name in group.names)
+        points.append(replace(group, names=names) if len(set(names)) == len(names) else group)
+    return replace(recording, points=tuple(points))
+
+
+def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -> str | None:
+    """Page on which the arm moves as recorded, with the unbent object, marked frames and points; its path, if any."""
+    run, page = load_config(out), out.with_suffix(".html")
+    system = build_system(run)
+    scene = recording_animation(recording.name, system, system.parameters.vector(), recording, has_straight_object=True)
+    if scene is None:
+        return None
+    data = ReportData(f"{out.stem}: what init guessed", run.description, result, animations=[scene])
+    return str(page) if write_report(page, data) else None
 
 
 # -- text of the configuration ----------------------------------------------------------------------------------------
