@@ -16,12 +16,12 @@ from yid_ocp.analysis.discretisation import (
     _MAX_GROWTH_DECADES,
     _N_CHECKED_NODES,
     AlternatingErrorGrowth,
-    FinerDiscretisationProblem,
     _error_growth_along,
     _fine_joints_by_coarse_joint,
+    _FinerDiscretisationProblem,
+    _parameter_shifts_in_finer_model,
     inflate_estimates_by_discretisation,
     largest_alternating_error_growth,
-    parameter_shifts_in_finer_model,
 )
 from yid_ocp.analysis.estimation import _checked_solution_and_step_stability
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -46,8 +46,8 @@ def problem(rows, start, shared=None, **more):
 def shifts(coarse, finer, factors=None, **more):
     """Of the coarse problem's parameters at its initial values."""
     x = coarse.initial_unknowns
-    return parameter_shifts_in_finer_model(
-        FinerDiscretisationProblem(finer, factors or {}), coarse, x, coarse.evaluate(x), **more
+    return _parameter_shifts_in_finer_model(
+        _FinerDiscretisationProblem(finer, factors or {}), coarse, x, coarse.evaluate(x), **more
     )
 
 
@@ -106,8 +106,8 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     guesses = (SimpleNamespace(equilibrium_guess=guess) for guess in (np.array([0.2, -0.4]), None))
     at = replace(coarse.evaluate(coarse.initial_unknowns), episode_predictions=tuple(guesses))
     divided = _fine_joints_by_coarse_joint(coarse.system, fine.system)
-    refined = FinerDiscretisationProblem(fine, {"a": 2.0, "c": 3.0}, divided)
-    parameter_shifts_in_finer_model(refined, coarse, coarse.initial_unknowns, at)
+    refined = _FinerDiscretisationProblem(fine, {"a": 2.0, "c": 3.0}, divided)
+    _parameter_shifts_in_finer_model(refined, coarse, coarse.initial_unknowns, at)
     [(x, (warm, none))] = asked
     point = dict(zip(fine.unknown_names, x, strict=True))
     assert point == {"a": 3.0, "c[run]": 6.0, "b": 7.0, **dict(zip(names, (0.2, 0.2, 0.0, 0.0), strict=True))}
@@ -183,7 +183,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     fine = EstimationProblem(step, [recording], coarse.free, coarse.options, values)
     found = solve(coarse, GaussNewton())
     finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
-    own = parameter_shifts_in_finer_model(FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
+    own = _parameter_shifts_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
     change = finer.x - found.x
     assert np.abs(change).max() > 1e-5
     np.testing.assert_allclose(
@@ -211,8 +211,8 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
     found, finer = (solve(problem, GaussNewton()) for problem in (coarse, anew))
-    refined = FinerDiscretisationProblem(fine)
-    own = parameter_shifts_in_finer_model(refined, found.problem, found.x, found.evaluation)
+    refined = _FinerDiscretisationProblem(fine)
+    own = _parameter_shifts_in_finer_model(refined, found.problem, found.x, found.evaluation)
     std = np.array([found.std[name] for name in free])
     change = (finer.x - found.x) / std
     assert np.abs(change).max() > 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.effects import make_effect
-from yid_ocp.errors import DataError, SolverError
+from yid_ocp.effects import candidate_kinds_and_locations, make_effect
+from yid_ocp.errors import DataError, ModelError, SolverError
 from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -341,3 +342,20 @@ def test_at_neutral_parameters_they_change_nothing(mode, benches, all_effects, s
     for sensor in watched:
         nominal = bench.reading(plain, sensor)
         assert largest(bench.reading(full, sensor) - nominal, nominal) < 1e-10
+
+
+def test_the_clock_of_any_group_of_points_may_be_late_or_early(driven):
+    """Not that of points which the arm measures by its own encoders."""
+    [camera] = [group for group in recording(driven).points if group.name.endswith("camera")]
+    mocap = replace(camera, name="points_mocap", sensor="mocap", pose=None)
+    made = replace(recording(driven, camera=False), points=(*recording(driven, camera=False).points, mocap))
+    assert "points:points_mocap" in recorded_signal_kinds([made])
+    found = candidate_kinds_and_locations(driven.system, recorded_signal_kinds([made]))
+    assert [place for kind, place in found if kind == "camera_latency"] == ["points_mocap"]
+    late = make_effect("camera_latency", "points_mocap", driven.system)
+    assert late.parameters["camera_latency@points_mocap.delay"].lower < 0
+    assert float(ca.DM(late.added_channel_delay("points_arm.w_T2", False))) == 0
+    symbol = late.added_channel_delay("points_mocap.w_T2", False)
+    assert ca.is_equal(symbol, late["delay"])
+    with pytest.raises(ModelError, match="does not fit 'mocap'"):
+        make_effect("camera_latency", "mocap", driven.system)

@@ -271,3 +271,24 @@ def test_torques_beside_encoders_are_never_exact_and_steps_average_their_samples
     assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
     assert problem.episodes[0].grid.time_step == H
     assert len(np.unique(errors.sample_of_step)) == problem.episodes[0].grid.steps
+
+
+@pytest.mark.parametrize("late", [0.03, -0.012])
+def test_a_late_or_early_group_of_points_is_found_by_its_name(urdf_folder, late):
+    """Motion capture beside encoders, on clocks that differ: by what it sees, whichever of them is the late one."""
+    latency = "camera_latency@points_mocap"
+    step = pendulum_step(urdf_folder, [("camera_latency", "points_mocap", {})], prescribed=("shoulder",))
+    source = taken(step, 1, camera=False, steps=150)
+    [group] = source.points
+    source = replace(source, points=(replace(group, name="points_mocap", sensor="mocap", std=1e-3),))
+    options = ProblemOptions(path_cutoff=np.inf)
+    free = ("elbow.damping", f"{latency}.delay")
+    true = EstimationProblem(step, [source], free, options).simulate_synthetic_recording(seed=3)
+    [seen] = true.points
+    made = replace(true, points=(replace(seen, t=seen.t + late),))
+    solution = yid.solve(EstimationProblem(step, [made], free, options))
+    entry = solution.parameters[f"{latency}.delay"]
+    assert abs(entry.value - late) < 3 * entry.std < 0.01
+    damping = solution.parameters["elbow.damping"]
+    assert abs(damping.value - 0.2) < 3 * damping.std
+    assert solution.goodness_of_fit.explains

@@ -38,7 +38,7 @@ _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the t
 
 
 @dataclass(frozen=True)
-class FinerDiscretisationProblem:
+class _FinerDiscretisationProblem:
     """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns.
 
     `parameter_factors` lead from a coarse parameter to the same physical object in the finer model, 1 for absent names;
@@ -88,8 +88,8 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
     return found
 
 
-def parameter_shifts_in_finer_model(
-    refined: FinerDiscretisationProblem,
+def _parameter_shifts_in_finer_model(
+    refined: _FinerDiscretisationProblem,
     coarse: EstimationProblem,
     x: Array,
     at_x: Evaluation,
@@ -177,7 +177,7 @@ def measure_discretisation_shifts(
         progress.begin_stage(f"trying {words}", 2.5, 2.7)
         try:
             refined = _refined_problem(problem, key)
-            own = parameter_shifts_in_finer_model(
+            own = _parameter_shifts_in_finer_model(
                 refined, problem, x, at_x, model_difference_only=model_difference_only
             )
         except YidError as error:
@@ -191,10 +191,10 @@ def measure_discretisation_shifts(
     return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> FinerDiscretisationProblem:
+def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> _FinerDiscretisationProblem:
     options = problem.options
     if what == "time_step" or options.divided_links_model is None:
-        return FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
+        return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
     recordings = [episode.recording for episode in problem.episodes]
     steps, factors = sum(e.grid.steps for e in problem.episodes), options.divided_links_model.parameter_factors
     step = options.divided_links_model.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE)
@@ -204,7 +204,7 @@ def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> Fi
         step, recordings, problem.free, replace(options, prior_stds=priors, multivariate_prior=joint)
     )
     joints = _fine_joints_by_coarse_joint(problem.system, step.system)
-    return FinerDiscretisationProblem(made, factors, joints)
+    return _FinerDiscretisationProblem(made, factors, joints)
 
 
 def inflate_estimates_by_discretisation(

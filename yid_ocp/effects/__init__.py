@@ -33,7 +33,8 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     `ModelError` where the system has no such place for it.
     """
     places = EFFECTS[kind].possible_locations(system)
-    if location not in places:
+    of_points = location.partition("_")[0] == "points"
+    if location not in places and not (EFFECTS[kind].is_at_point_groups and of_points and system.point_frames):
         said = {"allowed": "nothing in this system", "hint": "leave it out"}
         said = unknown_name_error_arguments(location, places) if places else said
         raise ModelError(f"{kind} does not fit '{location}'", where=f"{kind}@{location}", **said)
@@ -49,8 +50,9 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
     """All pairs (effect kind, location) that the system allows and the recorded signals can reveal, ordered by kind.
 
     The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`, or a
-    sensor on a frame such as `wrist:FRAME`. What works only on prescribed joints is left out where no effort was
-    recorded, for there nothing would show it. `ModelError` of another signal.
+    sensor on a frame such as `wrist:FRAME`, or `points:GROUP`, points with a clock of their own. What works only on
+    prescribed joints is left out where no effort was recorded, for there nothing would show it. `ModelError` of
+    another signal.
     """
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
     for name in sorted(name for name in present - known if ":" not in name):
@@ -60,7 +62,11 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
     for kind in EFFECTS:
         cls = EFFECTS[kind]
         if cls.required_sensors <= present:
-            places = (cls.candidate_locations or cls.possible_locations)(system)
-            places = [place for place in places if place in present] if cls.is_at_recorded_sensor else places
+            places = [*(cls.candidate_locations or cls.possible_locations)(system)]
+            if cls.is_at_recorded_sensor or cls.is_at_point_groups:
+                places = [place for place in places if place in present]
+            if cls.is_at_point_groups:
+                kinds_and_groups = (name.split(":") for name in sorted(present) if ":" in name)
+                places += [group for signal, group in kinds_and_groups if signal == "points"]
             found += [(kind, place) for place in places if place not in unseen]
     return found

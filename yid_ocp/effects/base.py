@@ -93,6 +93,8 @@ class EffectBase(Effect):
     is_local: ClassVar[bool] = False
     # whether a location is a sensor, `GROUP:FRAME`, which a diagnosis tries where recordings hold it
     is_at_recorded_sensor: ClassVar[bool] = False
+    # whether a group of points, by its name, is a location too, which a diagnosis tries where recordings hold it
+    is_at_point_groups: ClassVar[bool] = False
     # names of all places where the effect can act, as a function of this module gives them, and of those that a
     # diagnosis tries: all where absent
     possible_locations: ClassVar[Callable[[System], Collection[str]]]

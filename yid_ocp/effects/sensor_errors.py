@@ -100,16 +100,27 @@ class _SurfaceOffset(_CameraEffect):
 
 @EFFECTS.register("camera_latency")
 class _CameraLatency(_CameraEffect):
-    """Seen points are late: seen(t) = true(t - delay)."""
+    """Seen points are late: seen(t) = true(t - delay), of all cameras or of one group of points, by its name.
+
+    A negative delay of a group means that the clock of the joints is the late one.
+    """
 
     equation = "seen point(t) = true point(t - delay)"
     required_excitation = "when it is read"
+    required_sensors = frozenset()
+    is_at_point_groups = True
     declared_parameters = (
         ParameterDefinition("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "how long ago the point was there"),
     )
 
+    @classmethod
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
+        own = cls.declared_parameters
+        return own if location == "camera" else tuple(replace(d, lower=-0.2, prior_range=(-0.05, 0.15)) for d in own)
+
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        return self["delay"] if camera else ca.SX(0)
+        is_late = camera if self.location == "camera" else channel.partition(".")[0] == self.location
+        return self["delay"] if is_late else ca.SX(0)
 
 
 @EFFECTS.register("clock_scale")

@@ -18,6 +18,7 @@ from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_column_indices
 from yid_ocp.sensors.base import channel_kinds_for_group_name
+from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
@@ -194,7 +195,8 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     """Kinds of signals, such as `joints.effort`, that recordings contain and effects can require.
 
-    Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`.
+    Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`, and so is each group of points, no camera's
+    nor an arm's, beside joints: `points:GROUP`.
     """
     found, mounted = set[str](), set[str]()
     for recording in recordings:
@@ -209,6 +211,9 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
             mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
         if any(recorded_camera_pose(group) is not None for group in recording.points):
             found.add("camera")
+        for points in recording.points if recording.joints is not None else ():
+            if recorded_camera_pose(points) is None and not is_point_group_measured_by_arm(points):
+                mounted.add(f"points:{points.name}")
         if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")
     return frozenset(found & signal_kinds_required_by_any_effect() | mounted)
