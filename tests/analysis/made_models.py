@@ -56,7 +56,7 @@ class Formula:
         self.whitening_filters, self.has_process_noise = (None,), False
         weighting, empty = "paper" if noise != 1 else "whitened", {name: {} for name in _BY_NAME}
         common = {"multivariate_prior": MultivariateGaussianPrior(), "path_cutoff": np.inf, "data_issues": ()}
-        common |= {"no_data_issue_exceeds_warning": True, "initial_state": "equilibrium"}
+        common |= {"no_data_issue_exceeds_warning": True, "initial_state": "equilibrium", "stated_std_factor": 1.0}
         self.options = SimpleNamespace(weighting=weighting, **common, **empty)
         everything = samples(
             ("points.tip",), np.full((data, 1), noise), positive_weight_mask=np.ones((data, 1), bool),

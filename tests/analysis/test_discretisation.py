@@ -27,7 +27,7 @@ from yid_ocp.analysis.estimation import _checked_solution_and_step_stability
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
+from yid_ocp.integrator.step import compile_step, copy_of_step_with_time_step, simulate
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -205,9 +205,11 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     drawn = replace(drawn, joints=replace(drawn.joints, **levels), points=(points,))
     free, gains = ("elbow.damping", "elbow.stiffness"), (9.0,)
     options = ProblemOptions(arm_tracking_feedback=feedback, arm_tracking_feedback_gains=gains)
-    truth = EstimationProblem(step_with_time_step(step, 0.0025), [drawn], free, options)
+    truth = EstimationProblem(copy_of_step_with_time_step(step, 0.0025), [drawn], free, options)
     recording = truth.simulate_synthetic_recording(seed=1)
-    coarse, anew = (EstimationProblem(step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02))
+    coarse, anew = (
+        EstimationProblem(copy_of_step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02)
+    )
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
     found, finer = (solve(problem, GaussNewton()) for problem in (coarse, anew))

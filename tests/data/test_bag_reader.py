@@ -265,7 +265,7 @@ def test_wrenches_and_inertial_readings_become_groups_on_the_frames_of_their_hea
     np.testing.assert_allclose(own["torque"], 0.1 * own["force"])
     np.testing.assert_allclose(groups["imu"].values_by_quantity["angular_velocity"][:, 0, 0], 0.1 * np.arange(4))
     np.testing.assert_allclose(groups["imu"].values_by_quantity["specific_force"][:, 0], [[0, 0, 9.81]] * 4)
-    assert groups["imu"].stds_by_attribute == {"angular_velocity_std": pytest.approx(0.02)}
+    assert groups["imu"].noise_and_bias_stds_by_attribute == {"angular_velocity_std": pytest.approx(0.02)}
     assert not any("wrench" in note or "imu" in note for note in recording.notes)
     said = {source.name: source.imported_as for source in preview_file(path).sources}
     assert (said["/left/wrench"], said["/imu/data"]) == ("wrist on /ft_link", "imu on camera_imu")

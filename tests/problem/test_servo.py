@@ -21,7 +21,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.effects import _SENSOR_KINDS, candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import applied_driven_joint_torques, simulate
+from yid_ocp.integrator.step import input_or_servo_torques_of_rollout, simulate
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
@@ -104,7 +104,7 @@ def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
 def test_the_torque_along_a_rollout_is_what_moves_it(step) -> None:
     made = problem_of(step, commanded(), ["shoulder.damping"])
     [result] = made.evaluate(made.initial_unknowns, False).episode_predictions
-    torque = applied_driven_joint_torques(step, made.theta, result.rollout)
+    torque = input_or_servo_torques_of_rollout(step, made.theta, result.rollout)
     q = result.rollout.state[:, :2]
     rate, middle = np.diff(q, axis=0) / H, (q[1:] + q[:-1]) / 2
     demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate

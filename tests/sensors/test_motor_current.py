@@ -100,10 +100,10 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
     write_recording(made, tmp_path / "run.h5")
     again = read_recording(tmp_path / "run.h5")
     [one], [other] = made.channel_groups, again.channel_groups
-    assert (one.name, one.names, one.stds_by_attribute, one.clock) == (
+    assert (one.name, one.names, one.noise_and_bias_stds_by_attribute, one.clock) == (
         other.name,
         other.names,
-        other.stds_by_attribute,
+        other.noise_and_bias_stds_by_attribute,
         other.clock,
     )
     np.testing.assert_array_equal(one.values_by_quantity["current"], other.values_by_quantity["current"])
@@ -132,7 +132,7 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
         ({"values_by_quantity": {"current": np.zeros((400, 2))}}, r"shape \(400, 2\)"),
         ({"values_by_quantity": {"current": np.full((401, 2), np.nan)}}, "not finite"),
         ({"values_by_quantity": {"voltage": np.zeros((401, 2))}}, "no sensor declares a dataset 'voltage'"),
-        ({"stds_by_attribute": {"current_std": -1.0}}, "current_std is -1.0"),
+        ({"noise_and_bias_stds_by_attribute": {"current_std": -1.0}}, "current_std is -1.0"),
         ({"name": "engines"}, "no sensor declares a dataset 'current'"),
         ({"t": T[::-1]}, "does not advance"),
     ],
@@ -149,7 +149,7 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
         (SensorOptions(), {}, "torque constants are not given"),
         (SensorOptions(constants={"torque_constant": 0.0}), {}, "a torque constant is zero"),
         (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "joint 'shoulder' has no value"),
-        (KNOWN, {"stds_by_attribute": {}}, "noise level of the motor currents"),
+        (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "noise level of the motor currents"),
         (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder'"),
         (replace(KNOWN, use=False), {}, "no measurement that the model could be compared with"),
     ],

@@ -265,7 +265,7 @@ def test_noise_of_encoders_is_noise_of_what_the_sensor_weighs(urdf: Path, record
     [
         ({}, {"names": ("hand",)}, "sits on the frame 'hand', which is not there"),
         ({"frames": {"lower": "base"}}, {}, "sits on the frame 'base', which does not move"),
-        ({}, {"stds_by_attribute": {}}, "noise level of force is neither recorded nor given"),
+        ({}, {"noise_and_bias_stds_by_attribute": {}}, "noise level of force is neither recorded nor given"),
         ({"constants": {"sign": 2.0}}, {}, "sign of wrist.force"),
     ],
 )

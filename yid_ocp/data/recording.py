@@ -185,7 +185,7 @@ class SensorChannelGroup(ReprMixin):
         Strictly increasing time [s].
     values_by_quantity : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
         In the channel's unit.
-    stds_by_attribute : mapping of str to float or ndarray, shape (k,)
+    noise_and_bias_stds_by_attribute : mapping of str to float or ndarray, shape (k,)
         Noise by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), where known, in the channel's unit.
     clock : {'recorded', 'nominal'}
     """
@@ -194,16 +194,19 @@ class SensorChannelGroup(ReprMixin):
     names: tuple[str, ...]
     t: Array
     values_by_quantity: Mapping[str, Array]
-    stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
+    noise_and_bias_stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
     clock: ClockKind = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t",))
         values = {key: read_only_array(value, f"{self.name}/{key}") for key, value in self.values_by_quantity.items()}
-        stds = {key: _constant(std, f"{self.name}, attribute {key}") for key, std in self.stds_by_attribute.items()}
+        stds = {
+            key: _constant(std, f"{self.name}, attribute {key}")
+            for key, std in self.noise_and_bias_stds_by_attribute.items()
+        }
         object.__setattr__(self, "values_by_quantity", values)
-        object.__setattr__(self, "stds_by_attribute", stds)
+        object.__setattr__(self, "noise_and_bias_stds_by_attribute", stds)
 
     def _summary(self) -> ReprLineAndTableRows:
         quantities = ", ".join(self.values_by_quantity)
@@ -456,7 +459,7 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
     declared = {channel.quantity: channel for channel in channel_kinds_for_group_name(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
-    own, stds = group.values_by_quantity, group.stds_by_attribute
+    own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
     require_data(own, "the group has no values", where, ", ".join(declared))
     for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:

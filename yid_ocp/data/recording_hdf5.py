@@ -87,7 +87,7 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
             _write_group(file.create_group(group.name), vars(group), _POINT_UNITS, attributes)
         for channels in recording.channel_groups:
             units = {"t": "s"} | {c.quantity: c.unit for c in channel_kinds_for_group_name(channels.name)}
-            content, stds = {**vars(channels), **channels.values_by_quantity}, channels.stds_by_attribute
+            content, stds = {**vars(channels), **channels.values_by_quantity}, channels.noise_and_bias_stds_by_attribute
             _write_group(file.create_group(channels.name), {**content, **stds}, units, ("names", "clock", *stds))
         if recording.marker_reference_pose is not None:
             file.create_dataset(_STRAIGHT, data=recording.marker_reference_pose).attrs["unit"] = "m"

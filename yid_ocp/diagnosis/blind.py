@@ -21,7 +21,7 @@ from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import AllCandidatesLinearization, linearize_candidates
 from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.effects.base import EffectBase, segment_elastic_joints
+from yid_ocp.effects.base import EffectBase, elastic_joints_within_segment
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -387,7 +387,7 @@ class BlindCaseGenerator:
             size *= self._largest_torque(location)
         elif part_of == "stiffness":
             start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
-            bends = any(spring.deformation == "bend" for spring in segment_elastic_joints(system, location))
+            bends = any(spring.deformation == "bend" for spring in elastic_joints_within_segment(system, location))
             size *= float(start.get(f"{location}.bend", 10.0)) if bends else 10.0
         return InjectedEffect(kind, location, {"size": size})
 

@@ -26,7 +26,7 @@ import scipy.sparse
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.integrator.step import Step, applied_driven_joint_torques
+from yid_ocp.integrator.step import Step, input_or_servo_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState, System
@@ -66,7 +66,7 @@ class InverseDynamicsModel:
         function = self._function.map(len(nodes))
         squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
         applied = np.zeros((len(nodes), n))
-        torque = applied_driven_joint_torques(self._step, theta, rollout)
+        torque = input_or_servo_torques_of_rollout(self._step, theta, rollout)
         driven, prescribed = system.driven_coordinate_indices, system.prescribed_coordinate_indices
         for indices, effort in ((driven, torque), (prescribed, rollout.effort)):
             if indices:

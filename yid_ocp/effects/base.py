@@ -340,7 +340,7 @@ def segment_name_of_frame(system: System, frame: str) -> str | None:
     return next((s.name for s in system.segment_layouts if any(name in link for link in s.link_joints)), None)
 
 
-def segment_elastic_joints(system: System, segment: str) -> tuple[ElasticJoint, ...]:
+def elastic_joints_within_segment(system: System, segment: str) -> tuple[ElasticJoint, ...]:
     """The elastic joints (spring and damper) that belong to a segment."""
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 

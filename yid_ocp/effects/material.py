@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_elastic_joints, segment_names
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elastic_joints_within_segment, segment_names
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
@@ -19,7 +19,7 @@ _MIN_LARGEST_ANGLE = 0.02  # taken for a smaller one [rad]
 
 def _bending_stiffness(system: System, segment: str) -> float:
     """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
-    springs = segment_elastic_joints(system, segment)
+    springs = elastic_joints_within_segment(system, segment)
     chosen = [s.stiffness for s in springs if s.deformation == "bend"] or [s.stiffness for s in springs]
     if not chosen:
         return 1.0
@@ -34,7 +34,9 @@ class _SegmentEffect(EffectBase):
 
     def _springs(self, state: MidpointState) -> list[tuple[ElasticJoint, int]]:
         index = state.system.mechanism.joint_index
-        return [(spring, index(spring.joint_name)) for spring in segment_elastic_joints(state.system, self.location)]
+        return [
+            (spring, index(spring.joint_name)) for spring in elastic_joints_within_segment(state.system, self.location)
+        ]
 
 
 class _SegmentMemory(_SegmentEffect):
@@ -44,7 +46,7 @@ class _SegmentMemory(_SegmentEffect):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        return tuple(spring.joint_name for spring in segment_elastic_joints(system, location))
+        return tuple(spring.joint_name for spring in elastic_joints_within_segment(system, location))
 
 
 class _SpringChange(_SegmentEffect):
@@ -176,7 +178,7 @@ class RestCurvature(_SpringChange):
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of qx and qy [rad], added to the rest angle of every joint that bends about x or y."""
-        axes = {spring.axis for spring in segment_elastic_joints(system, location)}
+        axes = {spring.axis for spring in elastic_joints_within_segment(system, location)}
         text = "rest angle of every joint about"
         return tuple(
             ParameterDefinition(f"q{axis}", "rad", 0.0, -1.0, 1.0, (-0.3, 0.3), f"{text} {axis}")

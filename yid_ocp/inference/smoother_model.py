@@ -31,7 +31,7 @@ from yid_ocp.inference.linearized_residual import (
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import (
-    applied_driven_joint_torques,
+    input_or_servo_torques_of_rollout,
     moving_observable_state_mask,
     step_derivatives_along_rollout,
 )
@@ -192,7 +192,7 @@ def _loads(course: _LinearizedEpisode) -> Array:
         values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.nominal.theta)).ravel()
         for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-    torque = applied_driven_joint_torques(course.problem.step, course.nominal.theta, rollout)
+    torque = input_or_servo_torques_of_rollout(course.problem.step, course.nominal.theta, rollout)
     for indices, force in (
         (system.driven_coordinate_indices, torque),
         (system.prescribed_coordinate_indices, rollout.effort),

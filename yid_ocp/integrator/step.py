@@ -200,7 +200,7 @@ def compile_step(
     return Step(model, CompiledKernel(model, library), is_compiled=True)
 
 
-def step_with_time_step(step: Step, time_step: float) -> Step:
+def copy_of_step_with_time_step(step: Step, time_step: float) -> Step:
     """A copy of a step with another (positive) time step [s] that shares equations and compiled code."""
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_correction_tolerance(time_step))
     return Step(model, step.kernel.with_step_model(model), step.is_compiled)
@@ -301,7 +301,7 @@ def checked_rollout_inputs(
     return RolloutInputs(values, begin, inputs, course, feedback, directions)
 
 
-def applied_driven_joint_torques(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
+def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
     """Torque that acts on driven joints in every step, (N, nu) [N m]: the input, or the torque of position servos."""
     system, h = step.system, step.time_step
     if not system.servos:

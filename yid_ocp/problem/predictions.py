@@ -271,7 +271,7 @@ def _channel_groups(
         choice = predictor.options.sensors.get(sensor.group_name, SensorOptions())
         stds: dict[str, Array] = {}
         for attribute, own in zip(sensor.channel.std_attribute_names, (choice.std, choice.bias_std), strict=True):
-            given = own if own is not None else original.stds_by_attribute.get(attribute)
+            given = own if own is not None else original.noise_and_bias_stds_by_attribute.get(attribute)
             if given is not None:
                 stds[attribute] = expand_to_joint_values(given, original.names, names, f"sensors.{sensor.group_name}")
         function = predictor.model_functions.compiled_sensor_function(sensor)
@@ -283,8 +283,8 @@ def _channel_groups(
         values = values + _noisy(np.zeros(values.shape[1:]), np.broadcast_to(bias[widen], values.shape[1:]), rng)
         before = made.get(name, SensorChannelGroup(name, names, episode.grid.node_times, {}))
         by_quantity = {**before.values_by_quantity, quantity: values}
-        by_attribute = {**before.stds_by_attribute, **stds}
-        made[name] = replace(before, values_by_quantity=by_quantity, stds_by_attribute=by_attribute)
+        by_attribute = {**before.noise_and_bias_stds_by_attribute, **stds}
+        made[name] = replace(before, values_by_quantity=by_quantity, noise_and_bias_stds_by_attribute=by_attribute)
     return tuple(made.values())
 
 

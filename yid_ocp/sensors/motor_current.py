@@ -63,7 +63,7 @@ def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorDa
         if name not in around.system.mechanism.joint_names:
             hint = nearest_name_hint(name, around.system.mechanism.joint_names)
             raise DataError(f"the model has no joint '{name}'", where=where, hint=hint)
-    stated = [group.stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
+    stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
     if constants is None:

@@ -80,7 +80,7 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
             )
             hint = f"{nearest_name_hint(frame, moving)} (sensors.{key}.frames: {{{name}: FRAME}}, or use: false)"
             raise DataError(what, where=where, allowed="a frame that moves with a joint of the model", hint=hint)
-    stated = [group.stds_by_attribute.get(attribute) for attribute in channel.std_attribute_names]
+    stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in channel.std_attribute_names]
     std = stated[0] if choice.std is None else choice.std
     if std is None:
         what = f"the noise level of {channel.quantity} is neither recorded nor given"

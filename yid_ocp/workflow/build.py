@@ -169,7 +169,9 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
         what = f"a {kind}'s lengths come from recordings"
         raise run.config_error(what, "recordings", "estimate", hint="list at least one")
     with add_setting_location_to_errors(run, "model", "object"):
-        return item.clamped_system(typical_point_pair_distances(item.topology().edges, recordings), run.model.gravity)
+        return item.build_system_with_clamps(
+            typical_point_pair_distances(item.topology().edges, recordings), run.model.gravity
+        )
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:

@@ -450,7 +450,7 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
             found[f"joints.{channel}"] = noise
     for key, group, kind in _mounted_channels(recording):
         noise = _GroupNoise(None, kind.unit, _STATED_NOISE)
-        if kind.std_attribute_names[0] not in group.stds_by_attribute:
+        if kind.std_attribute_names[0] not in group.noise_and_bias_stds_by_attribute:
             values = group.values_by_quantity[kind.quantity]
             sizes = (_size(group.t, column) for column in values.reshape(len(values), -1).T)
             noise = _GroupNoise(max(1e-3, *sizes), kind.unit, _SEEN_NOISE)

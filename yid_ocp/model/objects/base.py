@@ -253,7 +253,7 @@ class ClampedObject(Protocol):
     def topology(self) -> CableTopology:
         """The object's vertices and clamps; `DataError` or `ModelError` if they are inconsistent."""
 
-    def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
+    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
         """Build the system of object and clamps from the measured edge lengths [m] and gravity [m/s^2]."""
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:

@@ -327,7 +327,7 @@ model:
                 raise ModelError(f"there is no branch '{name}'", where=f"branch_properties.{name}", hint=hint)
         return found
 
-    def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
+    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
         return clamped_cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
