@@ -197,7 +197,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
 
 
 def _init(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("robot", metavar="ROBOT", help="URDF file, or package:NAME such as package:ur5")
+    parser.add_argument("robot", metavar="ROBOT", help="URDF or MJCF file, or package:NAME such as package:ur5")
     text = "recordings of it, or files that `import` understands; several: the last ones are held out"
     parser.add_argument("files", metavar="FILE", nargs="+", help=text)
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")

@@ -145,7 +145,7 @@ class ModelSettings:
     robot: Annotated[
         _FilePath | None,
         OptionInfo(
-            "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; "
+            "URDF or MJCF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; "
             "null for an object held by the world or by clamps"
         ),
     ] = None
@@ -370,7 +370,7 @@ class _VirtualFramesSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackSettings:
+class _TrackSettings:
     """How points are tracked in the frames of a depth camera."""
 
     frames_path: Annotated[
@@ -406,7 +406,7 @@ class TrackSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanSettings(PlanOptions):
+class _PlanSettings(PlanOptions):
     """Goal of a planned motion and the run that supplies the parameters."""
 
     parameter_run: Annotated[
@@ -459,8 +459,8 @@ class RunSettings:
     )
     compare: Annotated[_CompareSettings, OptionInfo("which methods are compared")] = _CompareSettings()
     diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = DiagnosisSettings()
-    track: Annotated[TrackSettings, OptionInfo("how a camera's frames are tracked")] = TrackSettings()
-    plan: Annotated[PlanSettings, OptionInfo("which motion is planned")] = PlanSettings()
+    track: Annotated[_TrackSettings, OptionInfo("how a camera's frames are tracked")] = _TrackSettings()
+    plan: Annotated[_PlanSettings, OptionInfo("which motion is planned")] = _PlanSettings()
     output: Annotated[OutputSettings, OptionInfo("where results go")] = OutputSettings()
     name: str = "run"  # stem of the configuration file
     config_file: str = field(default="", compare=False)  # its path, empty for none

@@ -22,6 +22,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.files import MAX_TEXT_BYTES, check_input_file, is_file
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
+from yid_ocp.model.mjcf_robot import parsed_mjcf
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import (
     homogeneous_transform,
@@ -107,7 +108,7 @@ def read_urdf(
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
 ) -> Mechanism:
-    """Read a mechanism from a URDF file, with the chosen joints movable and all others locked.
+    """Read a mechanism from a URDF or MJCF file, with the chosen joints movable and all others locked.
 
     Each kept joint's bodies have the parameter `JOINT.mass` [kg] (inertia in proportion). Links without a kept joint
     above them are fixed to the world. Every link is a frame of its name.
@@ -126,7 +127,8 @@ def read_urdf(
     Raises
     ------
     ModelError
-        Missing or malformed file, unknown joint, joint type that is not revolute, continuous, prismatic or fixed.
+        Missing or malformed file, MJCF without `mujoco`, unknown joint, or joint type that is not revolute, continuous,
+        prismatic or fixed.
     """
     file, locked = resolve_urdf_path(path), dict(locked or {})
     if not is_file(file):
@@ -185,9 +187,11 @@ def _proximal_links(link: str, frames: Mapping[str, tuple[_Carrier, Array, str]]
 
 
 def _parsed(file: Path) -> SimpleNamespace:
-    """Name, links and joints of a URDF file, as far as a mechanism needs them."""
+    """Name, links and joints of a URDF or MJCF file, as far as a mechanism needs them."""
     try:
         robot = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot()
+        if robot.tag == "mujoco":
+            return parsed_mjcf(file)
         _check_numbers(robot, str(file))
         links = [
             SimpleNamespace(name=link.attrib["name"], inertial=_read_inertial(link.find("inertial")))

@@ -22,12 +22,13 @@ from yid_ocp.errors import DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.mjcf_robot import mjcf_joint_constants
 from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.system import floating_joint_mechanism
-from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role, unknown_name_error
@@ -137,6 +138,7 @@ def arms_are_estimated_states(run: RunSettings) -> bool:
 
 def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float], float]:
     said, has_object = run.model.damping, run.model.object is not None
+    of_file = {name: own["damping"] for name, own in _robot_file_constants(run).items() if "damping" in own}
     if isinstance(said, Mapping):
         known = (*joints, _OBJECT_DAMPING_KEY) if has_object else joints
         for name in said:
@@ -148,9 +150,9 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
             hint = f"set model.damping.{_OBJECT_DAMPING_KEY}"
             raise run.config_error(what, "model", "damping", allowed=allowed, hint=hint)
         of_object = said.get(_OBJECT_DAMPING_KEY, _DEFAULT_JOINT_DAMPING)
-        damping = {name: said.get(name, _DEFAULT_JOINT_DAMPING) for name in joints}
+        damping = {name: said.get(name, of_file.get(name, _DEFAULT_JOINT_DAMPING)) for name in joints}
     else:
-        damping, of_object = dict.fromkeys(joints, said), said
+        damping, of_object = {name: of_file.get(name, said) for name in joints}, said
     for name, spring in run.model.springs.items():
         if name not in joints:
             raise unknown_name_error(run, "joint", name, joints, "model", "springs", name)
@@ -184,6 +186,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
             system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
+    system = _with_robot_file_constants(run, system)
     chosen, entries = settings_by_parameter_name(run, system.parameters), []
     for entry in system.parameters:
         if entry.name in chosen:
@@ -199,6 +202,29 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
                 entry = replace(entry, value=value, lower=lower, upper=upper)
         entries.append(entry)
     return replace(system, parameters=Parameters(entries))
+
+
+def _with_robot_file_constants(run: RunSettings, system: System) -> System:
+    """The system with armature, dry friction and servos of an MJCF file, which values of the settings override."""
+    present = {f"{said.kind}@{said.location}" for said in run.model.effects if said.values}
+    kinds = {"armature": ("rotor_inertia", "armature"), "frictionloss": ("joint_coulomb", "tau_c")}
+    for joint, own in _robot_file_constants(run).items():
+        if joint not in (*system.driven, *system.prescribed):
+            continue
+        values = {f"{joint}.{key}": own[key] for key in ("servo_gain", "servo_damping") if key in own}
+        for key in kinds.keys() & own.keys():
+            kind, parameter = kinds[key]
+            name = f"{kind}@{joint}"
+            if f"{name}.{parameter}" not in system.parameters:
+                system = system.with_effects([make_effect(kind, joint, system)])
+            values |= {f"{name}.{parameter}": own[key]} if name not in present else {}
+        values = {name: value for name, value in values.items() if name in system.parameters}
+        system = replace(system, parameters=system.parameters.with_nominal_values(values))
+    return system
+
+
+def _robot_file_constants(run: RunSettings) -> dict[str, dict[str, float]]:
+    return {} if run.model.robot is None else mjcf_joint_constants(resolve_urdf_path(run.model.robot))
 
 
 def _matches(name: str, key: str) -> bool:

@@ -1,0 +1,217 @@
+"""Robots from MJCF files: MuJoCo compiles the file, and its bodies and joints become those of a URDF file."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.arrays import Array
+from yid_ocp.errors import ModelError
+
+log = logging.getLogger(__name__)
+_JOINT_TYPES = {2: "prismatic", 3: "revolute"}
+_JOINT_EQUALITY, _WORLD = 2, "world"
+
+
+def parsed_mjcf(file: Path) -> SimpleNamespace:
+    """Name, links and joints of an MJCF file, as `read_urdf` takes them from a URDF file; logs what is left out.
+
+    A body is a link with its inertial, or with what MuJoCo computes from its geoms; sites are frames. Coordinates are
+    MuJoCo's, `ref` included. A joint that an equality ties to another one linearly follows it, as `mimic` does.
+
+    `ModelError` where `mujoco` is not installed or refuses the file, or a joint is free or a ball.
+    """
+    model = _compiled_file(file)
+    links = [SimpleNamespace(name=_WORLD, inertial=None)]
+    joints: list[SimpleNamespace] = []
+    follows = _followed_joints(model)
+    for i in range(1, model.nbody):
+        own_links, own_joints = _body(model, i, follows, str(file))
+        links += own_links
+        joints += own_joints
+    for i in range(model.nsite):
+        name = model.site(i).name
+        if name and name not in {link.name for link in links}:
+            links.append(SimpleNamespace(name=name, inertial=None))
+            at = _pose(model.site_pos[i], model.site_quat[i])
+            joints.append(_fixed(f"{name}_site", _body_name(model, model.site_bodyid[i]), name, at))
+    return SimpleNamespace(name=file.stem, links=links, joints=joints)
+
+
+def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
+    """Constants of an MJCF file's joints that are not zero, by joint and name; empty for other files.
+
+    They are `armature` [kg m^2], `damping` [N m s/rad], `frictionloss` [N m], and of a position actuator `servo_gain`
+    [N m/rad] and `servo_damping` [N m s/rad]. Errors as `parsed_mjcf`.
+    """
+    if file.suffix.lower() != ".xml" or b"<mujoco" not in file.read_bytes():
+        return {}
+    model = _compiled_file(file)
+    found: dict[str, dict[str, float]] = {model.joint(j).name: {} for j in range(model.njnt)}
+    for j in range(model.njnt):
+        dof, own = int(model.jnt_dofadr[j]), found[model.joint(j).name]
+        for name, values in (
+            ("armature", model.dof_armature),
+            ("damping", model.dof_damping),
+            ("frictionloss", model.dof_frictionloss),
+        ):
+            own |= {name: float(np.ravel(values[dof])[0])} if np.ravel(values[dof])[0] > 0 else {}
+    for i in filter(lambda i: _is_position_actuator(model, i), range(model.nu)):
+        gain, damping = float(model.actuator_gainprm[i, 0]), -float(model.actuator_biasprm[i, 2])
+        found[model.joint(int(model.actuator_trnid[i, 0])).name] |= {"servo_gain": gain, "servo_damping": damping}
+    return {name: own for name, own in found.items() if own}
+
+
+def _is_position_actuator(model: Any, i: int) -> bool:
+    """Whether an actuator is a position servo of a joint, its gain the same for command and measurement."""
+    alike = float(model.actuator_biasprm[i, 1]) == -float(model.actuator_gainprm[i, 0]) != 0
+    return alike and int(model.actuator_trntype[i]) == 0 and float(model.actuator_gear[i, 0]) == 1.0
+
+
+def _compiled_file(file: Path) -> Any:
+    return _compiled(file, file.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4)
+def _compiled(file: Path, changed: int) -> Any:
+    """Compiled model of a file as it was at a time; what is not taken over of it is logged once."""
+    try:
+        import mujoco
+    except ImportError as error:
+        what, hint = "reading MJCF files needs mujoco", "pip install 'yid-ocp[blind]'"
+        raise ModelError(what, where=str(file), hint=hint) from error
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except Exception as error:  # MuJoCo raises ValueError, and others for files that are missing
+        what = f"MuJoCo cannot read the file: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
+        hint = "open it in MuJoCo's viewer; meshes have to lie where the file says"
+        raise ModelError(what, where=str(file), allowed="MJCF that MuJoCo compiles", hint=hint) from error
+    for sentence in _left_out(model, _followed_joints(model)):
+        log.warning("%s: %s", file.name, sentence)
+    return model
+
+
+def _body(
+    model: Any, i: int, follows: dict[str, SimpleNamespace], where: str
+) -> tuple[list[SimpleNamespace], list[SimpleNamespace]]:
+    """Links and joints of one body: a link for each joint but the last, and one of the body itself."""
+    name, parent = _body_name(model, i), _body_name(model, model.body_parentid[i])
+    mass, inertial = float(model.body_mass[i]), None
+    if mass > 0:
+        turn = _pose(model.body_ipos[i], model.body_iquat[i])
+        tensor = np.diag(model.body_inertia[i])
+        inertial = SimpleNamespace(mass=mass, inertia=tensor, origin=turn)
+    links, joints = [SimpleNamespace(name=name, inertial=inertial)], []
+    # where the next joint's frame lies in the link before it
+    at, last = _pose(model.body_pos[i], model.body_quat[i]), np.zeros(3)
+    first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
+    for j in range(first, first + count):
+        joint, kind = model.joint(j), _JOINT_TYPES.get(int(model.jnt_type[j]))
+        label = joint.name or f"{name}_joint{j - first + 1 if count > 1 else ''}"
+        if kind is None:
+            what, allowed = f"joint '{label}' is free or a ball", "hinge and slide joints"
+            raise ModelError(what, where=where, allowed=allowed, hint="fix the base, or use several hinges")
+        place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
+        origin = at @ _shift(place - last) @ _moved(axis, -ref, kind)
+        carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
+        if carried != name:
+            links.append(SimpleNamespace(name=carried, inertial=None))
+        joints.append(
+            SimpleNamespace(
+                name=label,
+                type=kind if model.jnt_limited[j] or kind == "prismatic" else "continuous",
+                origin=origin,
+                axis=np.array(axis),
+                limit=_limits(model, j),
+                mimic=follows.get(label),
+                parent=parent,
+                child=carried,
+            )
+        )
+        parent, at, last = carried, np.eye(4), place
+    if parent != name:
+        joints.append(_fixed(f"{name}_fixed", parent, name, at @ _shift(-last)))
+    return links, joints
+
+
+def _limits(model: Any, j: int) -> SimpleNamespace:
+    """Bounds of a joint, and of its effort by `actuatorfrcrange` or by the forces of its actuators."""
+    lower, upper = model.jnt_range[j] if model.jnt_limited[j] else (None, None)
+    efforts = [float(np.abs(model.jnt_actfrcrange[j]).max())] if model.jnt_actfrclimited[j] else []
+    for i in range(model.nu):
+        if model.actuator_trntype[i] == 0 and model.actuator_trnid[i, 0] == j and model.actuator_forcelimited[i]:
+            efforts.append(float(np.abs(model.actuator_forcerange[i] * model.actuator_gear[i, 0]).max()))
+    return SimpleNamespace(lower=lower, upper=upper, effort=min(efforts, default=None), velocity=None)
+
+
+def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
+    """Joint that each joint follows by a linear equality, with multiplier and offset, by name."""
+    found = {}
+    for i in range(model.neq):
+        first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+        linear = not np.any(model.eq_data[i, 2:5])
+        if int(model.eq_type[i]) == _JOINT_EQUALITY and second >= 0 and linear and model.eq_active0[i]:
+            refs = [float(model.qpos0[model.jnt_qposadr[j]]) for j in (first, second)]
+            offset, factor = float(model.eq_data[i, 0]), float(model.eq_data[i, 1])
+            law = {"multiplier": factor, "offset": offset + refs[0] - factor * refs[1]}
+            found[model.joint(first).name] = SimpleNamespace(joint=model.joint(second).name, **law)
+    return found
+
+
+def _left_out(model: Any, follows: dict[str, SimpleNamespace]) -> Iterator[str]:
+    """Sentences on what the file holds and the mechanism does not."""
+
+    motors = sum(not _is_position_actuator(model, i) for i in range(model.nu))
+    others = {
+        "actuators other than position servos": (motors, "recorded or driving efforts are torques at the joint"),
+        "equalities": (model.neq - len(follows), "welds and connects: model.grasp"),
+        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "model.springs"),
+        "tendons": (model.ntendon, ""),
+        "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), ""),
+    }
+    for noun, (count, remedy) in others.items():
+        if count:
+            yield f"{noun}: {count} not taken over" + (f" ({remedy})" if remedy else "")
+
+
+def _body_name(model: Any, i: int) -> str:
+    return model.body(int(i)).name or f"body{int(i)}" if i else _WORLD
+
+
+def _fixed(name: str, parent: str, child: str, origin: Array) -> SimpleNamespace:
+    limit = SimpleNamespace(lower=None, upper=None, effort=None, velocity=None)
+    own = {"axis": np.array([1.0, 0, 0]), "limit": limit, "mimic": None, "parent": parent, "child": child}
+    return SimpleNamespace(name=name, type="fixed", origin=origin, **own)
+
+
+def _pose(position: Array, quaternion: Array) -> Array:
+    w, x, y, z = quaternion / math.sqrt(float(quaternion @ quaternion))
+    turn = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, position
+    return pose
+
+
+def _shift(translation: Array) -> Array:
+    pose = np.eye(4)
+    pose[:3, 3] = translation
+    return pose
+
+
+def _moved(axis: Array, amount: float, kind: str) -> Array:
+    """Pose of a joint's moving side at a coordinate."""
+    if kind == "prismatic":
+        return _shift(amount * axis)
+    half = 0.5 * amount
+    return _pose(np.zeros(3), np.array([math.cos(half), *(math.sin(half) * axis)]))
