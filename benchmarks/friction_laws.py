@@ -1,0 +1,201 @@
+"""Every law of joint friction in recordings of another engine: is its size found, and is it told from its neighbour?
+
+    python benchmarks/friction_laws.py [--laws NAME ...] [--seeds FIRST LAST] [--size usual | small] [--file FILE]
+
+One geared joint with a pendulum (`configs/servo_pendulum.yaml`) follows 3 s of commands in MuJoCo, whose own solver
+holds and slides it: the size of its dry friction is set anew at every inner step (Dahl's law is a torque there). The
+encoder counts 4096 steps a turn after 0.5 mrad of noise. The recording is fitted with its own law and with the
+neighbour that lacks one amplitude of it. Found: that amplitude lies within two stated standard deviations. Told: the
+neighbour is less likely by odds of 150 to 1, one parameter counting as one. `small` is three times what is detectable.
+Results are appended to FILE as lines of JSON, so that slices of seeds add up; the table is of all that is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import ParameterSettings, RunSettings
+from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
+from yid_ocp.solvers import solve
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.build_problem import build_problem
+
+CONFIG = Path(__file__).resolve().parents[1] / "configs" / "servo_pendulum.yaml"
+DURATION, RATE, INNER_STEP = 3.0, 200.0, 1e-4  # [s], [Hz], [s]
+ANGLE_STD, COUNT = 5e-4, 2 * math.pi / 4096  # [rad]
+YIELD_ANGLE, STRIBECK_SPEED, COUNTER_VOLTAGE = 0.01, 0.1, 0.04  # [rad], [rad/s], [N m s/rad]
+KNOWN = {
+    "joint.servo_damping": COUNTER_VOLTAGE, "joint.servo_torque_limit": 5.0, "joint.servo_delay": 0.0,
+    "joint.servo_gain_factor": 400.0, "encoder_offset@joint.offset": 0.0,
+}  # fmt: skip
+FREE = {"joint.servo_gain": 0.005, "rotor_inertia@joint.armature": 0.0018, "joint.damping": 0.004}
+USUAL = {
+    "joint_coulomb@joint.tau_c": 0.03, "joint_load_friction@joint.share": 0.15,
+    "joint_stribeck@joint.tau_s": 0.03, "joint_stribeck@joint.v_stribeck": STRIBECK_SPEED,
+    "joint_presliding@joint.tau_c": 0.03, "joint_presliding@joint.yield_angle": YIELD_ANGLE,
+}  # fmt: skip
+# law: the amplitude that its neighbour on the ladder lacks, and the neighbour
+LADDER = {
+    "coulomb": ("joint_coulomb@joint.tau_c", "viscous"),
+    "stribeck": ("joint_stribeck@joint.tau_s", "coulomb"),
+    "presliding": ("joint_presliding@joint.tau_c", "viscous"),
+    "load": ("joint_load_friction@joint.share", "coulomb"),
+    "load_stribeck": ("joint_stribeck@joint.tau_s", "load"),
+}
+
+
+@dataclass
+class GearFriction:
+    """Friction of one joint by a law's amplitudes, from the start of the motion on."""
+
+    amplitudes: Mapping[str, float]
+    state: float = 0.0  # of Dahl's law
+    moves: bool = False
+
+    def edit_model(self, model: Any) -> None:
+        """Give the joint a friction that holds as firmly as the inner step allows."""
+        model.dof_frictionloss[:] = 1e-9
+        model.dof_solref[:, 0], model.dof_solimp[:, :2] = 10 * INNER_STEP, 0.999
+
+    def start_motion(self, data: Any) -> None:
+        """Let it rub."""
+        self.moves = True
+
+    def add_forces(self, model: Any, data: Any) -> None:
+        """Set the size of the next inner step."""
+        if not self.moves:
+            return
+        said = {name.partition("@")[0]: value for name, value in self.amplitudes.items() if "v_stri" not in name}
+        speed = float(data.qvel[0])
+        weight = model.body_subtreemass[model.jnt_bodyid[0]] * model.opt.gravity
+        reach = data.subtree_com[model.jnt_bodyid[0]] - data.xanchor[0]
+        load = float(data.qfrc_actuator[0] - COUNTER_VOLTAGE * speed - data.xaxis[0] @ np.cross(reach, weight))
+        size = said.get("joint_coulomb", 0.0) + said.get("joint_load_friction", 0.0) * abs(load)
+        size += said.get("joint_stribeck", 0.0) * math.exp(-((speed / STRIBECK_SPEED) ** 2))
+        model.dof_frictionloss[:] = max(size, 1e-9)
+        if (held := self.amplitudes.get("joint_presliding@joint.tau_c", 0.0)) > 0:
+            part = math.exp(-abs(speed) * INNER_STEP / YIELD_ANGLE)
+            self.state = math.copysign(1 - part, speed) + self.state * part
+            data.qfrc_passive[0] -= held * self.state
+
+
+def settings(law: str, file: str | None, start: Mapping[str, float]) -> RunSettings:
+    """The shipped configuration with one law of friction, the motor's gain and the joint's inertia unknown."""
+    own = [] if file is None else [file]
+    changed = ["recordings.held_out=[]", f"recordings.estimate={json.dumps(own)}", "model.arms.servo.motor={kind: dc}"]
+    changed += ["model.friction=null" if not law else f"model.friction={{law: {law}}}"]
+    run = load_config(CONFIG, changed)
+    given = {name: ParameterSettings(initial=value) for name, value in KNOWN.items()}
+    given |= {name: ParameterSettings(initial=value, free=True) for name, value in FREE.items()}
+    given |= {name: ParameterSettings(initial=value, free=True) for name, value in start.items()}
+    sensor = replace(run.sensors["joints.position"], std=None)
+    return replace(run, parameters=given, sensors={**run.sensors, "joints.position": sensor})
+
+
+def recorded(seed: int, amplitudes: Mapping[str, float]) -> Recording:
+    """One motion of the joint in MuJoCo: commands and counted angles."""
+    system = build_system(settings("", None, {}))
+    values = {name: value for name, value in {**KNOWN, **FREE}.items() if name in system.parameters}
+    excitation = MultisineOptions(
+        gripper_travel=0.25, max_joint_speed=6.0, duration=DURATION, frequency_band=(0.3, 2.0), ramp_time=0.5
+    )
+    start = {"joint": 0.3}
+    experiment = VirtualExperimentSettings(
+        motion=random_multisine_motion(system, values, seed=seed, initial_joint_angles=start, excitation=excitation),
+        initial_joint_angles=start,
+        simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),
+        arm_noise=ArmSensorNoise(position_std=ANGLE_STD),
+        injected_terms=GearFriction(amplitudes),
+        camera=None,
+        seed=seed,
+        recording_name=f"friction_{seed}",
+    )
+    made = run_virtual_experiment(system, values, experiment)
+    assert made.joints is not None
+    counted = COUNT * np.rint(made.joints.position / COUNT)
+    joints = replace(made.joints, position=counted, position_resolution=COUNT, proportional_gain=400.0)
+    return replace(made, joints=replace(joints, velocity=None, velocity_std=None), true_parameters={})
+
+
+def of_law(law: str) -> dict[str, float]:
+    """The usual amplitudes and shapes of a law."""
+    parts = law.split("_")
+    kinds = {f"joint_{own}" for own in parts} | ({"joint_coulomb"} if {"stribeck", "load"} & {*parts} else set())
+    kinds |= {"joint_load_friction"} if "load" in parts else set()
+    return {name: value for name, value in USUAL.items() if name.partition("@")[0] in kinds}
+
+
+def fitted(law: str, file: str, start: Mapping[str, float], amplitude: str = "") -> tuple[float, float, float]:
+    """Chi2 of a law's fit, and an amplitude with its standard deviation."""
+    run = settings(law, file, start)
+    found = solve(build_problem(run), run.solver)
+    entry = found.parameters.get(amplitude)
+    return (2 * found.cost, math.nan, math.nan) if entry is None else (2 * found.cost, entry.value, entry.std)
+
+
+def examined(law: str, seed: int, size: str) -> dict[str, Any]:
+    """One recording of a law, fitted with it and with its neighbour."""
+    amplitude, neighbour = LADDER[law]
+    truth = of_law(law)
+    with tempfile.TemporaryDirectory() as folder:
+        file = str(Path(folder) / "one.h5")
+        write_recording(recorded(seed, truth), file)
+        chi2, value, std = fitted(law, file, truth, amplitude)
+        if size == "small":
+            truth = {**truth, amplitude: 3 * DEFAULT_THRESHOLDS.detectable_amplitude_z * std}
+            write_recording(recorded(seed, truth), file)
+            chi2, value, std = fitted(law, file, truth, amplitude)
+        other, *_ = fitted(neighbour, file, {name: own for name, own in truth.items() if name in of_law(neighbour)})
+    more = len(truth) - len(of_law(neighbour))
+    told = other - chi2 - more > 2 * DEFAULT_THRESHOLDS.min_log_bayes_factor
+    found = abs(value - truth[amplitude]) <= 2 * std
+    kept = {"law": law, "seed": seed, "size": size, "truth": truth[amplitude], "value": value, "std": std}
+    return {**kept, "chi2": chi2, "neighbour_chi2": other, "found": bool(found), "told": bool(told)}
+
+
+def main() -> int:
+    """Run a slice, append it, and print the table of all that is there."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--laws", nargs="*", choices=LADDER, default=[*LADDER])
+    parser.add_argument("--seeds", nargs=2, type=int, default=(1, 20), metavar=("FIRST", "LAST"))
+    parser.add_argument("--size", choices=("usual", "small"), default="usual")
+    parser.add_argument("--file", type=Path, default=Path("friction_laws.jsonl"))
+    arguments = parser.parse_args()
+    lines = arguments.file.read_text(encoding="utf-8").splitlines() if arguments.file.exists() else []
+    done = {(own["law"], own["seed"], own["size"]): own for own in map(json.loads, lines)}
+    for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
+        for law in arguments.laws:
+            if (law, seed, arguments.size) not in done:
+                done[law, seed, arguments.size] = made = examined(law, seed, arguments.size)
+                with arguments.file.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(made) + "\n")
+    print("| law | size | recordings | amplitude, true and median found | within two std | told from its neighbour |")
+    print("|---|---|---|---|---|---|")
+    for law, (_, neighbour) in LADDER.items():
+        for size in ("usual", "small"):
+            own = [entry for entry in done.values() if (entry["law"], entry["size"]) == (law, size)]
+            if own:
+                middle = [float(np.median([entry[key] for entry in own])) for key in ("truth", "value", "std")]
+                right, apart = (sum(entry[key] for entry in own) for key in ("found", "told"))
+                amplitude = f"{middle[0]:.3g}, {middle[1]:.3g} ± {middle[2]:.2g}"
+                print(f"| {law} | {size} | {len(own)} | {amplitude} | {right} | {apart} from {neighbour} |")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
