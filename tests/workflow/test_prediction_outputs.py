@@ -262,3 +262,10 @@ def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
     noise = np.sqrt(np.mean([own[channel] ** 2 for own in expected.values()]))
     assert noise > 4e-3, "torques matter here more than sensors"
     assert 0.6 < errors / noise < 1.6
+
+
+def test_a_group_without_a_sample_has_no_expected_error():
+    sensor = SimpleNamespace(channel_names=("points.p",), outputs_per_channel=3)
+    nothing = SimpleNamespace(sensor=sensor, value=np.zeros((0, 3)), std=np.zeros((0, 3)))
+    outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
+    assert baseline_comparison._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}

@@ -106,8 +106,10 @@ def _expected_errors(
         square = np.where(np.isfinite(samples.value), samples.std, np.nan) ** 2
         for own in able:
             square = square + (own.predicted_outputs[k] - outcome.predicted_outputs[k]) ** 2 / len(able)
-        of_channel = square.reshape(len(square), len(samples.sensor.channel_names), -1).sum(axis=2)
-        for c, channel in enumerate(samples.sensor.channel_names):
+        sensor = samples.sensor
+        shape = (len(square), len(sensor.channel_names), sensor.outputs_per_channel)  # a slow camera may see nothing
+        of_channel = square.reshape(shape).sum(axis=2)
+        for c, channel in enumerate(sensor.channel_names):
             if np.isfinite(of_channel[:, c]).any():
                 found[channel] = float(np.sqrt(np.nanmean(of_channel[:, c])))
     return found
