@@ -17,8 +17,8 @@ from make_recordings import TRAVEL, TRUTH, compress
 import yid_ocp
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model import Grasp, System, flexible_object
+from yid_ocp.model.mechanism import transform_from_xyz_rpy
 from yid_ocp.model.objects.foam_y import foam_y_segments
-from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import (

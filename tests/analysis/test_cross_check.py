@@ -15,8 +15,7 @@ from yid_ocp.analysis.pinocchio_comparison import (
 )
 from yid_ocp.effects import make_effect
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.mechanism import Mechanism
-from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.model.mechanism import Mechanism, rotation_from_rpy
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
 GRAVITY = np.array([0.3, -0.2, -9.81])

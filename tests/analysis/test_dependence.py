@@ -21,7 +21,7 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions

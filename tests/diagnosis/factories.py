@@ -15,13 +15,13 @@ import pytest
 from made_series import seeing
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
-from yid_ocp.diagnosis.localise import GapLocation
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
     AllCandidatesLinearization,
     CandidateScore,
     ConfusabilityMatrix,
     DetectableAmplitudes,
+    GapLocation,
     _EffectSignature,
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect

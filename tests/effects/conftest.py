@@ -17,10 +17,9 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import CableOptions, clamped_cable_system
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_reading_function
 
 POSTURE = np.array([0.3, 0.8, 0.9])

@@ -13,8 +13,15 @@ from yid_ocp.effects.base import arm_link_end_frame_names, effort_limit_over_bax
 from yid_ocp.effects.bodies import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.mechanism import (
+    Frame,
+    Inertia,
+    Joint,
+    Placement,
+    homogeneous_transform,
+    merge_bodies,
+    rotation_from_rpy,
+)
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 

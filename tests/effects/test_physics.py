@@ -15,10 +15,9 @@ from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.problem import ProblemOptions
-from yid_ocp.problem.unknown_vector import estimated_initial_state_names, max_allowed_initial_state_offsets
+from yid_ocp.problem.evaluation import estimated_initial_state_names, max_allowed_initial_state_offsets
 from yid_ocp.sensors import EffortSensor, PointSensor, PositionSensor, sensor_reading_function
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0

@@ -14,7 +14,7 @@ import threadpoolctl
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.localise import gap_locations_by_smoother_evidence, z_scores_of_smoothed_unknowns
+from yid_ocp.diagnosis.screening import gap_locations_by_smoother_evidence, z_scores_of_smoothed_unknowns
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
 from yid_ocp.inference.smoother import select_and_smooth_unknowns

@@ -15,7 +15,7 @@ from yid_ocp.integrator.statics import (
 )
 from yid_ocp.integrator.step import compile_step, compile_step_like, simulate
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf

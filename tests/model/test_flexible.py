@@ -20,10 +20,10 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.flexible import edge_to_edge_transport_rotations
+from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import init_command_object_factories
 from yid_ocp.model.objects.foam_y import foam_y_object, foam_y_segments
 from yid_ocp.model.objects.tapered_rod import TaperedRod
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.workflow.build import build_system, divided_link_parameter_scale
 

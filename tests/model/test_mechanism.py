@@ -15,12 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism, Segment, flexible_object, forward_kinematics
-from yid_ocp.model.mechanism import Inertia, merge_bodies
-from yid_ocp.model.objects.base import CableTopology
-from yid_ocp.model.objects.cable import clamped_cable_system
-from yid_ocp.model.objects.foam_y import foam_y_object
-from yid_ocp.model.rotations import (
+from yid_ocp.model.mechanism import (
+    Inertia,
     homogeneous_transform,
+    merge_bodies,
     rotation_from_axis_sin_cos,
     rotation_from_rpy,
     rpy_from_rotation,
@@ -29,6 +27,9 @@ from yid_ocp.model.rotations import (
     symbolic_rotation_from_rpy,
     transform_from_xyz_rpy,
 )
+from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.cable import clamped_cable_system
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf
 
 

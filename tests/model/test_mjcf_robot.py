@@ -11,7 +11,8 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Mechanism, forward_kinematics, rotations
+from yid_ocp.model import Mechanism, forward_kinematics
+from yid_ocp.model import mechanism as mechanism_module
 from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.workflow.build import build_system
@@ -99,7 +100,7 @@ def dynamics(mechanism: Mechanism, gravity: np.ndarray) -> ca.Function:
 def test_mass_matrix_bias_and_frames_are_those_of_mujoco(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rotations, "_SNAP_TOLERANCE", 0.0)
+    monkeypatch.setattr(mechanism_module, "_SNAP_TOLERANCE", 0.0)
     file = tmp_path / "robot.xml"
     file.write_text(MODELS[name])
     mechanism, model = read_urdf(file).with_numeric_values(), mujoco.MjModel.from_xml_path(str(file))

@@ -19,9 +19,8 @@ from yid_ocp.model import (
     flexible_object,
     forward_kinematics,
 )
-from yid_ocp.model.mechanism import merge_bodies
+from yid_ocp.model.mechanism import merge_bodies, rotation_from_rpy
 from yid_ocp.model.objects.foam_y import foam_y_object
-from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 

@@ -13,8 +13,7 @@ from placed_frames import numbers
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import urdf as urdf_files
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
-from yid_ocp.model.rotations import homogeneous_transform
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, merge_bodies
 from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, resolve_urdf_path
 

@@ -14,8 +14,8 @@ from yid_ocp.inference.linearized_residual import linearization_without_weak_pri
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import mass_matrix_diagonal_at_zero, truncate_episode
-from yid_ocp.problem.evaluation import ResidualVectorLayout
-from yid_ocp.problem.unknown_vector import (
+from yid_ocp.problem.evaluation import (
+    ResidualVectorLayout,
     UnknownVectorLayout,
     check_parameter_bounds,
     soft_logarithm_and_slope,

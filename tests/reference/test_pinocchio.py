@@ -8,7 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.model import Mechanism, forward_kinematics, rotations
+from yid_ocp.model import Mechanism, forward_kinematics
+from yid_ocp.model import mechanism as mechanism_module
 from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
@@ -78,7 +79,7 @@ class Twin:
 def twin(request, urdf_folder):
     """Read without rounding nearly exact entries, which Pinocchio does not do either."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rotations, "_SNAP_TOLERANCE", 0.0)
+        patch.setattr(mechanism_module, "_SNAP_TOLERANCE", 0.0)
         return make_twin(urdf_folder, *ROBOTS[request.param])
 
 

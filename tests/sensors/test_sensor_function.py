@@ -16,9 +16,8 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, Segment, System, flexible_object
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import Effect, NodeState
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.sensors import ChannelSpecification, EffortSensor, PointSensor, Sensor, sensor_reading_function

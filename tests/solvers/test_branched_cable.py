@@ -8,7 +8,7 @@ import pytest
 from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.flexible import Segment, flexible_object
-from yid_ocp.model.rotations import rotation_from_rpy
+from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.system import System, floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions

@@ -10,7 +10,7 @@ from made_problems import MadeUp, Steps, linear
 
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.linearized_residual import is_stationary_point, predicted_cost_reduction
-from yid_ocp.problem.unknown_vector import soft_logarithm_and_slope
+from yid_ocp.problem.evaluation import soft_logarithm_and_slope
 from yid_ocp.solvers import GaussNewton, base
 from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, projected_gradient_norm, solve
 from yid_ocp.solvers.gradient_methods import _PATIENCE_STEPS

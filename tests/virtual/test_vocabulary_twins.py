@@ -19,8 +19,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.export.models import format_support_by_effect, format_support_by_parameter
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, System
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
-from yid_ocp.model.rotations import homogeneous_transform
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorOptions, PositionServoOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -29,8 +28,7 @@ from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExper
 from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
-from yid_ocp.virtual.mujoco_replay import replay_mismatch_by_channel
-from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, replay_mismatch_by_channel
 
 POSTURE = {"shoulder": 0.4, "elbow": 0.7}
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from yid_ocp import vision
-from yid_ocp.model.rotations import homogeneous_transform
+from yid_ocp.model.mechanism import homogeneous_transform
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.surface_meshes import TriangleMesh
 

@@ -5,7 +5,7 @@ import pytest
 
 from yid_ocp import vision
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.model.rotations import homogeneous_transform
+from yid_ocp.model.mechanism import homogeneous_transform
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import surface_meshes

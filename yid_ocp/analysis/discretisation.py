@@ -23,9 +23,8 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
-from yid_ocp.problem.evaluation import Evaluation, ProcessNoiseWhitener
+from yid_ocp.problem.evaluation import INITIAL_STATE_PREFIX, Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.options import DiscretisationName
-from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."

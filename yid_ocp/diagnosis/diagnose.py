@@ -32,13 +32,6 @@ from yid_ocp.diagnosis.hypotheses import (
     exclude_candidates,
     make_candidate_effects,
 )
-from yid_ocp.diagnosis.localise import (
-    GapLocation,
-    gap_locations_by_smoother_evidence,
-    gap_locations_from_effect_closures,
-    main_gap_locations,
-    merge_time_intervals,
-)
 from yid_ocp.diagnosis.refit import (
     NominalSolutionAndRefitStore,
     RefitContext,
@@ -47,7 +40,15 @@ from yid_ocp.diagnosis.refit import (
     load_stored_refit,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.screening import ScreeningResult, screen_candidates
+from yid_ocp.diagnosis.screening import (
+    GapLocation,
+    ScreeningResult,
+    gap_locations_by_smoother_evidence,
+    gap_locations_from_effect_closures,
+    main_gap_locations,
+    merge_time_intervals,
+    screen_candidates,
+)
 from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, SelectedEffect, held_out_gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import (

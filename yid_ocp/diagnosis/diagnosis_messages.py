@@ -9,10 +9,11 @@ from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsR
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
-from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     DetectableAmplitudes,
+    GapLocation,
+    main_gap_locations,
 )
 from yid_ocp.diagnosis.select import (
     SelectedEffect,

@@ -10,12 +10,12 @@ from typing import Any
 from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsRemovedAndAdded
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
-from yid_ocp.diagnosis.localise import GapLocation
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     CandidateScore,
     ConfusabilityMatrix,
     DetectableAmplitudes,
+    GapLocation,
     bonferroni_min_p_value,
 )
 from yid_ocp.diagnosis.select import (

@@ -19,7 +19,6 @@ import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import mask_out_samples
-from yid_ocp.diagnosis.localise import generalised_force_unit, smoothed_unknown_significance_mask
 from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
     DetectedForcePulse,
@@ -27,6 +26,7 @@ from yid_ocp.diagnosis.pulse_detection import (
     InverseDynamicsModel,
     detect_force_pulses,
 )
+from yid_ocp.diagnosis.screening import generalised_force_unit, smoothed_unknown_significance_mask
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.files import object_attributes_to_json_dict

@@ -13,8 +13,7 @@ import numpy as np
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, ReportedParameterValue
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
-from yid_ocp.model.mechanism import Inertia, merge_bodies
-from yid_ocp.model.rotations import symbolic_rotation_from_rpy
+from yid_ocp.model.mechanism import Inertia, merge_bodies, symbolic_rotation_from_rpy
 from yid_ocp.model.system import ForceWithDerivativeFactors, MidpointState, StepTerms, System
 
 _MAX_PAYLOAD_DISTANCE = 0.5  # of a payload's mass from its frame [m]

@@ -11,8 +11,7 @@ from dataclasses import replace
 import casadi as ca
 
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_name_of_frame
-from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.rotations import symbolic_rotation_from_rpy
+from yid_ocp.model.mechanism import Placement, symbolic_rotation_from_rpy
 from yid_ocp.model.system import NodeState, System
 
 

@@ -12,8 +12,7 @@ from xml.etree.ElementTree import Element, SubElement
 import casadi as ca
 import numpy as np
 
-from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_bodies
-from yid_ocp.model.rotations import rpy_from_rotation
+from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_bodies, rpy_from_rotation
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.virtual.mjcf import (

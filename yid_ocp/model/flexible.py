@@ -14,9 +14,17 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
-from yid_ocp.model.mechanism import ArcLengthChain, Frame, Inertia, Joint, Mechanism, Placement
+from yid_ocp.model.mechanism import (
+    ArcLengthChain,
+    Frame,
+    Inertia,
+    Joint,
+    Mechanism,
+    Placement,
+    rotation_from_axis_sin_cos,
+    snap_near_integer_entries,
+)
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import rotation_from_axis_sin_cos, snap_near_integer_entries
 
 AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 

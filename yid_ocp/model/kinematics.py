@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
-from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
+from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement, symbolic_rotation_from_axis_angle
 
 
 @dataclass(frozen=True)

@@ -21,16 +21,21 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.files import MAX_TEXT_BYTES, check_input_file, is_file
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
-from yid_ocp.model.mjcf_robot import parsed_mjcf
-from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import (
+from yid_ocp.model.mechanism import (
+    Frame,
+    Inertia,
+    Joint,
+    Mechanism,
+    Placement,
     homogeneous_transform,
+    merge_bodies,
     rotation_from_axis_sin_cos,
     rpy_from_rotation,
     snap_near_integer_entries,
     transform_from_xyz_rpy,
 )
+from yid_ocp.model.mjcf_robot import parsed_mjcf
+from yid_ocp.model.parameters import Parameter, Parameters
 
 _UNLIMITED_VALUE = 1e9  # stands for no limit where URDF asks for a number
 _MIN_MASS = 1e-9  # [kg]; dividing by less would not be finite for long

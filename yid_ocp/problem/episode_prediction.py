@@ -17,6 +17,7 @@ from yid_ocp.integrator.tracking_feedback import JointMotionWithSensitivities
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialStateWithSensitivity
+from yid_ocp.problem.evaluation import UnknownVectorLayout
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import (
     CorrectedInputs,
@@ -30,7 +31,6 @@ from yid_ocp.problem.model_functions import (
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads, mean_step_input_delay_derivative, mean_step_inputs
 from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeSmoother
-from yid_ocp.problem.unknown_vector import UnknownVectorLayout
 
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
 """Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""

@@ -29,13 +29,6 @@ from yid_ocp.problem.evaluation import (
     Evaluation,
     ProcessNoiseWhitener,
     ResidualVectorLayout,
-    whitened_episode_residual,
-)
-from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_residual_factors
-from yid_ocp.problem.model_functions import ModelFunctions
-from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.predictions import synthesize_recording
-from yid_ocp.problem.unknown_vector import (
     UnknownVectorLayout,
     check_free_parameters,
     check_parameter_bounds,
@@ -44,7 +37,12 @@ from yid_ocp.problem.unknown_vector import (
     soft_logarithm_and_slope,
     stated_prior_jacobian,
     stated_prior_stds,
+    whitened_episode_residual,
 )
+from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_residual_factors
+from yid_ocp.problem.model_functions import ModelFunctions
+from yid_ocp.problem.options import ProblemOptions
+from yid_ocp.problem.predictions import synthesize_recording
 
 _HELD_OUT_START_WINDOW = 0.2
 """Duration of the data from which a held-out recording's initial state is estimated [s]."""

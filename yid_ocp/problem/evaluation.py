@@ -1,16 +1,21 @@
-"""The residual of an estimation problem: its layout, and its value and derivative at one point."""
+"""Unknown vector and residual of an estimation problem: layouts, priors and bounds, value and derivative at a point."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.effects import EffectBase
+from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.measurements import (
     ResidualAndJacobian,
@@ -19,6 +24,7 @@ from yid_ocp.problem.measurements import (
     whitened_for_sensor_biases,
     whitened_measurement_sensitivities_to_biases,
 )
+from yid_ocp.problem.options import ProblemOptions
 
 EquilibriumGuesses = tuple[Array | None, ...]
 """For each recording, a configuration near the equilibrium from which it starts; None where it is not known."""
@@ -136,3 +142,164 @@ def whitened_episode_residual(
     cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
+
+
+INITIAL_STATE_PREFIX = "start."
+SOFT_LOGARITHM_MIN_RATIO = 1e-3
+"""Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
+
+
+@dataclass(frozen=True)
+class UnknownVectorLayout:
+    """Order of the unknown vector: shared parameters, then per recording local parameters and initial state offset."""
+
+    shared_parameters: tuple[str, ...]  # free, with one value for all recordings
+    local_parameters: tuple[str, ...]  # free, with a value in each
+    initial_state_names: tuple[str, ...]  # estimated: `q.JOINT`, `p.JOINT` and, of unobserved internal ones, `z.NAME`
+    recording_names: tuple[str, ...]
+
+    @cached_property
+    def unknown_names(self) -> tuple[str, ...]:
+        """Names of all unknowns; those of local parameters and initial states contain the recording's name."""
+        own = [*self.local_parameters, *(f"{INITIAL_STATE_PREFIX}{name}" for name in self.initial_state_names)]
+        each = (f"{name}[{recording}]" for recording in self.recording_names for name in own)
+        return (*self.shared_parameters, *each)
+
+    @property
+    def free_parameters(self) -> tuple[str, ...]:
+        """Names of the free parameters, shared then local, in the order of one recording's derivative columns."""
+        return (*self.shared_parameters, *self.local_parameters)
+
+    def unknown_indices_affecting_recording(self, recording: int) -> IntArray:
+        """Indices in the unknown vector of shared unknowns and of one recording's local and initial state unknowns."""
+        shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
+        return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
+
+    def scatter_to_unknown_columns(self, block: Array, recording: int) -> Array:
+        """Scatter one recording's derivative columns (r, d) to those of the unknown vector (r, nx); others are zero."""
+        wide = np.zeros((len(block), len(self.unknown_names)))
+        wide[:, self.unknown_indices_affecting_recording(recording)] = block
+        return wide
+
+    def theta_and_initial_state_deviation(
+        self, x: ArrayLike, recording: int, theta: Array, system: System
+    ) -> tuple[Array, Array]:
+        """Return theta with one recording's values in `x`, and that recording's initial state offset."""
+        own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
+        result = theta.copy()
+        for name, value in zip(self.free_parameters, own, strict=False):
+            result[system.parameters.index(name)] = value
+        return result, own[len(self.free_parameters) :]
+
+    def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
+        """Unknown vector from shared values, and local values and an initial state offset used for all recordings."""
+        parts = [np.asarray(shared, float)]
+        parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
+        return np.concatenate(parts)
+
+
+def stated_prior_stds(
+    unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
+) -> Array:
+    """Standard deviation (nx,) of each unknown's stated Gaussian prior; infinite for unknowns without one.
+
+    `inertia` gives the diagonal of the mass matrix, by which a start's velocity becomes a momentum. An internal
+    coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
+    """
+    limits = _unobserved_state_limits(system)
+    stds = []
+    joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
+    known = dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)).tolist(), strict=True))
+    for name in unknowns.unknown_names:
+        base = name.split("[")[0]
+        if base.startswith(f"{INITIAL_STATE_PREFIX}q."):
+            stds.append(options.initial_configuration_std)
+        elif base.startswith(f"{INITIAL_STATE_PREFIX}p."):
+            mass = float(inertia((base.removeprefix(f"{INITIAL_STATE_PREFIX}p."),))[0])
+            stds.append(options.initial_velocity_std * max(mass, 1e-9))
+        elif base.startswith(f"{INITIAL_STATE_PREFIX}z."):
+            stds.append(limits[base.removeprefix(f"{INITIAL_STATE_PREFIX}z.")] / math.sqrt(3))
+        else:
+            stds.append(known.get(name, float(options.prior_stds.get(base, np.inf))))
+    return np.array(stds)
+
+
+def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
+    """Jacobian (k, nx) of the stated priors' whitened residual, which is Jacobian x (x - initial x)."""
+    joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
+    at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
+    alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
+    rows = np.zeros((len(alone) + len(at), len(std)))
+    rows[np.arange(len(alone)), alone] = 1.0 / std[alone]
+    if at:
+        # C = L L', so that L^-1 d has unit covariance
+        rows[len(alone) :, at] = np.linalg.inv(np.linalg.cholesky(joint.covariance))
+    return rows
+
+
+def estimated_initial_state_names(
+    system: System, options: ProblemOptions, free: Sequence[str], theta: Array
+) -> tuple[str, ...]:
+    """Names of the estimated components of initial states, such as `q.JOINT`, `p.JOINT` and `z.NAME`.
+
+    Where starts are estimated, q and p of the coordinates that are neither driven by torques, nor prescribed, nor
+    follow their load at once; in any case the unobserved internal coordinates of effects that are free or not neutral.
+    """
+    found: list[str] = []
+    if options.initial_state == "estimated":
+        known = {*(() if system.servos else system.driven_coordinate_indices), *system.prescribed_coordinate_indices}
+        known |= {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
+        coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
+        found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]
+    for effect in system.effects:
+        if isinstance(effect, EffectBase) and effect.max_abs_unknown_initial_states:
+            index = system.parameters.index
+            names = effect.amplitude_names
+            if any(name in free or theta[index(name)] != effect.neutral_values[name] for name in names):
+                found += [f"z.{name}" for name in effect.max_abs_unknown_initial_states]
+    return tuple(found)
+
+
+def _unobserved_state_limits(system: System) -> dict[str, float]:
+    """Unobserved initial internal coordinates of the effects, each with its largest magnitude."""
+    effects = [effect for effect in system.effects if isinstance(effect, EffectBase)]
+    return {name: size for effect in effects for name, size in effect.max_abs_unknown_initial_states.items()}
+
+
+def max_allowed_initial_state_offsets(system: System, names: Sequence[str]) -> Array:
+    """Largest absolute offset of each estimated initial state component; infinite for coordinates and momenta."""
+    limits = _unobserved_state_limits(system)
+    return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
+
+
+def check_free_parameters(system: System, free: Sequence[str], options: ProblemOptions) -> None:
+    """Raise `ConfigError` if a free parameter is unknown or repeated, or a local or prior's parameter is not free."""
+    for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
+        system.parameters.index(name)
+    if len(set(free)) != len(free):
+        raise ConfigError("a free parameter is named twice", where=", ".join(free))
+    for name in (*options.local_parameters, *options.prior_stds):
+        if name not in free:
+            raise ConfigError(f"'{name}' is not free", hint=nearest_name_hint(name, free), where="local or priors")
+
+
+def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:
+    """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or its bounds coincide."""
+    for name in free:
+        entry, value = system.parameters[name], theta[system.parameters.index(name)]
+        if not entry.lower <= value <= entry.upper:
+            what = f"initial value {value:g} {entry.unit} of {name} lies outside its bounds"
+            allowed = f"{entry.lower:g} to {entry.upper:g} {entry.unit}"
+            raise ConfigError(what, where=f"parameters.{name}", allowed=allowed)
+        if not entry.lower < entry.upper:
+            what, hint = f"the bounds of {name} leave no room", "fix the parameter instead of closing its bounds"
+            raise ConfigError(what, where=f"parameters.{name}", allowed="lower below upper", hint=hint)
+
+
+def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
+    """Return log(ratio) and its slope; below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
+    below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
+    small = below < 0
+    kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)
+    value = np.log(kept) + np.where(small, below - below**2 / 2, 0.0)
+    return value, np.where(small, (1 - below) / SOFT_LOGARITHM_MIN_RATIO, 1 / kept)

@@ -31,8 +31,8 @@ from yid_ocp.integrator.statics import measured_angle_holding_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.evaluation import SOFT_LOGARITHM_MIN_RATIO
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.problem.unknown_vector import SOFT_LOGARITHM_MIN_RATIO
 from yid_ocp.sensors import Sensor, sensor_reading_function
 from yid_ocp.solvers.initial_guess import (
     UnknownsAndNodeStateGuess,

@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.model.rotations import homogeneous_transform
+from yid_ocp.model.mechanism import homogeneous_transform
 
 PointColourArray = NDArray[np.uint8]
 

@@ -28,8 +28,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
 from yid_ocp.files import check_input_file, is_file
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Mechanism
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.mechanism import Mechanism, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.options import OptionInfo, PositiveFloat

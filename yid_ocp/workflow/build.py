@@ -21,11 +21,10 @@ from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
-from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
 from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path

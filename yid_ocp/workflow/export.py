@@ -32,7 +32,7 @@ from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.virtual.mjcf import mujoco_xml
-from yid_ocp.virtual.mujoco_replay import (
+from yid_ocp.virtual.mujoco_simulation import (
     REPLAY_FEEDBACK_BANDWIDTH,
     ReplayErrorAgainstRecording,
     replay_mismatch_by_channel,

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
-from yid_ocp.model.rotations import transform_from_xyz_rpy
+from yid_ocp.model.mechanism import transform_from_xyz_rpy
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.registry import Registry

@@ -37,10 +37,9 @@ from yid_ocp.model.flexible import (
     edge_to_edge_transport_rotations,
     flexible_object,
 )
-from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement
+from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement, symbolic_rotation_from_axis_angle
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
 from yid_ocp.model.system import Grasp, System, SystemBuildArguments, floating_joint_mechanism
 from yid_ocp.options import OptionInfo
 

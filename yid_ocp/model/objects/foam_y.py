@@ -11,8 +11,8 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
+from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectKind
-from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
 _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]

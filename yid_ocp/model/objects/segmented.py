@@ -10,9 +10,9 @@ from annotated_types import Ge, Gt, Le
 
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
+from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.objects import base
 from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectKind
-from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]

@@ -10,7 +10,7 @@ import numpy as np
 
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages
-from yid_ocp.diagnosis.localise import smoothed_unknown_units, z_scores_of_smoothed_unknowns
+from yid_ocp.diagnosis.screening import smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.inference.smoother import SmoothedUnknownsResult
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
