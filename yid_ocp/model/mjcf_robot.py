@@ -14,6 +14,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError
+from yid_ocp.files import check_input_file
 
 log = logging.getLogger(__name__)
 _JOINT_TYPES = {2: "prismatic", 3: "revolute"}
@@ -51,7 +52,7 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     They are `armature` [kg m^2], `damping` [N m s/rad], `frictionloss` [N m], and of a position actuator `servo_gain`
     [N m/rad] and `servo_damping` [N m s/rad]. Errors as `parsed_mjcf`.
     """
-    if file.suffix.lower() != ".xml" or b"<mujoco" not in file.read_bytes():
+    if file.suffix.lower() != ".xml" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}
     model = _compiled_file(file)
     found: dict[str, dict[str, float]] = {model.joint(j).name: {} for j in range(model.njnt)}
@@ -88,7 +89,7 @@ def _compiled(file: Path, changed: int) -> Any:
         what, hint = "reading MJCF files needs mujoco", "pip install 'yid-ocp[blind]'"
         raise ModelError(what, where=str(file), hint=hint) from error
     try:
-        model = mujoco.MjModel.from_xml_path(str(file))
+        model = mujoco.MjModel.from_xml_path(str(check_input_file(file)))
     except Exception as error:  # MuJoCo raises ValueError, and others for files that are missing
         what = f"MuJoCo cannot read the file: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
         hint = "open it in MuJoCo's viewer; meshes have to lie where the file says"
