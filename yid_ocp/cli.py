@@ -34,7 +34,7 @@ _ERROR_FORMAT = "yid-error/1"
 
 @dataclass(frozen=True)
 class _CliCommand:
-    """A command; `run`, `MODULE.FUNCTION` of `workflow`, takes the parsed arguments and returns the exit code."""
+    """A command; `run`, a function or a module of `workflow` that has it as `run_from_arguments`, gives the exit code."""
 
     name: str
     help: str
@@ -314,57 +314,22 @@ _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, Y
 COMMANDS = tuple(
     _CliCommand(*row)
     for row in (
-        ("init", "write a commented configuration from a robot and recordings of it", "init.run_from_arguments", _init),
-        (
-            "solve",
-            "estimate the free parameters from recordings",
-            "solve.run_from_arguments",
-            partial(_doubting, optional=True),
-        ),
-        (
-            "compare",
-            "run several methods on one problem and say whether they agree",
-            "compare.run_from_arguments",
-            _doubting,
-        ),
-        ("identifiability", _SAID_IDENTIFIABILITY, "identifiability.run_from_arguments", _identifiability),
-        ("friction", "say which law of friction the recordings warrant", "friction.run_from_arguments", _doubting),
-        (
-            "diagnose",
-            "find the gap between model and recordings, and what makes it",
-            "diagnose.run_from_arguments",
-            _diagnose,
-        ),
-        ("blind", _SAID_BLIND, "blind.run_from_arguments", _blind),
-        (
-            "batch",
-            "solve or diagnose many recordings or robots, one table and report of all",
-            "batch.run_from_arguments",
-            _batch,
-        ),
-        (
-            "report",
-            "compare runs of one model: what drifted, which run to distrust",
-            "run_history.run_from_arguments",
-            _report,
-        ),
-        ("plan", "plan a motion of the arms with the identified model", "plan.run_from_arguments", _configured),
-        ("simulate", "write what the model says would be recorded", "simulate.run_from_arguments", _simulate),
-        (
-            "check",
-            "validate a configuration, its recordings and the model before a long run",
-            "check.run_from_arguments",
-            _doubting,
-        ),
-        (
-            "inspect",
-            "show the model's equations: names, patterns, single entries, numbers",
-            "inspect.run_from_arguments",
-            _inspect,
-        ),
-        ("track", "measure the object's points in the frames of a depth camera", "track.run_from_arguments", _track),
-        ("import", "turn a file of another tool into a recording", "import_recording.run_from_arguments", _import),
-        ("export", _SAID_EXPORT, "export.run_from_arguments", _export),
+        ("init", "write a commented configuration from a robot and recordings of it", "init", _init),
+        ("solve", "estimate the free parameters from recordings", "solve", partial(_doubting, optional=True)),
+        ("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
+        ("identifiability", _SAID_IDENTIFIABILITY, "identifiability", _identifiability),
+        ("friction", "say which law of friction the recordings warrant", "friction", _doubting),
+        ("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
+        ("blind", _SAID_BLIND, "blind", _blind),
+        ("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
+        ("report", "compare runs of one model: what drifted, which run to distrust", "run_history", _report),
+        ("plan", "plan a motion of the arms with the identified model", "plan", _configured),
+        ("simulate", "write what the model says would be recorded", "simulate", _simulate),
+        ("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
+        ("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
+        ("track", "measure the object's points in the frames of a depth camera", "track", _track),
+        ("import", "turn a file of another tool into a recording", "import_recording", _import),
+        ("export", _SAID_EXPORT, "export", _export),
         ("completion", _SAID_COMPLETION, _print_completion_script, _completion),
         ("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
     )
@@ -532,10 +497,9 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     try:
         run, arguments.begin_time = arguments.run, time.monotonic()
         if isinstance(run, str):
-            module, _, function = run.rpartition(".")
             gc.disable()  # imports leave nothing to collect, and looking for it takes a tenth of their time
             try:
-                run = getattr(import_module(f"yid_ocp.workflow.{module}"), function)
+                run = import_module(f"yid_ocp.workflow.{run}").run_from_arguments
             finally:
                 gc.enable()
         code = int(run(arguments))

@@ -15,6 +15,7 @@ from yid_ocp.problem import EstimationProblem, predictions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
+from yid_ocp.sensors.base import Sensor
 from yid_ocp.solvers import Solution
 
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
@@ -106,13 +107,20 @@ def _expected_errors(
         square = np.where(np.isfinite(samples.value), samples.std, np.nan) ** 2
         for own in able:
             square = square + (own.predicted_outputs[k] - outcome.predicted_outputs[k]) ** 2 / len(able)
-        sensor = samples.sensor
-        shape = (len(square), len(sensor.channel_names), sensor.outputs_per_channel)  # a slow camera may see nothing
-        of_channel = square.reshape(shape).sum(axis=2)
-        for c, channel in enumerate(sensor.channel_names):
-            if np.isfinite(of_channel[:, c]).any():
-                found[channel] = float(np.sqrt(np.nanmean(of_channel[:, c])))
+        found |= _rms_by_channel(samples.sensor, square)[0]
     return found
+
+
+def _rms_by_channel(sensor: Sensor, square: Array) -> tuple[dict[str, float], Array]:
+    """Root mean square by channel that has finite samples, and sums (M, channels), of squared outputs (M, outputs)."""
+    # a slow camera may see nothing, and then no axis can be left to reshape
+    summed = square.reshape(len(square), len(sensor.channel_names), sensor.outputs_per_channel).sum(axis=2)
+    found = {}
+    for c, channel in enumerate(sensor.channel_names):
+        seen = summed[np.isfinite(summed[:, c]), c]
+        if len(seen):
+            found[channel] = float(np.sqrt(np.mean(seen)))
+    return found, summed
 
 
 def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) -> tuple[str, float, float] | None:
@@ -168,13 +176,7 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
 
 def _errors(samples: SensorMeasurements, predicted: Array, fixed: float) -> dict[str, float]:
     sensor = samples.sensor
-    shape = (len(predicted), len(sensor.channel_names), sensor.outputs_per_channel)
-    square = np.sum((predicted - samples.value).reshape(shape) ** 2, axis=2)
-    result = {}
-    for c, channel in enumerate(sensor.channel_names):
-        seen = square[np.isfinite(square[:, c]), c]
-        if len(seen):
-            result[channel] = float(np.sqrt(np.mean(seen)))
+    result, square = _rms_by_channel(sensor, (predicted - samples.value) ** 2)
     if len(sensor.point_names) > 1:
         later = square[samples.node + samples.fraction > fixed + 1e-6]
         if np.any(np.isfinite(later)):

@@ -1,4 +1,4 @@
-"""Comparison of estimation methods on one problem, of a cable with and without memory, and with the source paper."""
+"""Comparison of estimation methods on one problem, and with the source paper."""
 
 from __future__ import annotations
 
@@ -36,9 +36,6 @@ _MEMORY_SAMPLING_PERIOD = 0.02
 # the value: below that the methods' own stopping rules show.
 _AGREEMENT_STDS, _AGREEMENT_RTOL = 2.0, 0.005
 _SOLVE_LABEL = "solve"  # the run that gives the verdicts, by all noise
-_MEMORY_SUFFIX = ".memory"
-_MAX_REST_SPEED = 0.01  # a recording whose points move more slowly at its start starts at rest [m/s]
-_MIN_MOVING_RECORDINGS = 2  # that start in motion, of which one is left out at a time: fewer cannot agree
 
 
 @dataclass(frozen=True)

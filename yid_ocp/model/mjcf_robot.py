@@ -11,10 +11,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError
 from yid_ocp.files import check_input_file
+from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_axis_sin_cos
 
 log = logging.getLogger(__name__)
 _JOINT_TYPES = {2: "prismatic", 3: "revolute"}
@@ -193,26 +195,15 @@ def _fixed(name: str, parent: str, child: str, origin: Array) -> SimpleNamespace
 
 
 def _pose(position: Array, quaternion: Array) -> Array:
-    w, x, y, z = quaternion / math.sqrt(float(quaternion @ quaternion))
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, position
-    return pose
+    return homogeneous_transform(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), position)
 
 
 def _shift(translation: Array) -> Array:
-    pose = np.eye(4)
-    pose[:3, 3] = translation
-    return pose
+    return homogeneous_transform(np.eye(3), translation)
 
 
 def _moved(axis: Array, amount: float, kind: str) -> Array:
     """Pose of a joint's moving side at a coordinate."""
     if kind == "prismatic":
         return _shift(amount * axis)
-    half = 0.5 * amount
-    return _pose(np.zeros(3), np.array([math.cos(half), *(math.sin(half) * axis)]))
+    return homogeneous_transform(rotation_from_axis_sin_cos(axis, math.sin(amount), math.cos(amount)), np.zeros(3))
