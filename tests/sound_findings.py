@@ -10,7 +10,7 @@ from yid_ocp.inference.null_test import residuals_exceed_noise
 
 
 def assert_nothing_impossible_is_said(finding: DiagnosisResult, text: str) -> None:
-    """No number that is none, no gap below noise, no closure without a gap to close."""
+    """Numbers are finite, a gap is above noise, and closure has a gap to close."""
     assert not re.search(r"\b(nan|inf)\b", text), text
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     if "The gap is real" in text and finding.candidate_scores:

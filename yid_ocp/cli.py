@@ -34,7 +34,7 @@ _ERROR_FORMAT = "yid-error/1"
 
 @dataclass(frozen=True)
 class _CliCommand:
-    """A command; `run`, a function or a module of `workflow` that has it as `run_from_arguments`, gives the exit code."""
+    """A command; `run` gives the exit code: a function, or a module of `workflow` with `run_from_arguments`."""
 
     name: str
     help: str

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from made_models import estimate, solution
 
-from yid_ocp.analysis import cable_memory, estimation
 from yid_ocp.analysis import compare as module
-from yid_ocp.analysis.cable_memory import choose_cable_memory_fit
+from yid_ocp.analysis import estimation
 from yid_ocp.analysis.compare import (
     _PAPER_PARAMETERS,
     _TRUTH_EXPERIMENT,
@@ -22,6 +21,7 @@ from yid_ocp.analysis.compare import (
     explain_paper_estimates,
     is_within_ensemble_range,
 )
+from yid_ocp.analysis.estimation import choose_cable_memory_fit
 from yid_ocp.cli import main
 from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -466,7 +466,7 @@ def solved(monkeypatch):
         kept.problems.append(problem)
         return fitted(start, problem.unknown_names) if kept.ok else SimpleNamespace(evaluation=None)
 
-    monkeypatch.setattr(cable_memory, "solve", solve)
+    monkeypatch.setattr(estimation.solvers, "solve", solve)
     return kept
 
 

@@ -53,8 +53,7 @@ def test_a_solve_waits_for_no_library_that_it_does_not_run():
 def test_every_command_is_a_function_of_workflow_and_prints_json():
     for row in COMMANDS:
         if isinstance(row.run, str):
-            module, function = row.run.split(".")
-            assert callable(getattr(importlib.import_module(f"yid_ocp.workflow.{module}"), function))
+            assert callable(importlib.import_module(f"yid_ocp.workflow.{row.run}").run_from_arguments)
             made = argparse.ArgumentParser()
             row.add_arguments(made)
             assert {"--json", "--quiet", "--verbose"} <= set(made._option_string_actions), row.name

@@ -10,7 +10,7 @@ import pytest
 from recording_examples import joints_of, table
 
 from yid_ocp.data import readers
-from yid_ocp.data.column_names import column_meanings
+from yid_ocp.data.foreign_formats import column_meanings
 from yid_ocp.data.readers import READERS, preview_file, read_any
 from yid_ocp.data.readers.csv import CsvOptions, read_csv
 from yid_ocp.data.recording import JointGroup, Recording, validated_recording

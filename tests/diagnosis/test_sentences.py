@@ -190,7 +190,7 @@ SIZES = st.sampled_from([0.3, 0.989, 1.0, 1.05, 1.2, 40.0])
 
 @given(CLOSURES, SIZES, SIZES, st.sampled_from([1e-13, 1e-3, 0.5]), st.sampled_from(["effect", "no_gap", *REASONS]))
 def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
-    """Whatever a diagnosis finds: no number that is none, no gap below noise, no closure without a gap."""
+    """Every finding of a diagnosis has finite numbers, no gap below noise, and no closure without a gap."""
     lost = loss(held_out, held_out)
     if lost.excess_chi2_per_sample <= 0:
         closure = closed(math.nan, math.nan, math.nan)

@@ -17,12 +17,13 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
-from yid_ocp.solvers.nonlinear_program import NonlinearProgram, _VectorBlock
-from yid_ocp.solvers.program_terms import (
+from yid_ocp.solvers.nonlinear_program import (
     GaussNewtonHessianRidge,
     LocalVariableFunction,
     MappedFunctionTerm,
+    NonlinearProgram,
     ResidualTerm,
+    _VectorBlock,
 )
 from yid_ocp.solvers.symbolic_transcription import problem_unknowns_from_program, transcribe
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step, taken
 
-from yid_ocp.analysis import baseline_comparison
-from yid_ocp.analysis.baseline_comparison import predict_held_out_with_expected_errors
+from yid_ocp.analysis import estimation
+from yid_ocp.analysis.estimation import predict_held_out_with_expected_errors
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
@@ -73,14 +73,14 @@ def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
 
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
     problem, _, held_out = solved_pendulum
-    entry = baseline_comparison._prediction_error_entry(problem, *held_out[0])
+    entry = estimation._prediction_error_entry(problem, *held_out[0])
     assert entry["recording"] == "held_out"
     samples = held_out[0][0].measurements[0]
     for i, channel in enumerate(samples.sensor.channel_names):
         error = held_out[0][1].predicted_outputs[0][:, i] - samples.value[:, i]
         assert entry["rmse"][channel] == pytest.approx(np.sqrt(np.nanmean(error**2)))
         assert entry["baselines"]["zero"][channel] == pytest.approx(np.sqrt(np.nanmean(samples.value[:, i] ** 2)))
-    failed = baseline_comparison._prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
+    failed = estimation._prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
     assert (failed["message"], failed["rmse"]) == ("step 3 did not converge", {})
     assert failed["baselines"] == entry["baselines"]
 
@@ -206,7 +206,7 @@ EFFORT, POINTS = [("joints", "effort")], [("points", "")]
     ],
 )
 def test_a_sensor_counts_as_a_whole(rmse, guess, places):
-    found = baseline_comparison.worse_than_baseline_issues([entry(rmse, guess)], UNITS)
+    found = estimation.worse_than_baseline_issues([entry(rmse, guess)], UNITS)
     assert [(doubt.group, doubt.channel) for doubt in found] == places
     assert all((d.cause, d.weight, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
 
@@ -214,7 +214,7 @@ def test_a_sensor_counts_as_a_whole(rmse, guess, places):
 def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
-    (doubt,) = baseline_comparison.worse_than_baseline_issues([said], UNITS)
+    (doubt,) = estimation.worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
     assert doubt.evidence_ratio == pytest.approx(0.2 / 0.105)
 
@@ -238,7 +238,7 @@ def test_a_guess_is_not_judged_by_the_sample_that_made_it():
     """A point that is seen once makes a guess without an error, which would beat every model."""
     sensor = SimpleNamespace(naive_prediction="stays", point_names=("p", "q"))
     value = np.array([[1.0, 1, 1, np.nan, np.nan, np.nan], [2.0, 2, 2, 5, 5, 5], [np.nan] * 6])
-    guess = baseline_comparison._baselines(None, SimpleNamespace(sensor=sensor, value=value), None)["stays"]
+    guess = estimation._baselines(None, SimpleNamespace(sensor=sensor, value=value), None)["stays"]
     assert np.isnan(guess[0, :3]).all()
     assert np.isnan(guess[1, 3:]).all()
     assert np.array_equal(guess[1:, :3], np.ones((2, 3)))
@@ -256,7 +256,7 @@ def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
     made = [replace(truth.simulate_synthetic_recording(seed=seed), name=f"held_{seed}") for seed in range(10)]
     problem = EstimationProblem(step, [source], ("elbow.mass",), options, held_out=made)
     pairs, expected = predict_held_out_with_expected_errors(problem, problem.initial_unknowns)
-    found = [baseline_comparison._prediction_error_entry(problem, *pair)["rmse"] for pair in pairs]
+    found = [estimation._prediction_error_entry(problem, *pair)["rmse"] for pair in pairs]
     channel = next(name for name in expected["held_0"] if name.endswith(".tip"))
     errors = np.sqrt(np.mean([own[channel] ** 2 for own in found]))
     noise = np.sqrt(np.mean([own[channel] ** 2 for own in expected.values()]))
@@ -268,4 +268,4 @@ def test_a_group_without_a_sample_has_no_expected_error():
     sensor = SimpleNamespace(channel_names=("points.p",), outputs_per_channel=3)
     nothing = SimpleNamespace(sensor=sensor, value=np.zeros((0, 3)), std=np.zeros((0, 3)))
     outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
-    assert baseline_comparison._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
+    assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}

@@ -109,8 +109,8 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
     what lies between their samples matters.
     """
     recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_sampling_kind)
-    # nothing else can be said in times that are not seconds
-    found = [*_few_samples(recording), *_units_of_time(recording)] or chain(
+    # only the number of samples can be said in times that are not seconds
+    found = list(_units_of_time(recording)) or chain(
         _common_clock(recording),
         _dropped(recording, driving),
         _velocities(recording),
@@ -120,7 +120,7 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
         channel_checks.saturated_effort_issues(recording),
         _standstill(recording),
     )
-    return [replace(doubt, recording=recording.name) for doubt in found]
+    return [replace(doubt, recording=recording.name) for doubt in chain(_few_samples(recording), found)]
 
 
 # -- clocks -----------------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ class _QualityLimits:
     min_stuck_samples: int = 12
     max_unseen_rotation: float = 0.03
     min_clipped_samples: int = 8
-    min_samples: int = 8
+    min_samples: int = 4
     min_joint_motion: float = 0.01
     min_point_travel: float = 0.002
     min_shared_samples: int = 50

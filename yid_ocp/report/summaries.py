@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from yid_ocp.analysis.baseline_comparison import channel_or_group_unit
+from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,

@@ -39,11 +39,12 @@ from yid_ocp.solvers.initial_guess import (
     guess_unknowns_and_node_states,
     mean_square_residual_without_efforts,
 )
-from yid_ocp.solvers.nonlinear_program import NonlinearProgram, ProgramVectorLayout
-from yid_ocp.solvers.program_terms import (
+from yid_ocp.solvers.nonlinear_program import (
     GaussNewtonHessianRidge,
     LocalVariableFunction,
     MappedFunctionTerm,
+    NonlinearProgram,
+    ProgramVectorLayout,
     ResidualTerm,
 )
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from yid_ocp.analysis import identifiability as fisher
 from yid_ocp.analysis import what_if
-from yid_ocp.analysis.cable_memory import problem_without_cable_memory
+from yid_ocp.analysis.estimation import problem_without_cable_memory
 from yid_ocp.analysis.experiment_design import RecordedExperiment
 from yid_ocp.analysis.identifiability import (
     GRASP_OFFSET_PRIOR_STD,

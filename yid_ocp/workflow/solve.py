@@ -9,9 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.baseline_comparison import channels_worse_than_naive_guess, prediction_errors_and_units
-from yid_ocp.analysis.cable_memory import ChosenCableMemoryFit, choose_cable_memory_fit
-from yid_ocp.analysis.estimation import solve
+from yid_ocp.analysis.estimation import (
+    ChosenCableMemoryFit,
+    channels_worse_than_naive_guess,
+    choose_cable_memory_fit,
+    prediction_errors_and_units,
+    solve,
+)
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, covariance_to_dict
 from yid_ocp.problem import EstimationProblem

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.joint_messages import JOINT_MESSAGE_TYPES, joint_values_of_fields, joint_values_of_message
+from yid_ocp.data.foreign_formats import JOINT_MESSAGE_TYPES, joint_values_of_fields, joint_values_of_message
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments

@@ -17,8 +17,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.data.column_names import column_meanings
-from yid_ocp.data.mocap_tables import mocap_table_reader
+from yid_ocp.data.foreign_formats import column_meanings, mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,

@@ -1,0 +1,320 @@
+"""What columns, tables and messages of other tools mean: loggers, motion capture exports, drivers of robots."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.arrays import Array
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, PointGroup
+from yid_ocp.errors import DataError, unknown_name_error_arguments
+
+_AXES = ("x", "y", "z")
+_Meaning = tuple[str, str] | None
+"""Of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None where it is left out."""
+_EXACT_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
+_TIME_WORDS = "t time times timestamp timestamps time_stamp stamp header_stamp sec secs seconds elapsed elapsed_time"
+_CHANNEL_WORDS: Mapping[str, str] = {
+    "position": "q pos position positions angle angles joint_pos joint_position joint_positions actual_q q_actual",
+    "velocity": "dq qd vel velocity velocities speed joint_vel joint_velocity joint_velocities actual_qd dq_actual",
+    "effort": "tau eff effort efforts torque torques trq joint_effort joint_torque joint_torques tau_j tau_measured",
+    "external_effort": "tau_ext ext_tau external_torque external_effort tau_ext_hat_filtered",
+    "position_command": "cmd q_cmd q_des q_d q_ref pos_cmd cmd_pos position_command target_q desired_position",
+    "velocity_command": "dq_cmd dq_des dq_d qd_d vel_cmd cmd_vel velocity_command target_qd desired_velocity",
+    "torque_enable": "torque_enable",
+}
+"""Words of loggers: Franka's, UR's, Isaac Sim's, LeRobot's, of ROS and of PlotJuggler."""
+_CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
+_LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
+_TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
+_UNIT_WORDS = {
+    **dict.fromkeys(("s", "sec", "secs", "seconds", "second"), "s"),
+    **{word: word for word in ("ms", "us", "ns", "m", "cm", "mm", "rad", "deg", "rev", "rpm", "rad/s", "deg/s")},
+    **{"degrees": "deg", "radians": "rad", "deg/sec": "deg/s", "rad_s": "rad/s", "deg_s": "deg/s", "rad/sec": "rad/s"},
+    **dict.fromkeys(("nm", "n m", "n*m", "n.m", "n·m", "n_m"), "N m"),
+    **{"nmm": "N mm", "n mm": "N mm", "n*mm": "N mm", "mnm": "mN m", "mn m": "mN m"},
+}
+_BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
+_SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS), key=len, reverse=True))})", re.I)
+
+
+def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
+    """Meaning of every column by its name, None where that says nothing, and unit by quantity where names have one.
+
+    `sensor_components` are components of vectors that sensors on a link read, such as `force_x`.
+    """
+    split = [_split_unit(name, sensor_components) for name in header]
+    whole = {name.strip().lower() for name, _ in split}
+    meanings: list[_Meaning] = []
+    units: dict[str, str] = {}
+    for name, unit in split:
+        meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name)
+        if meaning is None and set(_AXES) <= whole and name.strip().lower() in _AXES:
+            meaning = name.strip().lower(), "marker"  # a table of one point
+        meanings.append(meaning)
+        if meaning and unit:
+            units.setdefault("points" if meaning[0] in _AXES else meaning[0], unit)
+    return meanings, units
+
+
+def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str]:
+    """Name and unit of a column such as `time [ms]` or `q1_deg`; an empty unit where the name has none."""
+    if (bracketed := _BRACKETED_UNIT.fullmatch(column)) and (unit := _UNIT_WORDS.get(bracketed[2].lower())):
+        return bracketed[1], unit
+    if _exact_meaning(column, sensor_components) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
+        name = suffixed[1]
+        if _exact_meaning(name, sensor_components) or _spelled_meaning(name):
+            return name, _UNIT_WORDS[suffixed[2].lower()]
+    return column, ""
+
+
+def _exact_meaning(column: str, sensor_components: Sequence[str]) -> _Meaning:
+    """Meaning in this package's own spelling, of which a joint, point or sensor keeps its name as it stands."""
+    if column.lower() in _TIME_WORDS.split():
+        return "t", ""
+    for prefix in sorted(_EXACT_PREFIXES, key=len, reverse=True):
+        if column.startswith(prefix) and column != prefix:
+            return _EXACT_PREFIXES[prefix], column.removeprefix(prefix)
+    for component in sorted(sensor_components, key=len, reverse=True):
+        if (name := column.removesuffix(f"_{component}")) not in ("", column):
+            return component, name
+    point, _, axis = column.rpartition("_")
+    return (axis, point) if point and axis in _AXES else None
+
+
+def _spelled_meaning(column: str) -> _Meaning:
+    """Meaning of what other tools write: `pos_elbow`, `elbow.vel`, `tau1`, `tau_J[0]`, `/joint_states/elbow/effort`."""
+    plain = re.sub(r"[\s./:\-\[\]%]+", "_", column).strip("_")
+    if plain.lower() in _TIME_WORDS.split() or plain.lower() in ("field_header_stamp", "header_stamp_sec"):
+        return "t", ""
+    if axis := re.fullmatch(r"(.+?)_([xyzXYZ])", plain):
+        return axis[2].lower(), axis[1]
+    plain = _TOPIC_PREFIX.sub("", plain, count=1) if _TOPIC_PREFIX.match(plain) else plain
+    for word in _LONGEST_FIRST:
+        channel = _CHANNEL_BY_WORD[word]
+        if found := re.fullmatch(rf"{word}_?(\d+)", plain, re.IGNORECASE):
+            return channel, found[1]
+        if found := re.fullmatch(rf"{word}_(.+)|(.+)_{word}", plain, re.IGNORECASE):
+            return channel, found[1] or found[2]
+    return None
+
+
+_Rows = Iterable[tuple[int, list[str]]]
+_VICON_SECTIONS = ("Trajectories", "Devices", "Model Outputs", "Joints", "Segments")
+_UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
+_ALLOWED = "an export with its header as the program writes it"
+
+
+_MocapTable = tuple[PointGroup, str, tuple[str, ...]]
+"""Points of a motion capture export in its own unit, that unit (mm, cm or m), and what a user should know."""
+
+
+def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
+    """Function that reads a motion capture export from its rows, by its first row; None where the table is none."""
+    first = first_row[0].strip() if first_row else ""
+    if first == "Format Version":
+        return _read_motive
+    if first == "NO_OF_FRAMES":
+        return _read_qualisys
+    return _read_vicon if first in _VICON_SECTIONS else None
+
+
+def _read_motive(rows: _Rows, where: str) -> _MocapTable:
+    """Positions of rigid bodies and markers; rotations and errors of fits are left out."""
+    head: list[list[str]] = []
+    body: list[list[str]] = []
+    for _, cells in rows:
+        (body if head and head[-1][:1] == ["Frame"] else head).append([cell.strip() for cell in cells])
+    said = dict(zip(head[0][::2], head[0][1::2], strict=False))
+    by_label = {(row[1] if len(row) > 1 else ""): row for row in head[1:]}
+    axes, kinds, names = head[-1], by_label.get("Type", []), by_label.get("Name", [])
+    quantities = next((row for row in head[1:-1] if "Position" in row), [])
+    if axes[:1] != ["Frame"] or not (kinds and names and quantities):
+        raise _broken(where, "rows Type, Name, Rotation or Position, then Frame, Time (Seconds)")
+    columns: dict[str, range] = {}
+    for i in range(2, len(axes) - 2):
+        if quantities[i : i + 3] == ["Position"] * 3 and axes[i : i + 3] == ["X", "Y", "Z"] and names[i]:
+            columns.setdefault(names[i], range(i, i + 3))
+    table = _numbers(body, len(axes), where)
+    unit = _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
+    notes = [
+        "Motive's y axis points up unless the export said otherwise: `pose` or model.frames turn it to the robot's z"
+    ]
+    if len({names[i] for i in range(2, min(len(names), len(axes)))} - {""}) > len(columns):
+        notes.append("what has no position was left out")
+    return _made(table[:, 1], columns, table, unit, "OptiTrack", notes, where)
+
+
+def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
+    """Markers of the section `Trajectories`."""
+    lines = [[cell.strip() for cell in cells] for _, cells in rows]
+    begin = next((i for i, cells in enumerate(lines) if cells[:1] == ["Trajectories"]), None)
+    if begin is None or len(lines) < begin + 6:
+        raise _broken(where, "a section Trajectories with rate, names, Frame, Sub Frame, X, Y, Z and units")
+    rate, named, axes, units, *body = lines[begin + 1 :]
+    end = next((i for i, cells in enumerate(body) if cells[0] in _VICON_SECTIONS or not any(cells)), len(body))
+    table = _numbers(body[:end], len(axes), where)
+    columns: dict[str, range] = {}
+    for i, name in enumerate(named):
+        if name and [axis.upper() for axis in axes[i : i + 3]] == ["X", "Y", "Z"]:
+            columns[name] = range(i, i + 3)
+    short = {name.rpartition(":")[2]: at for name, at in columns.items()}
+    columns = short if len(short) == len(columns) else columns
+    unit = _UNITS.get(next((cell for cell in units if cell), "mm").lower(), "mm")
+    try:
+        frequency = float(rate[0])
+    except ValueError as error:
+        raise _broken(where, "the rate in Hz in the line below Trajectories") from error
+    return _made((table[:, 0] - table[0, 0]) / frequency, columns, table, unit, "Vicon", [], where)
+
+
+def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
+    """Markers; three zeros stand for one that was not seen."""
+    said: dict[str, list[str]] = {}
+    body: list[list[str]] = []
+    head: list[str] = []
+    for _, cells in rows:
+        row = [cell.strip() for cell in cells]
+        if not body and row[0] and not _is_number(row[0]):
+            said.setdefault(row[0], row[1:])
+            head = row if row[0] == "Frame" else head
+        else:
+            body.append(row)
+    names = [name for name in said.get("MARKER_NAMES", []) if name]
+    first = 2 if head else 0  # frame and time
+    table = _numbers(body, max(map(len, body), default=0), where)
+    try:
+        frequency = float(said["FREQUENCY"][0])
+    except (KeyError, IndexError, ValueError) as error:
+        raise _broken(where, "FREQUENCY and MARKER_NAMES in the header") from error
+    if not names or table.shape[1] < first + 3 * len(names):
+        raise _broken(where, "MARKER_NAMES and three columns for each")
+    columns = {name: range(first + 3 * i, first + 3 * i + 3) for i, name in enumerate(names)}
+    for at in columns.values():
+        own = table[:, at]
+        table[np.ix_((own == 0).all(axis=1), list(at))] = math.nan
+    t = table[:, 1] if head else np.arange(len(table)) / frequency
+    return _made(t, columns, table, "mm", "Qualisys", [], where)
+
+
+def _made(
+    t: Array, columns: dict[str, range], table: Array, unit: str, program: str, notes: list[str], where: str
+) -> _MocapTable:
+    if not columns or not len(table):
+        raise _broken(where, "markers or rigid bodies with positions")
+    position = np.stack([table[:, list(at)] for at in columns.values()], axis=1)
+    position[np.isnan(position).any(axis=2)] = math.nan
+    group = PointGroup("points", tuple(columns), t, position, None, program, clock="nominal")
+    return group, unit, (f"an export of {program}: {len(columns)} points in {unit}", *notes)
+
+
+def _numbers(rows: Sequence[Sequence[str]], n_columns: int, where: str) -> Array:
+    """Numbers of rows, NaN where a cell is empty or missing."""
+    table = np.full((len(rows), n_columns), math.nan)
+    for i, row in enumerate(rows):
+        for j, cell in enumerate(row[:n_columns]):
+            if cell and cell.upper() != "NULL":
+                if not _is_number(cell):
+                    raise _broken(f"{where}, row {i + 1} of the data", f"numbers in place of '{cell}'")
+                table[i, j] = float(cell)
+    return table
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _broken(where: str, allowed: str) -> DataError:
+    what = "the motion capture export cannot be understood"
+    return DataError(what, where=where, allowed=f"{_ALLOWED}: {allowed}", hint="export it again with its header")
+
+
+JOINT_MESSAGE_TYPES = (
+    "franka_msgs/msg/FrankaState",
+    "franka_msgs/msg/FrankaRobotState",
+    "control_msgs/msg/DynamicJointState",
+    "control_msgs/msg/JointTrajectoryControllerState",
+)
+"""Types of messages, beside JointState, whose joint values are understood."""
+
+
+def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
+    """Joint names and values by channel of a message of one of `JOINT_MESSAGE_TYPES`, absent channels left out."""
+    if kind == JOINT_MESSAGE_TYPES[0]:
+        return _franka_state(content)
+    if kind == JOINT_MESSAGE_TYPES[1]:
+        return _franka_robot_state(content)
+    if kind == JOINT_MESSAGE_TYPES[2]:
+        return _dynamic_joint_state(content)
+    measured = getattr(content, "feedback", None) or content.actual
+    wanted = getattr(content, "reference", None) or content.desired
+    own = {"position": measured.positions, "velocity": measured.velocities, "effort": measured.effort}
+    return _values(content.joint_names, own | {"position_command": wanted.positions})
+
+
+def joint_values_of_fields(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
+    """Joint values of any message, from the path of an array by channel, such as `position` to `state.q`.
+
+    Joints are called 1, 2 and so on. `DataError` where a channel or a path is not known, or holds no numbers.
+    """
+    found: dict[str, Any] = {}
+    for channel, path in paths.items():
+        if channel not in JOINT_CHANNEL_UNITS:
+            what = f"'{channel}' is no channel of joints"
+            raise DataError(what, where=where, **unknown_name_error_arguments(channel, JOINT_CHANNEL_UNITS))
+        value = content
+        for part in path.split("."):
+            if not hasattr(value, part):
+                known = [name for name in getattr(value, "__dataclass_fields__", {}) if not name.startswith("_")]
+                what = f"the message has no field '{path}'"
+                raise DataError(what, where=where, **unknown_name_error_arguments(part, known))
+            value = getattr(value, part)
+        try:
+            found[channel] = np.asarray(value, float).ravel()
+        except (TypeError, ValueError) as error:
+            allowed = "an array of numbers, one for each joint"
+            raise DataError(f"the field '{path}' holds no numbers", where=where, allowed=allowed) from error
+    count = max((len(values) for values in found.values()), default=0)
+    return _values([str(i + 1) for i in range(count)], found)
+
+
+def _franka_state(content: Any) -> SimpleNamespace:
+    """Of the driver for ROS 1, whose messages do not name joints."""
+    torque = content.tau_J if hasattr(content, "tau_J") else content.tau_j
+    own = {"position": content.q, "velocity": content.dq, "effort": torque, "position_command": content.q_d}
+    own["external_effort"] = content.tau_ext_hat_filtered
+    return _values([f"panda_joint{i + 1}" for i in range(len(content.q))], own)
+
+
+def _franka_robot_state(content: Any) -> SimpleNamespace:
+    """Of the driver for ROS 2."""
+    measured, external = content.measured_joint_state, content.tau_ext_hat_filtered
+    own = {"position": measured.position, "velocity": measured.velocity, "effort": measured.effort}
+    own["external_effort"] = getattr(external, "effort", external)
+    own["position_command"] = content.desired_joint_state.position
+    return _values(measured.name, own)
+
+
+def _dynamic_joint_state(content: Any) -> SimpleNamespace:
+    """Of the broadcaster of ros2_control: named interfaces of every joint, of which some have no position."""
+    by_joint = {
+        str(name): dict(zip(map(str, entry.interface_names), map(float, entry.values), strict=True))
+        for name, entry in zip(content.joint_names, content.interface_values, strict=True)
+    }
+    kept = {name: values for name, values in by_joint.items() if "position" in values}
+    channels = [c for c in ("position", "velocity", "effort") if all(c in values for values in kept.values())]
+    return _values(kept, {c: [values[c] for values in kept.values()] for c in channels})
+
+
+def _values(names: Any, values: Mapping[str, Any]) -> SimpleNamespace:
+    own = {channel: np.asarray(array, float).ravel() for channel, array in values.items() if len(array)}
+    return SimpleNamespace(frame="", name=[str(name) for name in names], **own)
