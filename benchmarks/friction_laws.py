@@ -17,11 +17,12 @@ import json
 import math
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from so101_twin import INNER_STEP, GearFriction
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ParameterSettings, RunSettings
@@ -36,7 +37,7 @@ from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "servo_pendulum.yaml"
-DURATION, RATE, INNER_STEP = 3.0, 200.0, 1e-4  # [s], [Hz], [s]
+DURATION, RATE = 3.0, 200.0  # [s], [Hz]
 ANGLE_STD, COUNT = 5e-4, 2 * math.pi / 4096  # [rad]
 YIELD_ANGLE, STRIBECK_SPEED, COUNTER_VOLTAGE = 0.01, 0.1, 0.04  # [rad], [rad/s], [N m s/rad]
 KNOWN = {
@@ -59,28 +60,18 @@ LADDER = {
 }
 
 
-@dataclass
-class GearFriction:
+class LawFriction(GearFriction):
     """Friction of one joint by a law's amplitudes, from the start of the motion on."""
 
-    amplitudes: Mapping[str, float]
-    state: float = 0.0  # of Dahl's law
-    moves: bool = False
-
-    def edit_model(self, model: Any) -> None:
-        """Give the joint a friction that holds as firmly as the inner step allows."""
-        model.dof_frictionloss[:] = 1e-9
-        model.dof_solref[:, 0], model.dof_solimp[:, :2] = 10 * INNER_STEP, 0.999
-
-    def start_motion(self, data: Any) -> None:
-        """Let it rub."""
-        self.moves = True
+    def __init__(self, amplitudes: Mapping[str, float]) -> None:
+        super().__init__()
+        self._amplitudes, self._state = amplitudes, 0.0  # the state is that of Dahl's law
 
     def add_forces(self, model: Any, data: Any) -> None:
         """Set the size of the next inner step."""
-        if not self.moves:
+        if not self._moves:
             return
-        said = {name.partition("@")[0]: value for name, value in self.amplitudes.items() if "v_stri" not in name}
+        said = {name.partition("@")[0]: value for name, value in self._amplitudes.items() if "v_stri" not in name}
         speed = float(data.qvel[0])
         weight = model.body_subtreemass[model.jnt_bodyid[0]] * model.opt.gravity
         reach = data.subtree_com[model.jnt_bodyid[0]] - data.xanchor[0]
@@ -88,10 +79,10 @@ class GearFriction:
         size = said.get("joint_coulomb", 0.0) + said.get("joint_load_friction", 0.0) * abs(load)
         size += said.get("joint_stribeck", 0.0) * math.exp(-((speed / STRIBECK_SPEED) ** 2))
         model.dof_frictionloss[:] = max(size, 1e-9)
-        if (held := self.amplitudes.get("joint_presliding@joint.tau_c", 0.0)) > 0:
+        if (held := self._amplitudes.get("joint_presliding@joint.tau_c", 0.0)) > 0:
             part = math.exp(-abs(speed) * INNER_STEP / YIELD_ANGLE)
-            self.state = math.copysign(1 - part, speed) + self.state * part
-            data.qfrc_passive[0] -= held * self.state
+            self._state = math.copysign(1 - part, speed) + self._state * part
+            data.qfrc_passive[0] -= held * self._state
 
 
 def settings(law: str, file: str | None, start: Mapping[str, float]) -> RunSettings:
@@ -120,7 +111,7 @@ def recorded(seed: int, amplitudes: Mapping[str, float]) -> Recording:
         initial_joint_angles=start,
         simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),
         arm_noise=ArmSensorNoise(position_std=ANGLE_STD),
-        injected_terms=GearFriction(amplitudes),
+        injected_terms=LawFriction(amplitudes),
         camera=None,
         seed=seed,
         recording_name=f"friction_{seed}",
