@@ -76,13 +76,16 @@ def solve(
 
 def checked_solution(problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS) -> Solution:
     """The solution of a fit with profile intervals, the discretisation's error, and its `checks`; see `solve`."""
-    solution, stability = _checked_solution_and_step_stability(problem, solution)
-    problem = solution.problem or problem
+    start, problem = problem, solution.problem or problem
+    if solution.evaluation is not None:
+        problem = _with_equilibrium_guesses(problem, solution.evaluation.episode_predictions, ())
+    solution, stability = _checked_solution_and_step_stability(start, problem, solution)
     solution = solution_with_profile_intervals(problem, solution, progress)
     data_std = solution.std
     solution, checks = _with_discretisation_errors(problem, solution, progress)
     progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
     held_out, expected = predict_held_out_with_expected_errors(problem, solution.x)
+    problem = _with_equilibrium_guesses(problem, (), [outcome for _, outcome in held_out])
     solution, issues = _checked_solution_and_issues(problem, solution, held_out)
     checks = replace(
         checks,
@@ -93,6 +96,26 @@ def checked_solution(problem: EstimationProblem, solution: Solution, progress: P
         step_stability=stability,
     )
     return replace(solution, checks=checks, problem=problem)
+
+
+def _with_equilibrium_guesses(
+    problem: EstimationProblem,
+    predictions: Sequence[EpisodePrediction],
+    held_out_predictions: Sequence[EpisodePrediction | str],
+) -> EstimationProblem:
+    """The problem, whose further searches for equilibria begin at those of predictions at its solution."""
+
+    def guessed(episodes: Sequence[Episode], found: Sequence[EpisodePrediction | str]) -> Sequence[Episode]:
+        pairs = zip(episodes, found or [""] * len(episodes), strict=True)
+        known = [(e, None if isinstance(own, str) else own.equilibrium_guess) for e, own in pairs]
+        return [e if guess is None else replace(e, equilibrium_guess=guess) for e, guess in known]
+
+    return problem.with_episodes(
+        guessed(problem.episodes, predictions),
+        guessed(problem.held_out, held_out_predictions),
+        problem.whitening_filters,
+        problem.held_out_whitening_filters,
+    )
 
 
 def _with_discretisation_errors(
@@ -132,7 +155,7 @@ def _checked_solution_and_issues(
 
 
 def _checked_solution_and_step_stability(
-    problem: EstimationProblem, solution: Solution
+    start: EstimationProblem, problem: EstimationProblem, solution: Solution
 ) -> tuple[Solution, dict[str, Any]]:
     """The solution, marked as not converged where the step is unstable, and stability data for result.json.
 
@@ -140,7 +163,7 @@ def _checked_solution_and_step_stability(
     stable and leave that place; one that ends there has followed the step's own errors.
     """
     growth = discretisation.largest_alternating_error_growth
-    begin, end = growth(problem, problem.initial_unknowns), growth(problem, solution.x)
+    begin, end = growth(start, start.initial_unknowns), growth(problem, solution.x)
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.keeps_errors_below_resolution:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
@@ -317,7 +340,9 @@ def predict_held_out_with_expected_errors(
                 white = errors.torque_std * samples[errors.sample_of_step]
                 bias = errors.torque_bias + errors.torque_bias_std * rng.standard_normal(len(errors.torque_std))
                 moved = replace(errors, torque_bias=bias, torque_noise=errors.torque_noise + white)
-                drawn.append(predict(replace(episode, input_errors=moved), theta, offset, False))
+                drawn.append(
+                    predict(replace(episode, input_errors=moved), theta, offset, False, outcome.equilibrium_guess)
+                )
         expected[episode.name] = _expected_errors(episode, outcome, drawn)
     return pairs, expected
 

@@ -105,7 +105,7 @@ class EquilibriumSolver:
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
         theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))
         stiffness = measured_angle_holding_stiffness(system, torque is not None)
-        nu, nz = step.sizes["nu"], step.sizes["nz"]
+        nu, nz, m = step.sizes["nu"], step.sizes["nz"], step.sizes["m"]
         held = np.zeros(nu) if torque is None else float_array_with_checked_shape("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness, np.where(_is_motor_off(system, held), _HOLD_STIFFNESS, 0.0))
         count, h = len(self.free_coordinates) + nz, step.clock_scaled_time_step(theta)
@@ -116,6 +116,10 @@ class EquilibriumSolver:
 
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
+            # the guess has no grasp forces, and a step that is as large as they are would be cut short
+            residual, slopes = equations(start)
+            if guess is not None and m and np.all(np.isfinite(residual)):
+                start[count:] = -np.linalg.lstsq(slopes[:, count:], residual, rcond=None)[0]
             w, error, converged = _damped_newton(equations, start, _REST_TOLERANCE)
             inner = w[count - nz : count]
             energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
