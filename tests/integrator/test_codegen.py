@@ -12,6 +12,7 @@ import pytest
 
 from yid_ocp.integrator import codegen, compiled, compiler
 from yid_ocp.integrator.codegen import _simd_c_source
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 pytestmark = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
@@ -247,3 +248,16 @@ def test_elimination_fills_no_more_than_the_tree(single_step):
     chain = [tree.joint_names[i] for i in tree.ancestor_joint_indices(tree.joint_index("T3_3_z"))]
     assert tip == chain[-2::-1]
     assert sum(len(entries) for entries in tables.fill_in) < 0.75 * size * (size - 1) / 2
+
+
+def test_a_kernel_in_the_cache_is_found_without_generating_code(parts, urdf_folder, monkeypatch):
+    """The serialized equations find it again, and tell every other system's from it."""
+    first = compile_step(parts.closed_loop(urdf_folder)[0], 2e-3)
+    monkeypatch.setattr(codegen, "kernel_c_source", lambda *_: pytest.fail("code is generated again"))
+    again = compile_step(parts.closed_loop(urdf_folder)[0], 2e-3)
+    assert again.is_compiled
+    texts = {
+        codegen.kernel_source_text(step.model.functions, step.model.index_tables)
+        for step in (first, again, parts.builders["relaxing_cable"](urdf_folder).step)
+    }
+    assert len(texts) == 2

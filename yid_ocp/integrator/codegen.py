@@ -5,7 +5,7 @@ Functions of several members at once, and long ones, are written in the arithmet
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
@@ -16,37 +16,64 @@ from numpy.typing import NDArray
 
 from yid_ocp.arrays import BoolArray, IntArray
 from yid_ocp.integrator.discrete import DiscreteEquations
+from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 
 _Indices = NDArray[np.int32]
 
 
-@dataclass(frozen=True)
 class StepFunctions:
     """CasADi functions of one step, with the arguments of `DiscreteEquations.arguments`, and their sparsity patterns.
 
-    What is at the midpoint and after it is empty where the constraints pull at the node.
+    What is at the midpoint and after it is empty where the constraints pull at the node. A function is made, and its
+    common subexpressions found, when it is first used: a kernel from the cache needs none of them.
     """
 
-    equations: DiscreteEquations
-    # (balance, internal, constraint, p1, share of Dphi(q_m)), balance and p1 without the constraints' pull
-    residual: ca.Function
-    # (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian, curvature), the last four as nonzeros; the
-    # curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}
-    jacobian_parts: ca.Function
-    # share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1
-    before_constraint_jacobian: ca.Function
-    after_constraint_jacobian: ca.Function
-    # derivatives of the pull of the first of these two by (q_k, z_k), of the second by q_{k+1}
-    constraint_force_derivatives: ca.Function
-    row_scale_and_time_step: ca.Function
-    # (equations of the internal coordinates at rest, their derivative by (q, z, lam, u), nodes being one)
-    internal_residual_at_rest: ca.Function
-    sparsity_patterns: dict[str, ca.Sparsity]
+    def __init__(
+        self,
+        equations: DiscreteEquations,
+        outputs: Mapping[str, Sequence[ca.SX]],
+        sparsity_patterns: Mapping[str, ca.Sparsity],
+    ) -> None:
+        self.equations = equations
+        self.sparsity_patterns = sparsity_patterns
+        self._outputs = outputs
+        self._function = CasadiLockedCache[str, ca.Function](
+            lambda name: ca.Function(name, equations.arguments, ca.cse(list(outputs[name])))
+        )
+
+    @property
+    def residual(self) -> ca.Function:
+        """Balance, internal, constraint, p1 and the share of Dphi(q_m); balance and p1 without the constraints' pull."""
+        return self._function("residual")
+
+    @property
+    def jacobian_parts(self) -> ca.Function:
+        """Pair vectors, then nonzeros of the rest Jacobian, that of p1, the constraint Jacobian and the curvature.
+
+        The curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}.
+        """
+        return self._function("linear")
+
+    @property
+    def row_scale_and_time_step(self) -> ca.Function:
+        """Scale of the balance's rows, and the time step by the recording's clock [s]."""
+        return self._function("scales")
+
+    @property
+    def internal_residual_at_rest(self) -> ca.Function:
+        """Equations of the internal coordinates at rest and their derivative by (q, z, lam, u), nodes being one."""
+        return self._function("resting")
 
     @property
     def all_functions(self) -> tuple[ca.Function, ...]:
         """All CasADi functions of the step, in the order in which C code is generated."""
-        return tuple(value for value in vars(self).values() if isinstance(value, ca.Function))
+        return tuple(map(self._function, self._outputs))
+
+    def expression_text(self) -> str:
+        """Text that determines the functions, from which a compiled kernel is found again: their serialized graphs."""
+        with CASADI_LOCK:
+            together = [output for own in self._outputs.values() for output in own]
+            return str(ca.Function("step", self.equations.arguments, together).serialize())
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
@@ -70,25 +97,23 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     share = pulls.midpoint_share
     middle, after, curve, after_curve = (share * x if share else ca.SX(*x.shape) for x in moving)
 
-    def function(name: str, *outputs: ca.SX) -> ca.Function:
-        return ca.Function(name, e.arguments, ca.cse(list(outputs)))
-
     def nonzeros(matrix: ca.SX) -> Any:
         return matrix.nz[:]
 
     matrices = {"rest": rest, "rest_p": rest_p, "constraint": by_unknown, "matrix": pulls.before_jacobian, "pull": pull}
     matrices |= {"curve": curve, "after_curve": after_curve, "resting": at_rest}
-    return StepFunctions(
-        e,
-        function("residual", balance, e.internal_residual, e.constraint_residual, p1, nonzeros(middle)),
-        function("linear", _pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown), nonzeros(curve)),
-        function("matrix", nonzeros(pulls.start_share * pulls.before_jacobian)),
-        function("ending", nonzeros(after)),
-        function("pull", nonzeros(pull), nonzeros(after_curve)),
-        function("scales", e.row_scale, e.h),
-        function("resting", e.internal_residual_at_rest, nonzeros(at_rest)),
-        {name: matrix.sparsity() for name, matrix in matrices.items()},
-    )
+    outputs = {
+        "residual": (balance, e.internal_residual, e.constraint_residual, p1, nonzeros(middle)),
+        "linear": (_pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown), nonzeros(curve)),
+        # share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1
+        "matrix": (nonzeros(pulls.start_share * pulls.before_jacobian),),
+        "ending": (nonzeros(after),),
+        # derivatives of the pull of the first of these two by (q_k, z_k), of the second by q_{k+1}
+        "pull": (nonzeros(pull), nonzeros(after_curve)),
+        "scales": (e.row_scale, e.h),
+        "resting": (e.internal_residual_at_rest, nonzeros(at_rest)),
+    }
+    return StepFunctions(e, outputs, {name: matrix.sparsity() for name, matrix in matrices.items()})
 
 
 def _pairs(e: DiscreteEquations) -> ca.SX:
@@ -211,6 +236,13 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
 
     varying = (columns(matrix) for matrix in (rows_old, p1_old, p1_new))
     return StepSparsityTables(unknown_row, order, tuple(fill), ancestors, *varying)
+
+
+def kernel_source_text(functions: StepFunctions, tables: StepSparsityTables) -> str:
+    """Text that determines `kernel_c_source`, without generating it: equations, tables, and the generators' files."""
+    folder = resources.files("yid_ocp.integrator")
+    files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]
+    return "\0".join([*files, *_kernel_tables(functions, tables), functions.expression_text()])
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:

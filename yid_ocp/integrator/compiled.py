@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -294,8 +295,9 @@ def _width(member: RolloutInputs) -> int:
 
 def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
-    source = codegen.kernel_c_source(model.functions, model.index_tables, batched=True)
-    library = None if source is None else compiler.compile_and_load_library(source)
+    parts = model.functions, model.index_tables
+    source = functools.partial(codegen.kernel_c_source, *parts, batched=True)
+    library = compiler.compile_and_load_library(f"batched\0{codegen.kernel_source_text(*parts)}", source)
     count = 0 if library is None else int(library.yid_simd_width())
     return None if library is None or not count else (library, count)
 

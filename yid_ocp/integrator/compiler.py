@@ -140,12 +140,13 @@ def _machine() -> str:
 
 
 def compile_and_load_library(
-    source: str, make: Callable[[], str] | None = None, level: str | None = None
+    source: str, make: Callable[[], str | None] | None = None, level: str | None = None
 ) -> ctypes.CDLL | None:
     """Compile a C source, or take it from the cache, and load the shared library; None if no compiler works.
 
     The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
-    which returns the C text and is called only if the library is not in the cache, `source` is what determines it.
+    which returns the C text, or None where there is none, and is called only if the library is not in the cache,
+    `source` is what determines it.
     `level` is another flag of optimisation than the step's.
     """
     target = _library_file(source, level or _optimization_flag(), make)
@@ -173,7 +174,7 @@ def compiled_casadi_function(function: ca.Function) -> ca.Function:
         return function
 
 
-def _library_file(source: str, level: str, make: Callable[[], str] | None = None) -> Path | None:
+def _library_file(source: str, level: str, make: Callable[[], str | None] | None = None) -> Path | None:
     """The library in the cache, compiled if it is not there yet; None where nothing can compile it."""
     path = _compiler_path()
     if path is None or path in _HUNG_COMPILERS:
@@ -192,6 +193,8 @@ def _library_file(source: str, level: str, make: Callable[[], str] | None = None
         with tempfile.TemporaryDirectory(prefix=_BUILD_PREFIX, dir=folder) as work:
             text, built = Path(work) / "source.c", Path(work) / "library.so"
             code = source if make is None else make()
+            if code is None:
+                return None
             text.write_text(f"{code}\nint {_MARKER_SYMBOL}(void) {{ return 1; }}\n", encoding="utf-8")
             for own in ((*flags, *_NATIVE_FLAGS), flags):
                 if path in _HUNG_COMPILERS:

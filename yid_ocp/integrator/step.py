@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -193,8 +194,11 @@ def compile_step(
         Time step not positive, unknown force split or constraint force.
     """
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
-    source = codegen.kernel_c_source(model.functions, model.index_tables) if use_compiler else None
-    library = None if source is None else compiler.compile_and_load_library(source)
+    library = None
+    if use_compiler:
+        parts = model.functions, model.index_tables
+        source = functools.partial(codegen.kernel_c_source, *parts)
+        library = compiler.compile_and_load_library(codegen.kernel_source_text(*parts), source)
     if library is None:
         return Step(model, InterpretedKernel(model), is_compiled=False)
     return Step(model, CompiledKernel(model, library), is_compiled=True)
