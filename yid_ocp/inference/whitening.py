@@ -108,7 +108,7 @@ class WhiteningFilter:
         bias[:, 0] += self.input_error_model.torque_bias
         return result, bias
 
-    def smooth_input_errors(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
+    def _smooth_input_errors(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
         """Smoothed torque and state errors given all measurements (Bryson, Frazier 1963); arguments as in whitening."""
         errors, last = self.input_error_model, len(self.filter_steps) - 1
         nu, ns = len(errors.torque_bias), int(np.count_nonzero(self.state_mask))
@@ -278,7 +278,7 @@ def _about_smoothed(
     """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
-    found = before.smooth_input_errors(_plain(episode, result), result.torque_correction_and_sensitivity)
+    found = before._smooth_input_errors(_plain(episode, result), result.torque_correction_and_sensitivity)
     own = predictor.theta_with_episode_values(episode, theta)
     errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
     errors = _behind_effects(predictor, episode, own, errors)

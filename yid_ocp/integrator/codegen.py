@@ -42,11 +42,6 @@ class StepFunctions:
         )
 
     @property
-    def residual(self) -> ca.Function:
-        """Balance, internal, constraint, p1 and the share of Dphi(q_m); balance and p1 without the constraints' pull."""
-        return self._function("residual")
-
-    @property
     def jacobian_parts(self) -> ca.Function:
         """Pair vectors, then nonzeros of the rest Jacobian, that of p1, the constraint Jacobian and the curvature.
 
@@ -69,7 +64,7 @@ class StepFunctions:
         """All CasADi functions of the step, in the order in which C code is generated."""
         return tuple(map(self._function, self._outputs))
 
-    def expression_text(self) -> str:
+    def _expression_text(self) -> str:
         """Text that determines the functions, from which a compiled kernel is found again: their serialized graphs."""
         with CASADI_LOCK:
             together = [output for own in self._outputs.values() for output in own]
@@ -103,6 +98,7 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     matrices = {"rest": rest, "rest_p": rest_p, "constraint": by_unknown, "matrix": pulls.before_jacobian, "pull": pull}
     matrices |= {"curve": curve, "after_curve": after_curve, "resting": at_rest}
     outputs = {
+        # balance and p1 without the constraints' pull; the share of Dphi(q_m)
         "residual": (balance, e.internal_residual, e.constraint_residual, p1, nonzeros(middle)),
         "linear": (_pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown), nonzeros(curve)),
         # share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1
@@ -242,7 +238,7 @@ def kernel_source_text(functions: StepFunctions, tables: StepSparsityTables) -> 
     """Text that determines `kernel_c_source`, without generating it: equations, tables, and the generators' files."""
     folder = resources.files("yid_ocp.integrator")
     files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]
-    return "\0".join([*files, *_kernel_tables(functions, tables), functions.expression_text()])
+    return "\0".join([*files, *_kernel_tables(functions, tables), functions._expression_text()])
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:

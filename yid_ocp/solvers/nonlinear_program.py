@@ -116,21 +116,21 @@ class MappedFunctionTerm:
         mapped = function.map(f"{function.name()}_{count}", "serial", count, [2], [])
         return mapped(*local, p[self.shared_data_indices.tolist()], *more)
 
-    def symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
+    def _symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """The local function's ny outputs at all K places, one place after another, shape (ny K, 1)."""
         return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
-    def jacobian_nonzero_values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Nonzero entries of the Jacobian with respect to w, in the order of `jacobian_nonzero_indices`."""
+    def _jacobian_nonzero_values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Nonzero entries of the Jacobian with respect to w, in the order of `_jacobian_nonzero_indices`."""
         return _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))
 
-    def jacobian_nonzero_indices(self) -> tuple[IntArray, IntArray]:
+    def _jacobian_nonzero_indices(self) -> tuple[IntArray, IntArray]:
         """Row and column indices of the nonzero entries of the Jacobian of all values with respect to w."""
         row, column = (np.array(x, np.int64) for x in self.local_function.jacobian.sparsity_out(0).get_triplet())
         first = len(self.row_names) * np.arange(len(self.variable_indices))[:, None]
         return (first + row).ravel(), self.variable_indices[:, column].ravel()
 
-    def weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
+    def _weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
         """Entries, rows and columns (some may repeat) of the Hessian of weight . values in w; None if it is zero."""
         function = self.local_function._weighted_hessian_function
         if function is None:
@@ -156,7 +156,7 @@ class ResidualTerm:
         """Number nr of residuals."""
         return self.term.n_values if self.combination is None else self.combination.size1()
 
-    def residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:
+    def _residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:
         """Jacobian of the residuals r with respect to the program term's values, sparse; None for the identity."""
         if self.combination is None and self.weight_indices is None:
             return None
@@ -167,9 +167,9 @@ class ResidualTerm:
         factors = p[self.weight_indices[np.array(row, int)].tolist()]
         return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
 
-    def symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
+    def _symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Residuals r at the program's unknowns w and parameters p, shape (nr, 1)."""
-        matrix, value = self.residual_jacobian_by_term_values(p), self.term.symbolic_outputs(w, p)
+        matrix, value = self._residual_jacobian_by_term_values(p), self.term._symbolic_outputs(w, p)
         result = value if matrix is None else ca.mtimes(matrix, value)
         if self.target_indices is None:
             return result
@@ -178,19 +178,19 @@ class ResidualTerm:
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Jacobian (nr, nw) of the residuals r with respect to the program's unknowns w, sparse."""
-        entries, shape = self.term.jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
-        placed = sparse_mx_from_entries(entries, *self.term.jacobian_nonzero_indices(), shape)
-        matrix = self.residual_jacobian_by_term_values(p)
+        entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
+        placed = sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
+        matrix = self._residual_jacobian_by_term_values(p)
         return placed if matrix is None else ca.mtimes(matrix, placed)
 
-    def evaluate_loss(self, r: ca.MX) -> ca.MX:
+    def _evaluate_loss(self, r: ca.MX) -> ca.MX:
         """Loss of residuals r: half the sum of squares, or Huber's loss."""
         if math.isinf(self.huber_threshold):
             return ca.sumsqr(r) / 2
         size, limit = ca.fabs(r), self.huber_threshold
         return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
 
-    def loss_gradient_by_residual(self, r: ca.MX) -> ca.MX:
+    def _loss_gradient_by_residual(self, r: ca.MX) -> ca.MX:
         """Gradient of the loss with respect to the residuals r, shape (nr, 1)."""
         limit = self.huber_threshold
         return r if math.isinf(limit) else ca.fmax(ca.fmin(r, limit), -limit)
@@ -373,7 +373,7 @@ class NonlinearProgram(ReprMixin):
     @ThreadSafeCachedProperty
     def g(self) -> ca.MX:
         """Symbolic constraint functions g(w, p), shape (ng, 1)."""
-        terms = (term.symbolic_outputs(self.w, self.p) for term in self.constraint_terms)
+        terms = (term._symbolic_outputs(self.w, self.p) for term in self.constraint_terms)
         return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.user_terms))
 
     @property
@@ -391,7 +391,7 @@ class NonlinearProgram(ReprMixin):
 
     @ThreadSafeCachedProperty
     def _residuals(self) -> list[ca.MX]:
-        return [term.symbolic_outputs(self.w, self.p) for term in self.residual_terms]
+        return [term._symbolic_outputs(self.w, self.p) for term in self.residual_terms]
 
     @ThreadSafeCachedProperty
     def _slopes(self) -> list[ca.MX]:
@@ -399,7 +399,7 @@ class NonlinearProgram(ReprMixin):
 
     @property
     def _losses(self) -> list[ca.MX]:
-        return [term.evaluate_loss(r) for term, r in zip(self.residual_terms, self._residuals, strict=True)]
+        return [term._evaluate_loss(r) for term, r in zip(self.residual_terms, self._residuals, strict=True)]
 
     @ThreadSafeCachedProperty
     def residual(self) -> ca.MX:
@@ -416,8 +416,8 @@ class NonlinearProgram(ReprMixin):
         """Jacobian of the constraints g with respect to the unknowns w, sparse."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
-            row, column = term.jacobian_nonzero_indices()
-            entries.append(term.jacobian_nonzero_values(self.w, self.p))
+            row, column = term._jacobian_nonzero_indices()
+            entries.append(term._jacobian_nonzero_values(self.w, self.p))
             rows.append(at + row)
             columns.append(column)
             at += term.n_values
@@ -431,7 +431,7 @@ class NonlinearProgram(ReprMixin):
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
         for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
-            total += ca.mtimes(slope.T, term.loss_gradient_by_residual(r))
+            total += ca.mtimes(slope.T, term._loss_gradient_by_residual(r))
         return total
 
     @ThreadSafeCachedProperty
@@ -465,7 +465,10 @@ class NonlinearProgram(ReprMixin):
             weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
             total += self.lam_f * ca.mtimes(slope.T, weighted)
             if exact:
-                matrix, pull = residual.residual_jacobian_by_term_values(self.p), residual.loss_gradient_by_residual(r)
+                matrix, pull = (
+                    residual._residual_jacobian_by_term_values(self.p),
+                    residual._loss_gradient_by_residual(r),
+                )
                 pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
                 total += self._curvature(residual.term, self.lam_f * pull)
         return total
@@ -485,7 +488,7 @@ class NonlinearProgram(ReprMixin):
 
     def _curvature(self, term: MappedFunctionTerm, weight: ca.MX) -> ca.MX | int:
         """Hessian of weight . values of a term."""
-        curved = term.weighted_hessian_triplets(self.w, self.p, weight)
+        curved = term._weighted_hessian_triplets(self.w, self.p, weight)
         return 0 if curved is None else sparse_matrix_summing_duplicates(*curved, self.w.numel())
 
     def _ridge(self, ridge: GaussNewtonHessianRidge) -> ca.MX:

@@ -97,7 +97,7 @@ class ParameterEvaluator:
         """Values of an expression that depends on parameters only."""
         return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
 
-    def is_zero_at_parameter_values(self, expression: ca.SX) -> bool:
+    def _is_zero_at_parameter_values(self, expression: ca.SX) -> bool:
         """Whether an expression, with the parameters at their values, is zero for all values of its other symbols."""
         return bool(ca.sparsify(self._substitute_parameter_values(expression)).is_zero())
 
@@ -178,7 +178,7 @@ def system_joint_dynamics_terms(system: System, value: ParameterEvaluator) -> di
         stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest_angle, spring.damping))
         add(spring.joint_name, JointDynamicsTerms(stiffness, stiffness * rest, damping=damping))
     for joint, compliance in system.joint_compliances.items():
-        if not value.is_zero_at_parameter_values(compliance):
+        if not value._is_zero_at_parameter_values(compliance):
             stiffness = 1 / float(value(compliance)[0])
             add(joint, JointDynamicsTerms(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
     for effect in system.effects:
@@ -480,18 +480,18 @@ def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bo
             allowed = ", ".join(words for name, words in MODEL_ASPECT_DESCRIPTIONS.items() if name in able)
             raise ModelError(what, where="mujoco_xml", allowed=f"effects that change {allowed}")
     for grasp in system.grasps:
-        if not value.is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
+        if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
             raise ModelError(f"grasp '{grasp.name}' is compliant", where="mujoco_xml", allowed=allowed)
     for joint, compliance in system.joint_compliances.items():
-        if value.is_zero_at_parameter_values(compliance):
+        if value._is_zero_at_parameter_values(compliance):
             allowed, hint = "a compliance above zero", "leave the effect out"
             raise ModelError(f"joint '{joint}' is rigid", where="mujoco_xml", allowed=allowed, hint=hint)
     for joint, servo in system.servos.items():
-        if not value.is_zero_at_parameter_values(servo.dead_band):
+        if not value._is_zero_at_parameter_values(servo.dead_band):
             allowed = f"{joint}.servo_dead_band: 0"
             raise ModelError(f"the servo of '{joint}' has a dead band", where="mujoco_xml", allowed=allowed)
-    if not value.is_zero_at_parameter_values(system.recorded_time_scale - 1):
+    if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
         raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock that tells the true time")
 
 

@@ -157,7 +157,7 @@ class ArmSurface:
     def _moving(self) -> BoolArray:
         return np.array([joint >= 0 for joint in self.robot_surfaces.part_joints])
 
-    def part_poses_at_time(self, t: float) -> Array:
+    def _part_poses_at_time(self, t: float) -> Array:
         """World poses of the robot's surface parts at a time [s], shape (parts, 4, 4)."""
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
@@ -194,7 +194,7 @@ class ArmSurface:
             kept = np.ones(len(points), bool)
         chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
         behind, now, later = (
-            self.part_poses_at_time(t + d)[part[chosen]] for d in (-_VELOCITY_TIME_STEP, 0.0, _VELOCITY_TIME_STEP)
+            self._part_poses_at_time(t + d)[part[chosen]] for d in (-_VELOCITY_TIME_STEP, 0.0, _VELOCITY_TIME_STEP)
         )
         local = np.einsum("nji,nj->ni", now[:, :3, :3], points[chosen] - now[:, :3, 3])
         moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
@@ -351,11 +351,11 @@ def _add_costs(
     distance = np.minimum(distance_transform_edt(empty, sampling=_GRID_CELL_SIZE), _MAX_START_DISTANCE)
     flat = np.where(outside, _HIDDEN_SAMPLE_COST, (distance / _MAX_START_DISTANCE) ** 2).astype(np.float32).ravel()
     t = float(told.stamps_to_joint_clock(glimpse.stamp))
-    before = arm.part_poses_at_time(t)[part]
+    before = arm._part_poses_at_time(t)[part]
     local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     for row, delay in zip(total, delays, strict=True):
-        then = arm.part_poses_at_time(t - delay)[part]
+        then = arm._part_poses_at_time(t - delay)[part]
         own = told.world_to_measured_points(np.einsum("nij,nj->ni", then[:, :3, :3], local) + then[:, :3, 3])
         index = np.clip(np.floor((own - low) / _GRID_CELL_SIZE).astype(np.int64), edge, shape - 1 - edge)
         row += flat[(index @ strides)[None, :] + (cells @ strides)[:, None]].mean(axis=1)
