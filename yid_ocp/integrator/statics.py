@@ -47,6 +47,7 @@ _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
 _NEWTON_ITERATION_LIMIT = 100
+_NEAR_GUESS = 0.1  # farther from a guess [rad or m] an equilibrium may be another one
 _REST_TOLERANCE = 1e-10  # imbalance [N m] and constraint violation [m] up to which all is at rest
 _ENERGY_ITERATION_LIMIT = 300  # of the search for the lowest energy
 _MIN_RECIPROCAL_CONDITION = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
@@ -116,11 +117,9 @@ class EquilibriumSolver:
 
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
-            # the guess has no grasp forces, and a step that is as large as they are would be cut short
-            residual, slopes = equations(start)
-            if guess is not None and m and np.all(np.isfinite(residual)):
-                start[count:] = -np.linalg.lstsq(slopes[:, count:], residual, rcond=None)[0]
-            w, error, converged = _damped_newton(equations, start, _REST_TOLERANCE)
+            w, error, converged = self._near(equations, start) if guess is not None and m else (start, math.inf, False)
+            if not converged:
+                w, error, converged = _damped_newton(equations, start, _REST_TOLERANCE)
             inner = w[count - nz : count]
             energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
             found = (not converged, energy if converged else error, error, w)
@@ -150,6 +149,20 @@ class EquilibriumSolver:
         by_torque = np.where(hold.by_hand > 0, 0.0, by_posture[:, :nu] / stiffness)
         derivatives, said = (by_theta, by_posture, by_torque), (not failed, error, message)
         return Equilibrium(state, held + stiffness * give, w[count:], *derivatives, *said)
+
+    def _near(self, equations: Callable[[Array], tuple[Array, Array]], start: Array) -> tuple[Array, float, bool]:
+        """What `_damped_newton` finds near a start that has no grasp forces yet; not converged where it is far.
+
+        With forces that fit the start at best. Without, steps are as long as the forces, and are cut short.
+        """
+        count = len(start) - self.step.sizes["m"]
+        residual, slopes = equations(start)
+        if not np.all(np.isfinite(residual)):
+            return start, math.inf, False
+        near = start.copy()
+        near[count:] = -np.linalg.lstsq(slopes[:, count:], residual, rcond=None)[0]
+        w, error, converged = _damped_newton(equations, near, _REST_TOLERANCE)
+        return w, error, converged and float(np.max(np.abs(w - start)[:count])) < _NEAR_GUESS
 
     def _guesses(self, given: Array, guess: ArrayLike | None) -> list[Array]:
         """Starts of the search: the given configuration or the undeformed object, then small bends of it.
