@@ -415,12 +415,13 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     grown = {x: AlternatingErrorGrowth("run", size, 1.3, 0.1, H) for x, size in decades.items()}
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
-    judged, said = _checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    problem = SimpleNamespace(initial_unknowns=np.zeros(1))
+    judged, said = _checked_solution_and_step_stability(problem, problem, found)
     assert judged.status == after
     assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: None)
-    unchecked = _checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    unchecked = _checked_solution_and_step_stability(problem, problem, found)
     assert unchecked == (found, {"start": None, "estimate": None})
