@@ -1,6 +1,7 @@
 """What differs from an earlier run, on a small beam that carries a load on the second day."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,12 +10,13 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, _estimated_without, with_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem.predictions import recording_from_prediction
+from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.solve import run_solve
@@ -99,6 +101,23 @@ def test_nothing_differs_where_nothing_changed(beam, tmp_path):
 def test_a_recording_of_the_baseline_is_refused(beam, tmp_path):
     with pytest.raises(ConfigError, match="would count twice"):
         diagnosed(beam, "bare", tmp_path / "new")
+
+
+def test_the_world_without_effects_is_estimated_on_its_own_recordings(beam):
+    loaded, bare = (
+        build_problem(load_config(beam / "beam.yaml", (f"recordings.estimate=[{name}.h5]",)))
+        for name in ("loaded", "bare")
+    )
+    found = _estimated_without(SimpleNamespace(problem=loaded), [e.recording for e in bare.episodes], tuple(TRUTH))
+    expected = solve(bare, GaussNewton())
+    for name, truth in TRUTH.items():
+        assert abs(found[name] - truth) < 4 * expected.std[name]
+        assert found[name] == pytest.approx(expected.parameters[name].value, abs=0.1 * expected.std[name])
+
+
+def test_without_earlier_runs_there_is_nothing_to_differ():
+    none = EarlierRunsBaseline.from_runs([], ())
+    assert (none.combined_estimates, none.between_runs_chi2, none.between_runs_p_value) == (None, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("times", [0.1, 1.0, 10.0])

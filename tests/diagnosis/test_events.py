@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from factories import FORCE, smoothed, trace
 from small_problems import joints, places, recording, seen
 
-from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording import Recording, SensorChannelGroup
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.events import (
     EventSet,
     ForceOrFaultEvent,
+    _floor,
+    _one_each,
     _Overspeed,
+    _short,
     find_force_and_fault_events,
     problem_corrected_for_events,
 )
-from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import times_since_recording_start
 from yid_ocp.inference.smoother import select_and_smooth_unknowns
@@ -146,6 +151,56 @@ def test_forces_that_mostly_recur_are_the_motions_own(twin, pushed):
     assert [event.location for event in found] == ["shoulder", "elbow", "elbow", "shoulder"]
 
 
+def test_currents_tell_of_a_push_what_efforts_tell(twin, pushed):
+    """With torque constants far from one, and of either sign."""
+    constants = np.array([4.0, -0.05])
+    joints = replace(pushed.joints, effort_kind="sample")
+    group = SensorChannelGroup("motors", JOINTS, joints.t, {"current": joints.effort / constants})
+    use = {
+        "joints.effort": SensorOptions(use=False),
+        "motors.current": SensorOptions(
+            std=tuple(0.02 / np.abs(constants)), constants={"torque_constant": tuple(constants)}
+        ),
+    }
+    plain = twin.problem(replace(pushed, joints=joints))
+    options = replace(plain.options, sensors=plain.options.sensors | use)
+    made = replace(pushed, joints=replace(joints, effort=None), channel_groups=(group,))
+    found = []
+    for problem in (plain, EstimationProblem(plain.step, [made], plain.free, options)):
+        x = problem.initial_unknowns
+        found.append(find_force_and_fault_events(problem, x, problem.evaluate(x), None).disturbances)
+    assert len(found[0]) == len(found[1]) == len(PUSHES)
+    for one, other in zip(*found, strict=True):
+        assert (one.channel, one.unit) == (other.channel, other.unit)
+        assert (one.impulse, one.impulse_std) == pytest.approx((other.impulse, other.impulse_std), rel=1e-6)
+
+
+def test_the_same_push_in_another_recording_is_another_event(twin):
+    pulse = DetectedForcePulse(1.0, 1.2, -0.1, False, 0.01, 1e-9)
+    surer = replace(pulse, p_value=1e-12)
+    problem = SimpleNamespace(system=SimpleNamespace(prescribed=()))
+    t = 0.1 * np.arange(30)
+    force = ForceEstimate("run_0", "elbow", "elbow", "N m", t, 0 * t, np.eye(30), 0 * t, 0 * t)
+    other, rival = replace(force, recording="run_1"), replace(force, location="shoulder", coordinate="shoulder")
+    found = _one_each([(force, pulse), (other, surer), (rival, surer)], problem)
+    assert sorted((e.recording, e.channel) for e in found) == [("run_0", "shoulder"), ("run_1", "elbow")]
+
+
+def test_an_effort_behind_a_filter_is_noisier_than_what_is_left_of_it(twin, pushed):
+    problem = twin.problem(pushed)
+    [episode], share = problem.episodes, 2 * problem.options.path_cutoff * 0.005
+    assert _floor(problem, episode, "elbow", "effort") == pytest.approx(0.02 / np.sqrt(share))
+    assert _floor(problem, episode, "elbow", "position") == pytest.approx(5e-5)
+
+
+def test_a_force_that_is_never_sure_is_no_event():
+    limits, std = Thresholds(), np.full((10, 1), 0.1)
+    for sure, expected in ((0, []), (1, ["T1.0"]), (9, [])):
+        mean = np.zeros((10, 1))
+        mean[:sure] = 5.0
+        assert _short(smoothed({FORCE: 1.0}, traces=[trace([FORCE], mean, std)]), 0, limits) == expected
+
+
 def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
     clean = twin.recording()
     position = clean.joints.position.copy()
@@ -228,8 +283,8 @@ def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_fo
     problem = EstimationProblem(step, [made], ["shoulder.damping"], options)
     x = solve(problem, GaussNewton()).x
     evaluation = problem.evaluate(x)
-    smoothed = select_and_smooth_unknowns(problem, x, evaluation)
-    (event,) = find_force_and_fault_events(problem, x, evaluation, smoothed).disturbances
+    unknowns = select_and_smooth_unknowns(problem, x, evaluation)
+    (event,) = find_force_and_fault_events(problem, x, evaluation, unknowns).disturbances
     assert (event.kind, event.location, event.channel, event.unit) == ("force", "elbow", "elbow", "N m")
     assert (event.start_time, event.end_time) == pytest.approx((push.start, push.end), abs=0.15)
     assert event.impulse == pytest.approx(push.impulse, rel=0.2)

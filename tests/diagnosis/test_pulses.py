@@ -99,6 +99,19 @@ def test_friction_that_holds_may_change_by_twice_itself_wherever_a_joint_stands_
     assert len(sure(history(values, friction_limit=np.where(T > 6, 0.2, 0.0)))) == 1
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+def test_the_likeliest_forces_are_those_measured_in_whatever_unit(unit):
+    made, values = history(wobble()), NOISE**2 * history(wobble()).score
+    scaled = replace(made, score=made.score / unit, information=made.information / unit**2)
+    np.testing.assert_allclose(scaled.max_likelihood_forces / unit, values, rtol=1e-5)
+
+
+def test_windows_longer_than_a_history_are_not_looked_at():
+    made = history(wobble()).subset_at_indices(np.arange(20))
+    tries = [detect_force_pulses(made, Thresholds(max_event_duration=longest))[1] for longest in (1.9, 5.0, 50.0)]
+    assert tries[0] == tries[1] == tries[2] > 1
+
+
 def test_a_filter_widens_what_is_seen_and_not_what_is_told():
     fine = np.arange(0, 8, 0.005)
     cutoff = 3.0

@@ -13,6 +13,7 @@ from factories import amplitude, cases, effect, shape, signature
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import blind as module
 from yid_ocp.diagnosis.blind import (
+    _OUT_OF_LIBRARY_SIZES,
     MAX_CASE_DRAWS,
     BlindCaseGenerator,
     CaseGroundTruth,
@@ -307,6 +308,11 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
         assert low <= min(ratios) < max(ratios) <= high
         assert {f.location for f in by_kind[kind]} == {"T1", "T2"}
     assert all(0.05 <= f.values["size"] <= 0.15 for f in by_kind["gusts"])
+
+
+def test_every_size_outside_the_library_has_a_range():
+    assert {*_OUT_OF_LIBRARY_SIZES} == {*OUT_OF_LIBRARY_FORCE_BUILDERS}
+    assert all(0 < low < high for _, low, high, _ in _OUT_OF_LIBRARY_SIZES.values())
 
 
 def chain(links, **values):

@@ -1,6 +1,7 @@
 """A diagnosis as `yid-diagnosis/2`: rule by rule."""
 
 import math
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -149,6 +150,13 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
     [entry] = told["carried_over"]
     assert (entry["value"], entry["again"], entry["agrees"]) == (0.5, 0.9, False)
     assert finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []
+    # of several each has its own checks; one without checks of its own fails by those of all
+    third, other = effect("third@x"), replace(carried("b"), effect_label="offset@wrist")
+    chosen, checks = tuple(map(added, (FRICTION, OFFSET, third))), (carried(), other, carried("c", agrees=True))
+    told = finding("unknown", unknown_reason="stand_in", selected_effects=chosen, transfer_checks=checks).to_dict()
+    reasons = [entry["reason"] for entry in told["rejected_candidates"]]
+    assert reasons[:2] == [carried().both_estimates_text, other.both_estimates_text]
+    assert reasons[2] == "; ".join(reasons[:2])
 
 
 @pytest.mark.parametrize("reason", get_args(UnknownVerdictReason))

@@ -92,6 +92,7 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
         "as large as expected": ([3.0, 4.0], None, (0.0, 0.4), 2.0 / 5.0, False),
         "to either side": ([3.0, 4.0], None, (-0.5, 0.3), 2.0 / 5.0, True),
         "too noisy": ([3.0, 4.0], 400.0, (0.0, 1.0), 2.0 * 20.0 / 25.0, False),
+        "noise that rounding makes negative": ([3.0, 4.0], -1e-18, (0.0, 1.0), 0.0, True),
         "nothing": ([0.0, 0.0], None, (0.0, 1.0), math.inf, False),
         "hardly": ([1e-09, 0.0], None, (0.0, 1000000000000.0), math.inf, False),
         "little": ([1e-07, 0.0], None, (0.0, 1000000000000.0), 2.0 / 1e-07, True),

@@ -34,9 +34,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sound_findings import assert_nothing_impossible_is_said
 
+from yid_ocp.diagnosis.baseline import EarlierRunsComparison
 from yid_ocp.diagnosis.diagnosis_messages import (
     _event_sentences,
     _separating_experiment,
+    _since,
     diagnosis_summary_text,
     insufficient_data_message,
     recommended_experiment_text,
@@ -205,6 +207,24 @@ def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
 
 def test_a_diagnosis_says_what_is_written_down():
     assert said() == json.loads(FILE.read_text("utf-8"))
+
+
+def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_suffice():
+    chosen = (added(FRICTION, rivals=[OFFSET]),)
+    assert recommended_experiment_text("effect", chosen, (), ()) == _separating_experiment([FRICTION, OFFSET])
+    sole = recommended_experiment_text("effect", (added(FRICTION),), (), ())
+    assert sole.startswith("Repeat with other motions")
+    few = recommended_experiment_text("insufficient_data", chosen, (), ())
+    assert few.startswith("Record longer and larger motions")
+
+
+def test_runs_of_a_baseline_differ_where_there_are_several_and_chance_does_not_explain_it():
+    def differ(runs, p_value):
+        found = _since(EarlierRunsComparison(runs, True, (), 9.0, p_value, ()), False)
+        return any("differ among themselves" in text for text in found)
+
+    said = [differ(runs, p) for runs, p in ((("a", "b"), 1e-3), (("a", "b"), 0.5), (("a",), 1e-3))]
+    assert said == [True, False, False]
 
 
 if __name__ == "__main__":

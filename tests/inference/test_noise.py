@@ -12,6 +12,7 @@ from yid_ocp.inference.smoother_model import recording_models_with_unknown_force
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
     problem_whitened_at,
+    torque_bias_change_in_stds,
     torque_biases_and_stds_by_recording,
 )
 from yid_ocp.integrator.step import compile_step
@@ -109,6 +110,19 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
     np.testing.assert_array_equal(weighted.residual[rows.stop :], plain.residual[rows.stop :])
 
 
+def test_a_step_without_a_measurement_adds_no_likelihood_and_lets_the_state_go_on():
+    covariance = np.array([[2.0, 0.3], [0.3, 1.0]])
+    map_ = np.array([[0.9, 0.2]])
+    transition = kalman.FilterStateTransition(map_, np.array([0.5]))
+    step, after, log_determinant = kalman.kalman_matrices_and_next_covariance(covariance, np.zeros((0, 2)), transition)
+    assert log_determinant == 0.0
+    whole = np.vstack([map_, [0.0, 0.5]])
+    np.testing.assert_allclose(after, whole @ covariance @ whole.T)
+    white, mean = step.normalized_innovations_and_next_mean(np.array([[1.0], [2.0]]), np.zeros((0, 1)))
+    assert white.shape == (0, 1)
+    np.testing.assert_allclose(mean[:, 0], whole @ [1.0, 2.0])
+
+
 @pytest.mark.skipif(kalman._library() is None, reason="no compiler")
 @pytest.mark.parametrize(
     "how",
@@ -193,6 +207,9 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
     again = problem_whitened_at(weighted, problem.initial_unknowns)
     np.testing.assert_allclose(again.episodes[0].input_errors.torque_bias, value)
+    moved = torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
+    assert moved == pytest.approx(value[0] / BIAS)
+    assert torque_bias_change_in_stds(weighted.whitening_filters, [None]) == 0.0
     ((settled, _),) = torque_biases_and_stds_by_recording(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
     assert torque_biases_and_stds_by_recording(problem, problem.initial_unknowns) == [None]

@@ -17,6 +17,7 @@ from yid_ocp.inference import uncertainty
 from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
+    benjamini_hochberg_mask,
     residual_channel_indices,
     residual_chi2_null_test,
     residuals_exceed_noise,
@@ -31,6 +32,7 @@ from yid_ocp.inference.uncertainty import (
     _misfit_sandwich_covariance,
     _score_covariance,
     assess_goodness_of_fit,
+    misfit_robust_covariance,
     needs_no_profile_likelihood,
     parameter_estimates,
     parameter_verdict,
@@ -208,6 +210,16 @@ def test_a_misfit_that_stays_for_long_counts_as_one_and_one_that_alternates_as_m
     assert widened(constant(quick)) == 1.0
 
 
+def test_only_a_fit_that_does_not_explain_the_data_counts_its_misfit():
+    problem = constant(5 * np.sign(np.sin(4 * np.pi * np.linspace(0, 1, 480))))
+    found = problem.evaluate([0.0])
+    plain, _ = unknowns_covariance_and_reduced_chi2(problem, found)
+    assert misfit_robust_covariance(problem, found, GOOD) == plain
+    assert (
+        misfit_robust_covariance(problem, found, BAD) == _misfit_sandwich_covariance(problem, found, plain) > 5 * plain
+    )
+
+
 def test_a_misfit_of_one_block_or_of_none_widens_nothing():
     one = MadeUp(linear(np.ones((3, 1)), [5.0, 5.0, 5.0]), duration=0.2)
     for problem in (one, MadeUp(linear(np.zeros((3, 0))), ())):
@@ -253,6 +265,18 @@ def test_scores_of_a_fit_scatter_as_the_noise_does_however_much_a_cluster_decide
     np.testing.assert_allclose(sum(map(scatter, left)) / wider_by_few(4) ** 2, information, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_scores_are_numbers_where_unknowns_are_seen_only_together(seed):
+    """Rounding makes eigenvalues of a singular information negative."""
+    rng = np.random.default_rng(seed)
+    slopes, residual = np.outer(rng.standard_normal(12), rng.standard_normal(4)), rng.standard_normal(12)
+    information = slopes.T @ slopes
+    found = _score_covariance(
+        information, np.linalg.pinv(information), [(slopes[c], residual[c]) for c in (slice(0, 5), slice(5, 12))]
+    )
+    assert np.all(np.isfinite(found))
+
+
 def test_a_prior_counts_as_stated_where_a_part_of_all_stated_deviations_is_noise():
     share, slopes = 0.1, np.array([[0.0, 2.0], [0.0, -2.0], [1 / (0.5 * 0.1), 0.0]])  # the prior of the first is 0.5
     problem = MadeUp(linear(slopes, [3.0, 4.0, 0.0]), (1.0, 1.0), stated=1)
@@ -279,6 +303,12 @@ def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, kept):
     assert std == pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01)
     said = [estimated(problem, x, [[1.0]], fit)["k0"].std for fit in (GOOD, None)]
     assert said == [pytest.approx(std), 1.0]
+
+
+@pytest.mark.parametrize("bound", [{"lower": 0.9}, {"lower": -np.inf, "upper": 1.1}])
+def test_beyond_a_bound_the_cost_is_not_asked(bound):
+    problem = MadeUp(linear([[1.0]], [-1.0]), **bound)
+    assert _cost_checked_std(problem, np.ones(1), problem.evaluate([1.0]), np.eye(1))[0] == 1.0
 
 
 def estimated(problem, x, covariance, fit=GOOD):
@@ -498,6 +528,11 @@ def test_windows_are_flagged_by_their_false_discovery_rate(level, p_values, flag
     found = residual_chi2_null_test(*with_p_values(*p_values), 0, level=level).windows
     assert len(found) == 4
     assert tuple(i for i, entry in enumerate(found) if entry.is_flagged) == flagged
+
+
+@pytest.mark.parametrize(("p_value", "tries", "expected"), [(0.04, 1.0, True), (0.06, 1.0, False), (0.04, 2.0, False)])
+def test_one_test_is_judged_by_the_level_and_the_number_of_tries(p_value, tries, expected):
+    assert benjamini_hochberg_mask([p_value], tries, 0.05) == [expected]
 
 
 def test_columns_of_a_channel_share_windows_and_recordings_do_not():

@@ -9,7 +9,12 @@ import pytest
 from made_problems import MadeUp, Steps, linear
 
 from yid_ocp.errors import DataError, SolverError
-from yid_ocp.inference.linearized_residual import is_stationary_point, predicted_cost_reduction
+from yid_ocp.inference.linearized_residual import (
+    bounded_levenberg_marquardt_step,
+    is_stationary_point,
+    predicted_cost_reduction,
+    solve_step_within_unknown_sizes,
+)
 from yid_ocp.problem.evaluation import soft_logarithm_and_slope
 from yid_ocp.solvers import GaussNewton, base
 from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, projected_gradient_norm, solve
@@ -118,6 +123,7 @@ def test_a_fit_that_cannot_be_evaluated_has_failed():
     solution = solve(problem, Steps([[9.0]], [[9.0]], [[9.0]], [[9.0]]))
     assert (solution.status, solution.message, solution.evaluation) == (Status.FAILED, "it snaps", None)
     assert solution.cost == math.inf
+    assert replace(solution, history=()).n_iterations == 0
     assert math.isnan(solution.goodness_of_fit.chi2_per_dof)
     paper = MadeUp(misfit({1.0: 2.0, 4.0: 2.0}.get), weighting="paper")
     solver = Steps([[9.0]])
@@ -209,7 +215,9 @@ class Carrying(Steps):
 def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing():
     solver = Carrying([[1.0], [2.0]], [[2.0], [2.5]], [[2.5]], [[99.0]])
     problem = Disturbed(linear(np.eye(1), [-2.5]))
-    solution = solve(problem, solver, restarts=False)
+    told = []
+    solution = solve(problem, solver, callback=told.append, restarts=False)
+    assert [entry.note for entry in told] == [f"pass {k} of at most 6" for k in (1, 1, 2, 2, 3)]
     assert starts(solver) == [[1.0], [2.0], [2.5]]
     assert problem.frozen == [([1.0], None), ([2.0], "warm"), ([2.5], "warm")]
     assert solution.x.tolist() == [2.5]
@@ -407,6 +415,22 @@ def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(at, exp
 def test_no_step_longer_than_the_unknowns_size_counts(size, slope, residual, expected):
     problem = MadeUp(linear(slope, residual), lower=-np.inf, scales=(size,))
     assert is_stationary_point(problem, np.zeros(1), problem.evaluate([0.0])) is expected
+
+
+def test_a_step_does_not_depend_on_the_unit_of_the_residual():
+    jacobian, residual = np.array([[1.0, 2.0], [0.5, -1.0], [0.0, 1.0]]), np.array([3.0, -1.0, 0.5])
+    open_ends = np.full(2, -np.inf), np.full(2, np.inf)
+    plain, small = (bounded_levenberg_marquardt_step(c * jacobian, c * residual, 0.1, *open_ends) for c in (1.0, 1e-3))
+    np.testing.assert_allclose(small, plain)
+    damped = jacobian.T @ jacobian + 0.1 * 6.0 * np.eye(2)  # the second column is the larger one
+    np.testing.assert_allclose(plain, -np.linalg.solve(damped, jacobian.T @ residual))
+
+
+@pytest.mark.parametrize(("pull", "expected"), [(9.0, -0.1), (-9.0, 0.2), (0.05, -0.05)])
+def test_a_step_ends_at_the_bounds(pull, expected):
+    problem = MadeUp(linear([[1.0]], [0.0]), (0.5,), lower=0.4, upper=0.7, scales=(0.01,))
+    step = solve_step_within_unknown_sizes(problem, np.array([0.5]), np.eye(1), np.array([pull]), 1e-14)
+    assert step[0] == pytest.approx(expected)
 
 
 def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost_and_nothing_without_unknowns():
