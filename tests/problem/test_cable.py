@@ -184,6 +184,24 @@ def test_held_out_starts_use_no_frame_after_the_second(twin_options, cable, twin
     np.testing.assert_array_equal(first.predicted_outputs[0], second.predicted_outputs[0])
 
 
+def test_a_simulated_cable_keeps_what_its_clamps_were_seen_to_do(twin_options, cable, twin):
+    """Whatever another group that stands before it has: the clamps' points, at the times of the simulated frames."""
+    step, options, recording = twin
+    [group] = recording.points
+    other = replace(group, name="zero", names=tuple(f"x_{name}" for name in group.names))
+    source = replace(recording, points=(other, group))
+    settings = twin_options([recording], options)
+    settings = replace(settings, sensors={**settings.sensors, "zero": SensorOptions(use=False)})
+    problem = EstimationProblem(step, [source], ("parent.bend",), settings)
+    made = problem.simulate_synthetic_recording(TRUTH, seed=0)
+    [simulated] = (entry for entry in made.points if entry.name == group.name)
+    assert {*simulated.names} == {*cable.vertex_names}
+    rows = np.searchsorted(group.t, simulated.t - 1e-9)
+    for name in cable.clamped_vertex_names:
+        seen, kept = group.position[rows, group.names.index(name)], simulated.position[:, simulated.names.index(name)]
+        np.testing.assert_array_equal(kept, seen)
+
+
 def test_edges_are_as_long_as_measured(cable):
     t = PERIOD * np.arange(4)
     seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertex_names}

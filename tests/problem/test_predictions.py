@@ -12,6 +12,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
+    _noisy,
     constant_position_baseline,
     interpolated_displacement_position_baseline,
     mean_clamp_displacement_baseline_prediction,
@@ -76,6 +77,23 @@ def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
     np.testing.assert_allclose(np.array(np.broadcast_arrays(*levels, stated)[:3]), [[1e-3] * 2, [0.3] * 2, stated])
     assert np.array_equal(plain.effort[-1], plain.effort[-2])
     assert plain.effort_kind == ("command" if "driven" in how else "sample")
+
+
+def test_what_has_no_stated_noise_is_simulated_without(urdf_folder):
+    step = pendulum_step(urdf_folder, prescribed=PENDULUM)
+    source = taken(step, 1)
+    source = replace(source, joints=replace(source.joints, position_std=None))
+    problem = EstimationProblem(step, [source], ("elbow.mass",), ProblemOptions(path_cutoff=np.inf))
+    plain, noisy = (problem.simulate_synthetic_recording(seed=seed).joints for seed in (None, 1))
+    np.testing.assert_array_equal(noisy.position, plain.position)
+    assert np.std(noisy.effort - plain.effort) == pytest.approx(0.3, rel=0.3)
+
+
+def test_noise_that_is_not_finite_is_none():
+    std, rng = np.array([[0.5, np.nan, np.inf]]), np.random.default_rng(0)
+    moved = _noisy(np.zeros((200, 3)), np.broadcast_to(std, (200, 3)), rng)
+    assert np.std(moved[:, 0]) == pytest.approx(0.5, rel=0.2)
+    assert not moved[:, 1:].any()
 
 
 def test_a_parameter_that_is_not_there_is_named(problem):
@@ -153,6 +171,9 @@ def test_all_points_move_with_the_mean_of_the_clamps(recording):
     predicted = mean_clamp_displacement_baseline_prediction(recording, ("p2", "c1"), ("p0", "p4"))
     np.testing.assert_allclose(predicted[-1, :, 2], 2e-3 * 9)
     np.testing.assert_allclose(predicted[-1, :, :2], [[0.2, 0.0], [0.2, 0.1]])
+    # with one clamp they move as it does
+    alone = mean_clamp_displacement_baseline_prediction(recording, ("p2", "c1"), ("p4",))
+    np.testing.assert_allclose(alone[-1, :, 2], 3e-3 * 9)
 
 
 def test_linear_carry_interpolates_along_the_arc_and_children_follow_their_junction(recording):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 
-from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.episodes import truncate_episode
+from yid_ocp.integrator.step import simulate_rollouts
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions, episode_prediction
+from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
 
 MISREAD = (("encoder_offset", "shoulder", {"offset": 0.03}), ("effort_gain", "shoulder", {"scale": 0.9}))
 LATE = (("camera_latency", "camera", {"delay": 0.0137}), ("clock_scale", "clock", {"scale": 0.97}))
@@ -314,6 +315,39 @@ def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, c
         np.testing.assert_array_equal(samples.value, before.value[early])
         np.testing.assert_allclose(two.predicted_outputs[k], one.predicted_outputs[k][early], atol=1e-9)
     assert truncate_episode(whole, 99).grid.steps == STEPS
+
+
+@pytest.mark.parametrize(("share", "calls"), [(0.0, [1, 1, 1]), (1.5, [1, 1, 1]), (2.5, [2, 1]), (9.0, [3])])
+def test_so_many_rollouts_are_held_at_once_as_the_memory_takes(urdf_folder, monkeypatch, share, calls):
+    problem, asked = problem_of(urdf_folder, "free", seeds=(1, 2, 3)), []
+    plain = problem.evaluate(problem.initial_unknowns)
+    free = len(problem.free)
+    held = 8 * (STEPS + 1) * 4 * (free + 1)  # bytes of one recording's states and their derivatives
+    monkeypatch.setattr(episode_prediction, "_MAX_ROLLOUT_MEMORY", share * held)
+    monkeypatch.setattr(
+        episode_prediction,
+        "simulate_rollouts",
+        lambda step, members: asked.append(len(members)) or simulate_rollouts(step, members),
+    )
+    found = problem.evaluate(problem.initial_unknowns)
+    assert asked == calls
+    np.testing.assert_array_equal(found.residual, plain.residual)
+
+
+@pytest.mark.parametrize("reference", [None, [[0.0], [1.0], [3.0]]])
+def test_errors_of_inputs_on_finer_steps_are_held_and_the_reference_lies_between(reference):
+    rng, reference = np.random.default_rng(0), None if reference is None else np.array(reference)
+    noise = rng.standard_normal((3, 3, 1))
+    one = np.ones(1)
+    errors = InputErrorModel(one, one, one, np.array([0, 1, 1]), 1.0, False, one, *noise, reference)
+    fine = errors.on_finer_steps(2)
+    assert fine.sample_of_step.tolist() == [0, 0, 1, 1, 1, 1]
+    np.testing.assert_array_equal(fine.torque_noise[:, 0], np.repeat(noise[0, :, 0], 2))
+    if reference is None:
+        assert fine.smoothed_reference is None
+    else:
+        # beyond the last node it stays
+        np.testing.assert_allclose(fine.smoothed_reference[:, 0], [0.0, 0.5, 1.0, 2.0, 3.0, 3.0])
 
 
 @pytest.mark.parametrize(
