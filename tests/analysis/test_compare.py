@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_models import estimate, solution
+from small_problems import pendulum_step, taken
 
 from yid_ocp.analysis import compare as module
 from yid_ocp.analysis import estimation
@@ -21,7 +22,13 @@ from yid_ocp.analysis.compare import (
     explain_paper_estimates,
     is_within_ensemble_range,
 )
-from yid_ocp.analysis.estimation import choose_cable_memory_fit
+from yid_ocp.analysis.estimation import (
+    channels_worse_than_naive_guess,
+    choose_cable_memory_fit,
+    predict_held_out_with_expected_errors,
+    prediction_errors_and_units,
+    worse_than_baseline_issues,
+)
 from yid_ocp.cli import main
 from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -519,3 +526,96 @@ def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     assert "inf with it and" in choose_cable_memory_fit(problem, None, found).message
     solved.ok = False
     assert choose_cable_memory_fit(problem, None, found).solution is found
+
+
+# -- what is predicted ------------------------------------------------------------------------------------------------
+
+ENTRY = {
+    "recording": "run",
+    "rmse": {"points.a": 0.02, "points.b": 0.01, "points": 0.016},
+    "baselines": {"stays": {"points.a": 0.01, "points.b": 0.0099}, "zero": {"points.a": 0.015}},
+}
+
+
+def test_a_channel_is_worse_than_a_guess_where_the_best_one_is_clearly_nearer():
+    units = {"points.a": "m", "points.b": "m"}
+    [found] = channels_worse_than_naive_guess([ENTRY], units)
+    assert found == {
+        **{"recording": "run", "channel": "points.a", "unit": "m"},
+        **{"baseline": "stays", "guess": pytest.approx(0.01), "rmse": pytest.approx(0.02)},
+    }
+    # of a group only a guess that all of its channels have counts, over all of them
+    [issue] = worse_than_baseline_issues([ENTRY], units)
+    error, guess = (math.sqrt((a**2 + b**2) / 2) for a, b in ((0.02, 0.01), (0.01, 0.0099)))
+    assert issue.evidence_ratio == pytest.approx(error / (1.05 * guess))
+    assert (issue.recording, issue.group, issue.weight) == ("run", "points", "not_trusted")
+    better = ENTRY | {"rmse": {"points.a": 0.0101, "points.b": 0.01}}
+    assert worse_than_baseline_issues([better], units) == channels_worse_than_naive_guess([better], units) == []
+
+
+@pytest.mark.parametrize(("start", "window"), [("equilibrium", -1.0), ("fitted_to_points", 0.1)])
+def test_errors_of_held_out_and_fitted_recordings_leave_out_what_fixed_the_start(urdf_folder, start, window):
+    step = pendulum_step(urdf_folder)
+    options = ProblemOptions(initial_state=start, initial_state_fit_window=0.1, weak_prior_geometric_std=0.0)
+    made = EstimationProblem(step, [taken(step, 1)], ("elbow.stiffness",), options, None, [taken(step, 2)])
+    evaluation, held_out = made.evaluate(made.initial_unknowns, False), made.predict_held_out(made.initial_unknowns)
+    fit = SimpleNamespace(evaluation=evaluation, episode_predictions=evaluation.episode_predictions)
+    entries, units, residuals = prediction_errors_and_units(made, fit, held_out)
+    assert [entry["recording"] for entry in entries] == ["run_2", "run_1"]
+    assert units == dict.fromkeys(residuals, "m")
+    [k] = [i for i, s in enumerate(made.episodes[0].measurements) if s.sensor.group_name == "points_camera"]
+    samples, predicted = made.episodes[0].measurements[k], evaluation.episode_predictions[0].predicted_outputs[k]
+    square = np.sum((predicted - samples.value).reshape(-1, 2, 3) ** 2, axis=2)
+    later = (samples.node + samples.fraction) * step.time_step > window
+    assert later.all() == (start == "equilibrium")
+    assert entries[1]["rmse"]["points_camera"] == pytest.approx(math.sqrt(np.nanmean(square[later])))
+    assert entries[1]["rmse"]["points_camera.tip"] == pytest.approx(math.sqrt(np.nanmean(square[:, 1])))
+    unfitted, nothing, _ = prediction_errors_and_units(made, SimpleNamespace(evaluation=None), held_out)
+    assert ([entry["recording"] for entry in unfitted], nothing) == (["run_2"], {})
+
+
+def test_the_error_to_expect_is_that_of_the_sensors_and_of_torques_as_wrong_as_stated(urdf_folder):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    how = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
+
+    def expected(size):
+        recordings = [taken(step, seed) for seed in (3, 4)]
+        recordings = [replace(r, joints=replace(r.joints, effort_std=size, effort_bias_std=size)) for r in recordings]
+        options = ProblemOptions(path_cutoff=math.inf, **how)
+        made = EstimationProblem(step, recordings[:1], ("elbow.stiffness",), options, None, recordings[1:])
+        [(_, outcome)], found = predict_held_out_with_expected_errors(made, made.initial_unknowns)
+        [(_, plain)] = made.predict_held_out(made.initial_unknowns)
+        np.testing.assert_array_equal(outcome.predicted_outputs[0], plain.predicted_outputs[0])
+        return found["run_4"]["points_arm.tip"]
+
+    exact, small, large = map(expected, (0.0, 0.05, 0.1))
+    assert exact == pytest.approx(math.sqrt(3) * 0.02)
+    assert small > exact + 1e-5
+    assert (large**2 - exact**2) / (small**2 - exact**2) == pytest.approx(4.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("segments", "kinds", "divided", "links"),
+    [
+        (True, ("time_step",), False, True),
+        (True, ("links", "time_step"), True, True),
+        (True, ("links", "time_step"), False, True),
+        (True, ("time_step",), True, False),
+        (False, ("links", "time_step"), False, False),
+        (False, ("time_step",), True, False),
+    ],
+)
+def test_the_error_of_links_is_uncounted_where_an_object_has_them_and_nothing_is_said_of_it(
+    monkeypatch, segments, kinds, divided, links
+):
+    """Where neither could be compared; an object divided otherwise is not asked for its links."""
+    layouts = (SimpleNamespace(name="T1"),) if segments else ()
+    options = SimpleNamespace(checked_discretisations=kinds, divided_links_model=divided)
+    made = SimpleNamespace(options=options, system=SimpleNamespace(segment_layouts=layouts))
+    monkeypatch.setattr(estimation.discretisation, "measure_discretisation_shifts", lambda *_: ({}, ["why"]))
+    monkeypatch.setattr(estimation, "typical_parameter_magnitudes", lambda *_: {"k": 1.0})
+    fit = replace(solution(k=estimate(2.0)), evaluation=SimpleNamespace())
+    found, checks = estimation._with_discretisation_errors(made, fit, None)
+    assert found.parameters == fit.parameters
+    assert checks.notes == ("why",)
+    assert checks.uncounted_errors == (("of the object's links",) if links else ()) + ("of the time step",)

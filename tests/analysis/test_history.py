@@ -199,10 +199,25 @@ def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_
     assert fit.parameters["joint_coulomb@shoulder.tau_c"].value == pytest.approx(1.2, abs=0.05)
     [cloud] = friction_torque_clouds(driven, solution, ["joint_coulomb@shoulder.tau_c"])
     assert (cloud.joint, cloud.speed.shape, cloud.load.shape) == ("shoulder", (4 * 79,), (4 * 79,))
+    assert len(np.unique(cloud.speed)) == 4 * 79, "every point of the motion once"
     moving = np.abs(cloud.speed) > 0.5
     # friction is against the motion, in the data as in the law
     assert np.median(cloud.measured[moving] * np.sign(cloud.speed[moving])) == pytest.approx(1.2, abs=0.15)
     assert np.median(cloud.predicted[moving] * np.sign(cloud.speed[moving])) == pytest.approx(1.2, abs=0.05)
+
+
+def test_a_kind_of_motion_is_predicted_from_the_others_alone(dry, monkeypatch):
+    driven, folds, search = dry.with_episodes(dry.episodes[:-1], ()), [], GaussNewton.minimize_cost
+
+    def searched(self, problem, start, callback):
+        folds.append(tuple({e.name for e in group} for group in (problem.episodes, problem.held_out)))
+        return search(self, problem, start, callback)
+
+    solution = solve(driven, GaussNewton(), restarts=False)
+    monkeypatch.setattr(GaussNewton, "minimize_cost", searched)
+    cross_validate_friction_law("coulomb", driven, solution, recording_names_by_name_stem(driven))
+    names = {"slow_1", "slow_2", "fast_1", "turn_1"}
+    assert folds == [(names - own, own) for own in ({"slow_1", "slow_2"}, {"fast_1"}, {"turn_1"})]
 
 
 def test_the_command_says_which_law_a_real_servo_warrants(cli, repository, shared, tmp_path: Path) -> None:

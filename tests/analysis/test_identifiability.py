@@ -11,6 +11,7 @@ from made_recordings import holding_pendulum
 
 from yid_ocp.analysis import identifiability as module
 from yid_ocp.analysis.identifiability import (
+    _orthogonal_part,
     identifiability,
     system_with_grasp_offset_effects,
     unknowns_from_solution,
@@ -131,6 +132,13 @@ def test_a_nuisance_takes_what_it_explains_whatever_its_unit(size):
     assert info.parameters["a"].std_relative == pytest.approx(math.sqrt(expected))
     assert info.parameters["a"].std_alone == pytest.approx(1 / 30)
     np.testing.assert_allclose(info.fisher_information, np.diag([1 / expected, 1600.0]), atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
+def test_the_part_that_a_direction_explains_does_not_depend_on_its_length(size):
+    columns = np.array([[1.0, 0.0], [2.0, 1.0], [2.0, -1.0]])
+    explained = size * np.array([[1.0, 2.0], [2.0, 4.0], [2.0, 4.0]])
+    np.testing.assert_allclose(_orthogonal_part(columns, explained), [[0, 0], [0, 1], [0, -1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -308,6 +316,7 @@ def test_the_combination_that_moves_the_data_least_is_named_where_it_can_be_roll
     """At equal values sum, product and series look alike at first; a partner below zero is none."""
     assert "a + b" in unseen(lambda a, b: a + b, {"a": 3.0, "b": 3.0})
     assert "a + b" not in unseen(lambda a, b: a + b, {"a": 9.0, "b": 1.0})
+    assert "a + b" not in unseen(lambda a, b: a + b, {"a": 3.0, "b": 0.5})
     assert "as springs" not in unseen(lambda a, b: a + b, fails=lambda values: values["a"] != 2.0)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
-from yid_ocp.analysis.clock_checks import drift_and_overstated_noise_issues
+from yid_ocp.analysis.clock_checks import _by_clock, _clock_error, drift_and_overstated_noise_issues
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
     check_efforts_by_inverse_dynamics,
@@ -317,6 +317,29 @@ def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, 
     assert found == f"{name}, values: {{offset: {-float(size):.3g}"
 
 
+@pytest.mark.parametrize(("std", "is_known"), [(0.02, False), (1e-3, True), (None, True)])
+def test_points_may_be_as_far_off_as_they_are_said_to_be(arms, runs, std, is_known):
+    def moved(group):
+        level = None if std is None else np.full(group.position.shape, std)
+        return replace(group, position=group.position + np.array([0.06, 0.0, 0.0]), std=level)
+
+    groups = tuple(moved(g) if g.name == "points_arm" else g for g in runs[1].points)
+    found = list(check_robot_held_points(arms[1], replace(runs[1], points=groups), usual))
+    assert [doubt.cause for doubt in found] == (["point_frame"] if is_known else [])
+
+
+def test_a_clocks_offset_is_known_no_better_than_the_errors_that_look_like_it():
+    """Of a point that moves steadily: a frame that is off by 2 cm is an offset of 2 cm over the speed."""
+    t, speed, noise = np.linspace(0.0, 10.0, 400), 0.5, 1e-3
+    by_clock = _by_clock(t, np.full(400, speed / noise), (0.0, 10.0))
+    residual = by_clock[:, 0] * 0.03 + np.random.default_rng(0).standard_normal(400)
+    found = _clock_error(t, residual, by_clock, np.full((400, 1), 1 / noise), np.array([0.02]), (0.0, 10.0))
+    assert found.delay == pytest.approx(0.03, rel=0.02)
+    assert found.delay_std == pytest.approx(0.02 / speed, rel=0.02)
+    alone = _clock_error(t, residual, by_clock, np.zeros((400, 0)), np.zeros(0), (0.0, 10.0))
+    assert alone.delay_std == pytest.approx(noise / speed / math.sqrt(400), rel=0.5)
+
+
 def test_clocks_that_are_far_apart(arms, runs):
     (doubt,) = check_robot_held_points(arms[2], stamped(runs[2], 0.2, -0.05), usual)
     assert "taken +0.202 s from the joints, by a clock that runs -52.4 parts per thousand fast" in doubt.what
@@ -539,6 +562,7 @@ def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):
     assert doubt.evidence_ratio == pytest.approx(QUALITY_LIMITS.min_joint_motion / 0.006, rel=1e-3)
     assert "elbow turns by 0.006 rad at most, in held" in doubt.what
     assert list(check_joint_excitation([held, recording], asked, USUAL)) == []
+    assert list(check_joint_excitation([recording, held], asked, USUAL)) == []
     assert list(check_joint_excitation([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
     coarse = replace(USUAL, std=0.2)
     (doubt,) = check_joint_excitation([held, recording], asked, coarse)

@@ -246,6 +246,16 @@ def test_a_stiffness_that_is_known_to_be_small_is_found():
     assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))
 
 
+def test_the_papers_cost_and_a_failed_fit_have_no_intervals():
+    problem = Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0})
+    fitted = replace(solution(a=estimate(3.0, 10.0, "weak")), x=problem.initial_unknowns)
+    assert solution_with_profile_intervals(problem, fitted) is fitted
+    fitted = replace(fitted, evaluation=problem.evaluate(problem.initial_unknowns))
+    assert solution_with_profile_intervals(problem, fitted).parameters["a"].interval is not None
+    problem.options.weighting = "paper"
+    assert solution_with_profile_intervals(problem, fitted) is fitted
+
+
 TWINS = 100
 SEEN = ("T1.bend", "T1.twist", "T2.bend", "T3.bend")
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}

@@ -67,7 +67,7 @@ def diagnosed(side: str, extra):
     free, options = tuple(f"{name}.damping" for name in names), ProblemOptions(path_cutoff=np.inf)
     estimate, held_out = (recording(side, seed, extra) for seed in (1, 2))
     problem = EstimationProblem(step, [estimate], free, options, held_out=[held_out])
-    return diagnose(problem, CANDIDATES, thresholds=Thresholds(max_effects=2, n_refit_per_round=3))
+    return diagnose(problem, CANDIDATES, thresholds=Thresholds(max_effects=1, n_refit_per_round=3))
 
 
 def test_a_spring_is_found_at_a_wrist():

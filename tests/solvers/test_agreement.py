@@ -89,10 +89,10 @@ def test_multiple_shooting_agrees(make_problem, solver, duration):
 
 @pytest.fixture(scope="module")
 def two_arms(paper_systems, clean):
-    """50 variables, 250 steps, six parameters from 3 N m/rad; two of the twists leave no trace in the data."""
+    """50 variables, 200 steps, six parameters from 3 N m/rad; two of the twists leave no trace in the data."""
     step = compile_step(paper_systems["dual"], 0.01)
     recording = read_recording(clean / "dual_arm_vision_estimate.h5")
-    return EstimationProblem(step, [recording], FREE, ProblemOptions(duration=2.5))
+    return EstimationProblem(step, [recording], FREE, ProblemOptions(duration=2.0))
 
 
 @pytest.mark.parametrize(

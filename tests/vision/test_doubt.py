@@ -10,7 +10,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.vision import CloudFilterOptions
 from yid_ocp.vision.sequence_calibration import TubeDimensionEstimates
 
-FRAMES = 4
+FRAMES = 3
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_radii_wrong_by_a_third_are_said_and_enter_the_standard_deviation(track)
 
 def test_estimated_radii_are_used(track):
     thin = {name: 0.7 * radius for name, radius in Y_RADII.items()}
-    found, error = track(radii=thin, estimated_dimensions=("radius",))
+    found, error = track(radii=thin, frames=4, estimated_dimensions=("radius",))
     assert np.exp(found.dimensions.log_ratio[3:]) == pytest.approx(0.7, abs=0.06)
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.012
 
