@@ -32,6 +32,7 @@ from yid_ocp.diagnosis.hypotheses import (
     exclude_candidates,
     make_candidate_effects,
 )
+from yid_ocp.diagnosis.law import find_gap_law
 from yid_ocp.diagnosis.refit import (
     NominalSolutionAndRefitStore,
     RefitContext,
@@ -131,7 +132,7 @@ def diagnose(
         clock["compose"] = time.perf_counter()
         limits = thresholds or DEFAULT_THRESHOLDS
         search = RefitContext(composed, limits, told, known.store, clock[""] + (limits.budget or math.inf))
-        return _diagnosed(_examined(problem, search, known.solution, clock), earlier, clock)
+        return _diagnosed(problem, _examined(problem, search, known.solution, clock), earlier, clock)
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,9 @@ def _examined(
     return found
 
 
-def _diagnosed(seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, float]) -> DiagnosisResult:
+def _diagnosed(
+    problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, float]
+) -> DiagnosisResult:
     search, nominal, before, held, screened = seen.search, seen.nominal, seen.before, seen.held, seen.screened
     limits, enough, scores = search.thresholds, seen.has_enough_samples, screened.candidate_scores
     changed = earlier.fit_parameters_differ_significantly(nominal, limits)
@@ -213,6 +216,12 @@ def _diagnosed(seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, f
     accepted = added if verdict in ("effect", "confusable") else ()
     final = last if accepted else nominal
     remaining, where, rest = _after(nominal, accepted, where, before, held, limits)
+    law = None
+    if verdict == "unknown" or (accepted and rest):
+        sought = rest if accepted else where
+        law = find_gap_law(
+            search, problem, final, [place.location for place in main_gap_locations(sought)], seen.events
+        )
     # what a better model explains was no event
     events = _happened(seen.whole, final, limits)[0] if accepted else seen.events
     clock["remaining"] = time.perf_counter()
@@ -248,6 +257,7 @@ def _diagnosed(seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, f
         counterfactual=earlier.errors_with_effects_removed_and_added(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         search_seconds=clock["refits"] - clock[""],
+        law=law,
     )
     return replace(finding, summary=diagnosis_summary_text(finding))
 

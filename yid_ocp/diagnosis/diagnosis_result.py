@@ -10,6 +10,7 @@ from typing import Any
 from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsRemovedAndAdded
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
+from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     CandidateScore,
@@ -93,6 +94,7 @@ class DiagnosisResult(ReprMixin):
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
     untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
     search_seconds: float = 0.0  # from the start to the end of the search for effects
+    law: GapLaw | None = None  # of the gap, or of what the effects leave, where something unnamed closes it
 
     def _summary(self) -> ReprLineAndTableRows:
         effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction
@@ -156,6 +158,7 @@ class DiagnosisResult(ReprMixin):
                 "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.remaining_gap_locations],
             },
             "reason": self.unknown_reason,
+            "law": None if self.law is None else self.law.to_dict(),
             "rejected_candidates": _rejected_candidates(self),
             "carried_over": [object_attributes_to_json_dict(c, carried) for c in self.transfer_checks],
             "confusable": [[object_attributes_to_json_dict(e, _EFFECT) for e in own] for own in rivals if accepted],

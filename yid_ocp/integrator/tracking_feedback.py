@@ -183,7 +183,8 @@ class EffectMomentumShift:
         seen = _columns(e.p1[driven], ca.vertcat(e.z0, e.z1))
         self._kept = sorted({row % e.z0.numel() for row in seen})
         z0, z1 = (ca.SX(ca.DM.zeros(e.z0.numel())) for _ in range(2))
-        z0[self._kept], z1[self._kept] = (x[self._kept] for x in (e.z0, e.z1))
+        if self._kept:
+            z0[self._kept], z1[self._kept] = (x[self._kept] for x in (e.z0, e.z1))
         known = [*whole, z0, z1, ca.SX(ca.DM.zeros(e.lam.numel()))]
         wanted = [ca.densify(e.p1[driven]), e.internal_residual[self._kept]]
         [momentum, law] = ca.substitute(wanted, [e.q0, e.q1, e.z0, e.z1, e.lam], known)

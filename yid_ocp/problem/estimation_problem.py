@@ -41,7 +41,7 @@ from yid_ocp.problem.evaluation import (
 )
 from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_residual_factors
 from yid_ocp.problem.model_functions import ModelFunctions
-from yid_ocp.problem.options import ProblemOptions
+from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
 
 _HELD_OUT_START_WINDOW = 0.2
@@ -443,6 +443,10 @@ class EstimationProblem(ReprMixin):
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
         """The same problem, prepared anew from its recordings with other options."""
         return self._prepared(options=options)
+
+    def with_multivariate_prior(self, prior: MultivariateGaussianPrior) -> EstimationProblem:
+        """The same problem with another multivariate prior; filters are kept."""
+        return self._changed(options=replace(self.options, multivariate_prior=prior))
 
     def with_free_parameters(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
         """The same problem, prepared anew with other free parameters and, if given, other parameter values."""

@@ -1,0 +1,310 @@
+"""A law where names end: a torque at the gap's place as a smooth function of what the model knows there.
+
+Functions compete with each other, and with a torque over time, by the evidence of a linearised fit; the best few are
+refitted with the nominal parameters and judged on held-out recordings like any effect.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.arrays import Array
+from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
+from yid_ocp.diagnosis.hypotheses import KEPT_HELD_OUT_DURATION_FRACTIONS, AllCandidatesProblem
+from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
+from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement
+from yid_ocp.effects import EffectBase
+from yid_ocp.effects.law import (
+    LAW_QUANTITY_UNITS,
+    Law,
+    LawTable,
+    law_quantities_at_location,
+    make_law,
+    quantity_values_along,
+)
+from yid_ocp.files import to_json_types
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import EpisodePrediction
+from yid_ocp.problem.options import MultivariateGaussianPrior
+
+_N_KNOTS = 12
+_MAX_PLACES = 2  # places of the gap at which a law is sought
+_MAX_REFITS = 5  # the torque over time included
+_ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # of the curvature, among which the evidence chooses
+_RIDGE_STD_RATIO = 3.0  # standard deviation of a value at a knot, beside its curvature, over the torques there
+_MIN_LEFTOVER_CLOSURE = 0.2  # part of what effects leave that a law beside them must close to be told
+
+
+@dataclass(frozen=True)
+class GapLaw:
+    """A law estimated where nothing in the library explains the gap, with its held-out closure."""
+
+    location: str
+    tables: tuple[LawTable, ...]  # one for every quantity that it depends on
+    visited_range: Mapping[str, tuple[float, float]]  # of every quantity, in the recordings to estimate on
+    closure: GapClosure  # of the held-out gap that the model without it leaves
+    runner_up: tuple[str, str, float] | None  # location, quantities and closure of the next best
+    model: RefittedModel
+    has_accepted_effects: bool  # whether it stands beside effects that a diagnosis names
+
+    @property
+    def depends_on(self) -> str:
+        """The quantities that the torque depends on, joined with `+`."""
+        return "+".join(table.quantity for table in self.tables)
+
+    @property
+    def sentence(self) -> str:
+        """What is said of the law: where, of what, how large, and how far it closes the gap."""
+        if self.depends_on == "time":
+            head = f"{self.location} carries a torque that depends on nothing the model knows better than on time"
+        else:
+            words = " and its ".join("the time" if t.quantity == "time" else t.quantity for t in self.tables)
+            head = f"{self.location} carries a torque that depends on its {words}"
+        sizes = []
+        for table in self.tables:
+            low, high = self.visited_range[table.quantity]
+            seen = (table.knots >= low) & (table.knots <= high)
+            torque, unit = table.torque[seen], LAW_QUANTITY_UNITS[table.quantity]
+            if len(torque):
+                ends = f"from {torque.min():.2g} to {torque.max():.2g} N m"
+                sizes.append(f"{ends} between {low:.2g} and {high:.2g} {unit}")
+        gap = "of the held-out gap that the effects leave" if self.has_accepted_effects else "of the held-out gap"
+        closed = f"it closes {100 * self.closure.fraction:.3g} % {gap}"
+        return f"{head} ({', '.join(sizes)}); {closed}. It is not in the library."
+
+    def to_dict(self) -> dict[str, Any]:
+        """The law as a JSON-compatible dictionary: location, depends_on, table, closure, visited_range, runner_up."""
+        rows = [
+            {"quantity": t.quantity, "unit": LAW_QUANTITY_UNITS[t.quantity], "at": x, "torque": f, "std": s}
+            for t in self.tables
+            for x, f, s in zip(t.knots.tolist(), t.torque.tolist(), t.torque_std.tolist(), strict=True)
+        ]
+        keys = ("location", "depends_on", "closure")
+        rival = None if self.runner_up is None else dict(zip(keys, self.runner_up, strict=True))
+        found = {
+            "location": self.location,
+            "depends_on": self.depends_on,
+            "table": rows,
+            "closure": self.closure.fraction,
+            "closure_ci": [self.closure.ci_low, self.closure.ci_high],
+            "visited_range": {name: list(ends) for name, ends in self.visited_range.items()},
+            "runner_up": rival,
+            "sentence": self.sentence,
+        }
+        return {name: to_json_types(value) for name, value in found.items()}
+
+
+@dataclass(frozen=True)
+class _Family:
+    """A law as a function of some quantities at one place: what a linearised fit says of it."""
+
+    law: Law  # restricted to the quantities
+    log_evidence: float
+    values: dict[str, float]  # at the knots, of the linearised fit
+    precision: Array  # of the prior of the values at the knots, in the order of the law's parameters
+
+
+def find_gap_law(
+    search: RefitContext,
+    problem: EstimationProblem,
+    last: RefittedModel,
+    places: Sequence[str],
+    events: EventSet,
+) -> GapLaw | None:
+    """Estimate the law of the gap that a model leaves; None where no place is possible or nothing closes any of it.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        Of the nominal model, without candidates.
+    last : RefittedModel
+        The model with the effects that are named, or the nominal one.
+    places : sequence of str
+        Locations of the gap, the likeliest first.
+    """
+    system = problem.system
+    places = [place for place in places if law_quantities_at_location(system, place)][:_MAX_PLACES]
+    if not places or search.note_skip_past_deadline("a law"):
+        return None
+    search.progress.begin_stage(f"estimating a law at {' and '.join(places)}", 3.0, 2.5)
+    laws = [_law_with_all_quantities(last, place) for place in places]
+    composed = _composed_with_laws(search, problem, last, laws, events)
+    before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
+    if before is None:
+        return None
+    composed = replace(composed, problem=before.problem.with_free_parameters_without_recompiling(problem.free))
+    families = _ranked_families(composed, before, laws)
+    found: list[tuple[_Family, RefittedModel, HeldOutLoss]] = []
+    for family in families:
+        fit = _refitted(composed, before, family, search)
+        if fit is not None:
+            found.append((family, fit, replace(fit.held_out_loss, baseline_chi2=before.held_out_loss.baseline_chi2)))
+    found.sort(key=lambda entry: entry[2].chi2_per_sample)
+    closures = [held_out_gap_closure(before.held_out_loss, loss, search.thresholds) for *_, loss in found]
+    if not found or not _closes(before.held_out_loss, found[0][2], closures[0], bool(last.effects)):
+        return None
+    family, fit, _ = found[0]
+    rivals = [
+        (f.law.location, "+".join(f.law.quantities), c.fraction) for (f, *_), c in zip(found, closures, strict=True)
+    ]
+    ranges = {name: _visited_range(last, family.law.location, name) for name in family.law.quantities}
+    runner_up = rivals[1] if len(rivals) > 1 else None
+    return GapLaw(
+        family.law.location, _tables(family.law, fit), ranges, closures[0], runner_up, fit, bool(last.effects)
+    )
+
+
+def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, is_beside_effects: bool) -> bool:
+    """Whether a law surely closes a part of the gap; beside named effects a part that is worth telling."""
+    gained, error = held_out_improvement(before, after)
+    return gained > error and closure.ci_low > (_MIN_LEFTOVER_CLOSURE if is_beside_effects else 0.0)
+
+
+def _law_with_all_quantities(model: RefittedModel, place: str) -> Law:
+    """A law at a place as a sum over everything it may depend on there, neutral, with knots over what was visited."""
+    tables, zeros = [], np.zeros(_N_KNOTS)
+    for quantity in law_quantities_at_location(model.problem.system, place):
+        low, high = _visited_range(model, place, quantity)
+        room = max(high - low, 1e-6) / (_N_KNOTS - 3)
+        # half a gap of room, so that the ends are estimated and what lies beyond is flat
+        knots = np.linspace(low - room / 2, high + room / 2, _N_KNOTS)
+        tables.append(LawTable(quantity, knots, zeros, zeros))
+    scale = _torque_scale(model, place)
+    return make_law(place, model.problem.system, tables, _RIDGE_STD_RATIO * scale)
+
+
+def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:
+    rollout = prediction.rollout
+    own = {"state": rollout.state, "torque": rollout.torque, "multipliers": rollout.multipliers}
+    return own | {"time_step": np.array(step)}
+
+
+def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
+    """Values of a quantity in all recordings to estimate on, shape (samples,)."""
+    problem, x, found = model.problem, model.problem.vector(model.values), []
+    for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
+        theta = problem.predictor.theta_with_episode_values(episode, problem.theta_and_initial_state_deviation(x, i)[0])
+        nodes = _along(result, episode.grid.time_step)
+        found.append(quantity_values_along(problem.system, place, quantity, theta, nodes).ravel())
+    return np.concatenate(found)
+
+
+def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[float, float]:
+    values = _visited(model, place, quantity)
+    return float(values.min()), float(values.max())
+
+
+def _torque_scale(model: RefittedModel, place: str) -> float:
+    """Standard deviation of the torque at a place [N m], of springs or through a joint; 1 where it is zero."""
+    size = float(np.std(_visited(model, place, "load")))
+    return size if size > 0 else 1.0
+
+
+def _composed_with_laws(
+    search: RefitContext, problem: EstimationProblem, last: RefittedModel, laws: Sequence[Law], events: EventSet
+) -> AllCandidatesProblem:
+    """The problem with the named effects and the laws in one step, corrected and cut as that of the diagnosis was."""
+    held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
+    composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
+    composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
+    start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
+    for margin in KEPT_HELD_OUT_DURATION_FRACTIONS[:1]:
+        composed, _ = composed.truncate_failing_held_out_recordings(start, margin)
+    return composed.whitened_at(last.values) if composed.problem.has_process_noise else composed
+
+
+def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[Law]) -> list[_Family]:
+    """The families that are refitted, by the evidence of a fit linearised about the model without a law."""
+    own = composed.with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
+    evaluation = own.evaluate(own.vector(before.values), equilibrium_guesses=before.evaluation.equilibrium_guesses)
+    if not evaluation.ok or evaluation.jacobian is None:
+        return []
+    residual, jacobian = linearization_without_weak_priors(own, evaluation)
+    names = list(own.unknown_names)
+    ours = {name for law in laws for name in law.parameters.names}
+    nuisance = [i for i, name in enumerate(names) if name not in ours]
+    basis, _ = np.linalg.qr(jacobian[:, nuisance])
+    residual = residual - basis @ (basis.T @ residual)
+    families = []
+    for law in laws:
+        quantities: list[tuple[str, ...]] = [(q,) for q in law.quantities]
+        quantities += [("angle", "speed")] if {"angle", "speed"} <= set(law.quantities) else []
+        for own_quantities in quantities:
+            part = law.restricted_to(own_quantities)
+            at = [names.index(name) for name in part.parameters.names]
+            slopes = jacobian[:, at] - basis @ (basis.T @ jacobian[:, at])
+            families.append(_family(part, residual, slopes))
+    families.sort(key=lambda family: -family.log_evidence)
+    over_time = [family for family in families if family.law.quantities == ("time",)]
+    rest = [family for family in families if family.law.quantities != ("time",)]
+    return [*rest[: _MAX_REFITS - 1], *over_time[:1]]
+
+
+def _family(law: Law, residual: Array, slopes: Array) -> _Family:
+    """Evidence, values and prior of one law: the weight of its curvature that the evidence prefers.
+
+    Noise has the size that fits best, as where the model errs more than the sensors, and the prior grows with it.
+    """
+    n, gram, pull = len(residual), slopes.T @ slopes, slopes.T @ residual
+    total = float(residual @ residual)
+    best: tuple[float, Array, Array] | None = None
+    for weight in _ROUGHNESS_WEIGHTS:
+        precision = _prior_precision(law, weight)
+        matrix = gram + precision
+        values = np.asarray(-np.linalg.solve(matrix, pull), float)
+        left = max(total + float(pull @ values), 1e-12 * total, 1e-300)
+        shrink = np.linalg.slogdet(precision)[1] - np.linalg.slogdet(matrix)[1]
+        evidence = -0.5 * n * math.log(left / n) + 0.5 * float(shrink)
+        if best is None or evidence > best[0]:
+            best = (evidence, values, precision)
+    assert best is not None
+    names = law.parameters.names
+    return _Family(law, best[0], dict(zip(names, map(float, best[1]), strict=True)), best[2])
+
+
+def _prior_precision(law: Law, roughness_weight: float) -> Array:
+    """Inverse covariance of the values at a law's knots: of their second differences, and of each alone."""
+    blocks = []
+    for quantity in law.quantities:
+        count = len(law.parameter_names_of(quantity))
+        width = law.prior_ranges[law.parameter_names_of(quantity)[0]][1]
+        bends = np.diff(np.eye(count), n=2, axis=0) * (_RIDGE_STD_RATIO / width)
+        blocks.append(roughness_weight * bends.T @ bends + np.eye(count) / width**2)
+    size, made, at = sum(map(len, blocks)), np.zeros((sum(map(len, blocks)),) * 2), 0
+    for block in blocks:
+        made[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    assert at == size
+    return made
+
+
+def _refitted(
+    composed: AllCandidatesProblem, before: RefittedModel, family: _Family, search: RefitContext
+) -> RefittedModel | None:
+    """The model with a law, its values at the knots under their prior."""
+    known = composed.problem.options.multivariate_prior
+    names = (*known.parameter_names, *family.law.parameters.names)
+    covariance = np.zeros((len(names),) * 2)
+    count = len(known.parameter_names)
+    covariance[:count, :count] = known.covariance
+    covariance[count:, count:] = np.linalg.inv(family.precision)
+    prior = MultivariateGaussianPrior(names, covariance)
+    with_prior = replace(composed, problem=composed.problem.with_multivariate_prior(prior))
+    effects: tuple[EffectBase, ...] = (*before.effects, family.law)
+    start = {**before.values, **family.values}
+    return refit_with_effects(with_prior, effects, start, limits=search.thresholds)
+
+
+def _tables(law: Law, fit: RefittedModel) -> tuple[LawTable, ...]:
+    made = []
+    for quantity, knots in (law.knots or {}).items():
+        names = law.parameter_names_of(quantity)
+        torque, std = (np.array([own[name] for name in names]) for own in (fit.values, fit.std))
+        made.append(LawTable(quantity, knots, torque, std))
+    return tuple(made)

@@ -1,0 +1,268 @@
+"""A law that has no name: a torque at a joint or segment as a smooth function of what the model knows there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.arrays import Array
+from yid_ocp.effects.base import (
+    EffectBase,
+    ParameterDefinition,
+    arm_joint_names,
+    elastic_joints_within_segment,
+    segment_names,
+)
+from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
+from yid_ocp.model.flexible import ElasticJoint
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.system import MidpointState, StepTerms, System
+
+LawDependence = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
+"""What a law's torque depends on: one quantity, or a sum of functions of two."""
+LAW_QUANTITY_UNITS: Mapping[str, str] = {"angle": "rad", "speed": "rad/s", "load": "N m", "command": "rad", "time": "s"}
+"""Unit of each quantity that a law may depend on, of revolute joints."""
+_TABLE_COLUMNS = ("quantity", "unit", "at", "torque", "std")
+_SPACING_RTOL = 1e-3  # by which knots that are read may be apart unevenly
+
+
+@dataclass(frozen=True)
+class LawTable:
+    """Torque as a function of one quantity: values at equally spaced knots, shape (k,), and their standard deviations.
+
+    Between the knots runs the natural cubic spline through them, beyond them the torque stays what it is at the end.
+    """
+
+    quantity: str  # one of `LAW_QUANTITY_UNITS`
+    knots: Array
+    torque: Array  # [N m]
+    torque_std: Array  # [N m]; NaN where it is not known
+
+
+@dataclass(frozen=True)
+class Law(EffectBase):
+    """A torque F = f(x) on an arm joint, or on every joint of a segment, with x its own angle, speed, load or command.
+
+    f is the natural cubic spline through values at equally spaced knots, which are the parameters, and a sum of such
+    where it depends on two quantities. Beyond the knots it is constant. `time` is that since the recording began, the
+    internal coordinate s with ds/dt = 1. Of a segment, the load of a joint is that of its spring.
+    """
+
+    knots: Mapping[str, Array] | None = None  # of every quantity
+
+    equation = "F = f(x)"
+    required_excitation = "how far it bends"
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """The quantities that the torque depends on."""
+        return tuple(self.knots or ())
+
+    def restricted_to(self, quantities: Sequence[str]) -> Law:
+        """The same law as far as it depends on some quantities; the others' parameters are not part of it."""
+        kept = {name: own for name, own in (self.knots or {}).items() if name in quantities}
+        definitions = [d for d in self.definitions if d.name.rstrip("0123456789") in kept]
+        entries = Parameters(self.parameters[f"{self.label}.{d.name}"] for d in definitions)
+        return replace(self, parameters=entries, definitions=tuple(definitions), knots=kept)
+
+    def parameter_names_of(self, quantity: str) -> tuple[str, ...]:
+        """Names of the parameters that are values at the knots of one quantity."""
+        return tuple(f"{self.label}.{quantity}{k}" for k in range(len((self.knots or {})[quantity])))
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        force = ca.SX(state.system.n_coordinates, 1)
+        for index, spring in _coordinates_and_springs(state.system, self.location):
+            for quantity in self.quantities:
+                force[index] += self._torque(quantity, _quantity(quantity, state, self.label, index, spring))
+        equations, at_rest = {}, {}
+        for name in self.internal_coordinate_symbols:
+            row = state.internal_rows[name]
+            equations[name], at_rest[name] = state.h * (state.z_rate[row] - 1), state.z[row]
+        return StepTerms(generalized_force=force, internal_equations=equations, static_equations=at_rest)
+
+    def _torque(self, quantity: str, x: ca.SX) -> ca.SX:
+        """f(x) by cubic B-splines, of which four are not zero anywhere."""
+        knots = (self.knots or {})[quantity]
+        values = ca.vertcat(*(self.parameters[name].symbol for name in self.parameter_names_of(quantity)))
+        weights = ca.SX(ca.DM(_spline_weights(len(knots)))) @ values
+        place = ca.fmin(ca.fmax((x - knots[0]) / (knots[1] - knots[0]), 0), len(knots) - 1)
+        total = ca.SX(0)
+        for k in range(len(knots) + 2):
+            away = ca.fabs(place - (k - 1))
+            total += weights[k] * (ca.fmax(2 - away, 0) ** 3 - 4 * ca.fmax(1 - away, 0) ** 3) / 6
+        return total
+
+
+def _spline_weights(count: int) -> Array:
+    """Weights (count + 2, count) of uniform cubic B-splines for the natural spline through values at the knots."""
+    inner = np.zeros((count + 2, count + 2))
+    rows = np.arange(count)
+    for shift, weight in enumerate((1 / 6, 4 / 6, 1 / 6)):
+        inner[rows, rows + shift] = weight
+    inner[count, :3], inner[count + 1, -3:] = (1, -2, 1), (1, -2, 1)
+    return np.asarray(np.linalg.inv(inner)[:, :count], float)
+
+
+def _coordinates_and_springs(system: System, location: str) -> list[tuple[int, ElasticJoint | None]]:
+    """Indices of the coordinates on which a law at a location acts, each with its spring where it has one."""
+    index = system.mechanism.joint_index
+    if location in segment_names(system):
+        return [(index(s.joint_name), s) for s in elastic_joints_within_segment(system, location)]
+    return [(index(location), None)]
+
+
+def _quantity(quantity: str, state: MidpointState, label: str, index: int, spring: ElasticJoint | None) -> ca.SX:
+    system = state.system
+    if quantity == "time":
+        return state.z[state.internal_rows[f"{label}.time"]]
+    if quantity == "angle":
+        return state.q[index]
+    if quantity == "speed":
+        return state.v[index]
+    if quantity == "command":
+        return state.u[system.driven_coordinate_indices.index(index)]
+    if spring is not None:
+        return spring.stiffness * state.q[index]
+    return system.input_force(state.u, state.q, state.v)[index] - system.weight_and_grasp_force_on_coordinate(
+        state, index
+    )
+
+
+def law_quantities_at_location(system: System, location: str) -> tuple[str, ...]:
+    """Quantities that a law may depend on at a location: no load where nothing drives, commands of servos only.
+
+    Empty where no law is possible.
+    """
+    if location in segment_names(system):
+        return ("angle", "speed", "time")
+    if location not in arm_joint_names(system):
+        return ()
+    driven = ("load",) if location in system.driven else ()
+    return ("angle", "speed", *driven, *(("command",) if location in system.servos else ()), "time")
+
+
+def quantity_values_along(
+    system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
+) -> Array:
+    """Values of a quantity at a location at all midpoints of a rollout, shape (N, joints).
+
+    `nodes` holds `state` (N + 1, nx), `torque` (N, nu), `multipliers` (N, m) and the `time_step` [s] as an array.
+    """
+    n, h = system.n_coordinates, float(nodes["time_step"])
+    if quantity == "time":
+        return (np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h
+    places, q = _coordinates_and_springs(system, location), nodes["state"][:, :n]
+    at = [index for index, _ in places]
+    if quantity == "speed":
+        return np.asarray(np.diff(q[:, at], axis=0) / h, float)
+    if quantity == "angle":
+        return np.asarray((q[1:, at] + q[:-1, at]) / 2, float)
+    if quantity == "command":
+        return nodes["torque"][:, [system.driven_coordinate_indices.index(index) for index in at]]
+    internal = system.effect_internal_coordinate_symbols
+    sizes = {"q": n, "v": n, "z": len(internal), "u": len(system.driven), "lam": system.n_constraints}
+    symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    kinematics = forward_kinematics(system.mechanism, symbols["q"])
+    rows = {name: i for i, name in enumerate(internal)}
+    state = MidpointState(
+        system,
+        kinematics,
+        symbols["q"],
+        symbols["v"],
+        symbols["z"],
+        symbols["z"],
+        symbols["u"],
+        symbols["lam"],
+        rows,
+        ca.SX(h),
+    )
+    load = ca.vertcat(*(_quantity("load", state, "", index, spring) for index, spring in places))
+    load = ca.substitute(load, ca.vertcat(*internal.values()), symbols["z"]) if internal else load
+    function = ca.Function("load", [*symbols.values(), system.parameters.symbols], [load])
+    z = nodes["state"][:-1, 2 * n :]
+    inputs = ((q[1:] + q[:-1]) / 2, np.diff(q, axis=0) / h, z, nodes["torque"], nodes["multipliers"] / h)
+    columns = [own.T if own.shape[1] else ca.DM(0, len(own)) for own in inputs]
+    return np.asarray(function.map(len(q) - 1)(*columns, np.tile(theta[:, None], len(q) - 1)), float).T
+
+
+def make_law(location: str, system: System, tables: Sequence[LawTable], torque_scale: float = math.inf) -> Law:
+    """Make a law at a joint or segment from its tables; `torque_scale` [N m] is the size that is expected of it.
+
+    `ConfigError` where no law is possible at the location, or not of the quantities.
+    """
+    label, possible = f"law@{location}", law_quantities_at_location(system, location)
+    if not possible:
+        places = (*segment_names(system), *arm_joint_names(system))
+        raise ConfigError(f"there is no place '{location}' for a law", where=label, **_allowed(location, places))
+    definitions, entries = [], []
+    for table in tables:
+        if table.quantity not in possible:
+            allowed = ", ".join(possible)
+            raise ConfigError(f"a law at {location} cannot depend on '{table.quantity}'", where=label, allowed=allowed)
+        for k, (at, torque) in enumerate(zip(table.knots, table.torque, strict=True)):
+            said = f"torque at {at:.4g} {LAW_QUANTITY_UNITS[table.quantity]}"
+            name, size = f"{table.quantity}{k}", min(torque_scale, 1e6)
+            definitions.append(ParameterDefinition(name, "N m", 0.0, -math.inf, math.inf, (-size, size), said))
+            entries.append(Parameter(f"{label}.{name}", float(torque), "N m", description=said))
+    inner = {f"{label}.time": ca.SX.sym(f"{label}.time")} if any(t.quantity == "time" for t in tables) else {}
+    knots = {table.quantity: np.asarray(table.knots, float) for table in tables}
+    return Law("law", location, Parameters(entries), inner, tuple(definitions), (), knots)
+
+
+def _allowed(name: str, known: Sequence[str]) -> dict[str, str]:
+    return dict(unknown_name_error_arguments(name, known))
+
+
+def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ...]:
+    """Read a law's tables from a CSV file, as `write_law_tables` writes it.
+
+    `DataError` where the file cannot be read as such, its knots are not evenly spaced and increasing, or it is not of
+    the quantities of `depends_on`.
+    """
+    hint = f"the header is {','.join(_TABLE_COLUMNS)}, as in the file law.csv that `diagnose` writes"
+    try:
+        lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"the law's table cannot be read: {error}", where=str(path), hint=hint) from error
+    if not lines or tuple(word.strip() for word in lines[0]) != _TABLE_COLUMNS:
+        raise DataError("this is no table of a law", where=str(path), hint=hint)
+    rows: dict[str, list[list[float]]] = {}
+    for number, words in enumerate(lines[1:], 2):
+        try:
+            quantity, _, *numbers = (word.strip() for word in words)
+            rows.setdefault(quantity, []).append([float(word or "nan") for word in numbers])
+            if len(numbers) != 3 or not all(map(math.isfinite, rows[quantity][-1][:2])):
+                raise ValueError
+        except ValueError:
+            what = f"line {number} is not a quantity, its unit and three numbers"
+            raise DataError(what, where=str(path), hint=hint) from None
+    wanted = depends_on.split("+")
+    if set(rows) != set(wanted):
+        what = f"the table is of {', '.join(rows) or 'nothing'}, the law depends on {depends_on}"
+        raise DataError(what, where=str(path), hint="set depends_on to what the table is of")
+    tables = []
+    for quantity in wanted:
+        knots, torque, std = np.array(rows[quantity]).T
+        gaps = np.diff(knots)
+        if len(knots) < 4 or np.any(gaps <= 0) or np.ptp(gaps) > _SPACING_RTOL * float(np.mean(gaps)):
+            what = f"the knots of {quantity} are not at least four evenly spaced, increasing numbers"
+            raise DataError(what, where=str(path), hint="interpolate the table at evenly spaced values")
+        tables.append(LawTable(quantity, knots, torque, std))
+    return tuple(tables)
+
+
+def law_tables_csv(tables: Sequence[LawTable]) -> str:
+    """Text of a CSV file of a law's tables, which `read_law_tables` reads."""
+    lines = [",".join(_TABLE_COLUMNS)]
+    for table in tables:
+        unit = LAW_QUANTITY_UNITS[table.quantity]
+        for at, torque, std in zip(table.knots, table.torque, table.torque_std, strict=True):
+            lines.append(f"{table.quantity},{unit},{at:.10g},{torque:.10g},{std:.6g}")
+    return "\n".join(lines) + "\n"
