@@ -161,7 +161,7 @@ def test_workers_find_what_one_process_does(run, tmp_path):
 
 
 def test_an_interrupted_run_goes_on(run, tmp_path, monkeypatch):
-    names, done = [], identifiability_command.profile_likelihood_task
+    names, done = [], identifiability_command._profile_likelihood_task
 
     def twice(name, **arguments):
         if len(names) == 1:
@@ -170,11 +170,11 @@ def test_an_interrupted_run_goes_on(run, tmp_path, monkeypatch):
         return done(name=name, **arguments)
 
     twice.__module__, twice.__qualname__ = done.__module__, done.__qualname__
-    monkeypatch.setattr(identifiability_command, "profile_likelihood_task", twice)
+    monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", twice)
     with pytest.raises(KeyboardInterrupt):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
     assert len(list((tmp_path / "run.partial" / "tasks").glob("*.json"))) == 1
-    monkeypatch.setattr(identifiability_command, "profile_likelihood_task", done)
+    monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", done)
     outcome = run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
     assert set(outcome.result["profiles"]) == {"spring_1.stiffness", "spring_2.stiffness"}
     assert not (tmp_path / "run.partial").exists()
@@ -185,7 +185,7 @@ def test_a_part_that_fails_is_said(run, tmp_path, monkeypatch):
         raise SolverError(f"no {name}", hint="mend it")
 
     failing.__module__, failing.__qualname__ = "yid_ocp.workflow.identifiability", "profiled"
-    monkeypatch.setattr(identifiability_command, "profile_likelihood_task", failing)
+    monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", failing)
     words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
     with pytest.raises(WorkerError, match=words):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())

@@ -60,7 +60,7 @@ def test_numbers_that_are_not_finite_become_null():
 
 KEYS = """format verdict gap where which effects remaining reason rejected_candidates carried_over confusable events
 not_judged next_experiment side evidence explainable statistics summary message held_out_in_blocks absorption steps
-unseen noise baseline counterfactual seconds stopped"""
+unseen noise baseline counterfactual seconds stopped law"""
 
 
 def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():

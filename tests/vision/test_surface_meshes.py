@@ -12,8 +12,8 @@ from yid_ocp.vision import surface_meshes
 from yid_ocp.vision.surface_meshes import (
     ArticulatedSurfaces,
     TriangleMesh,
+    _tube_meshes_by_joint,
     load_robot_meshes_by_joint,
-    tube_meshes_by_joint,
 )
 
 SHAPE = (480, 640)
@@ -94,7 +94,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert np.array_equal(first, one.sequence.load_cloud(1))
     assert not np.array_equal(one.capture_times[:3], two.capture_times[:3])
     # the object's surface is where the points are
-    tubes = ArticulatedSurfaces(system.numeric_mechanism(), tube_meshes_by_joint(system))
+    tubes = ArticulatedSurfaces(system.numeric_mechanism(), _tube_meshes_by_joint(system))
     away, _, _ = tubes.nearest_moving_surface(
         one.sequence.load_world_cloud(1), one.true_configuration_at(one.capture_times[1]), 0.2
     )
@@ -172,19 +172,19 @@ def test_baxters_meshes_are_found_and_move(system):
 
 
 def test_tubes_have_their_lengths_and_radii(system):
-    meshes = tube_meshes_by_joint(system)
+    meshes = _tube_meshes_by_joint(system)
     link = meshes[system.mechanism.joint_index("T3_3_z")].vertices
     assert link[:, 2].max() == pytest.approx(0.737 / 4)
     assert np.abs(link[:, :2]).max() == pytest.approx(0.019)
     assert len(meshes) == 12
-    thin = tube_meshes_by_joint(system, {"T3.radius": 0.01})[system.mechanism.joint_index("T3_3_z")].vertices
+    thin = _tube_meshes_by_joint(system, {"T3.radius": 0.01})[system.mechanism.joint_index("T3_3_z")].vertices
     assert np.abs(thin[:, :2]).max() == pytest.approx(0.01)
 
 
 def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
     tree = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
     with pytest.raises(DataError, match="no object"):
-        tube_meshes_by_joint(System.build(tree))
+        _tube_meshes_by_joint(System.build(tree))
     with pytest.raises(ModelError, match="no URDF file"):
         load_robot_meshes_by_joint(tmp_path / "none.urdf", tree)
     bare = tmp_path / "bare.urdf"

@@ -149,7 +149,7 @@ def driven(pendulum):
 @pytest.mark.slow
 def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeypatch):
     folder = tmp_path / "proof"
-    sealed_at, first = [], blind.diagnose_case_from_recordings_task
+    sealed_at, first = [], blind._diagnose_case_from_recordings_task
 
     def watched(**arguments):
         """What a diagnosis is told, and whether the labels were committed to before."""
@@ -158,7 +158,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
         return first(**arguments)
 
     watched.__module__, watched.__qualname__ = first.__module__, first.__qualname__
-    monkeypatch.setattr(blind, "diagnose_case_from_recordings_task", watched)
+    monkeypatch.setattr(blind, "_diagnose_case_from_recordings_task", watched)
     outcome = run_blind([driven], folder, 2, 3, workers=InlineExecutor())
     text = (folder / "sealed" / "labels.json").read_bytes()
     assert sealed_at == [hashlib.sha256(text).hexdigest()] * 2

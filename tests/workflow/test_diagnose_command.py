@@ -21,7 +21,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.inference.whitening import problem_whitened_at, torque_biases_and_stds_by_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.progress import Progress
-from yid_ocp.workflow.diagnose import SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
+from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
@@ -157,7 +157,7 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
     made_from = [{"a.h5": "12"}, "a: 1", {"yid-ocp": "1.0"}]
     refitted = StoredFit({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1}, "done")
     with atomic_run_folder(load_config(rubbing), tmp_path / "run") as folder:
-        first = SingleJsonFileRefitStore(folder, *made_from)
+        first = _SingleJsonFileRefitStore(folder, *made_from)
         first.put("joint_coulomb@elbow", refitted)
         if spoil == "inputs":
             made_from[0] = {"a.h5": "34"}
@@ -167,7 +167,7 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
             first.file.write_text(first.file.read_text()[:40])
         elif spoil == "other text":
             first.file.write_text("[1, 2]")
-        second = SingleJsonFileRefitStore(folder, *made_from)
+        second = _SingleJsonFileRefitStore(folder, *made_from)
         assert second.get("joint_coulomb@elbow") == (refitted if spoil == "nothing" else None)
         assert second.get("joint_viscous@elbow") is None
         assert len(caplog.records) == (0 if spoil == "nothing" else 1)

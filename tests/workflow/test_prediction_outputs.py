@@ -9,7 +9,7 @@ import pytest
 from small_problems import pendulum_step, taken
 
 from yid_ocp.analysis import estimation
-from yid_ocp.analysis.estimation import predict_held_out_with_expected_errors
+from yid_ocp.analysis.estimation import _predict_held_out_with_expected_errors
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
@@ -206,7 +206,7 @@ EFFORT, POINTS = [("joints", "effort")], [("points", "")]
     ],
 )
 def test_a_sensor_counts_as_a_whole(rmse, guess, places):
-    found = estimation.worse_than_baseline_issues([entry(rmse, guess)], UNITS)
+    found = estimation._worse_than_baseline_issues([entry(rmse, guess)], UNITS)
     assert [(doubt.group, doubt.channel) for doubt in found] == places
     assert all((d.cause, d.weight, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
 
@@ -214,7 +214,7 @@ def test_a_sensor_counts_as_a_whole(rmse, guess, places):
 def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
-    (doubt,) = estimation.worse_than_baseline_issues([said], UNITS)
+    (doubt,) = estimation._worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
     assert doubt.evidence_ratio == pytest.approx(0.2 / 0.105)
 
@@ -255,7 +255,7 @@ def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
     truth = EstimationProblem(step, [source], ("elbow.mass",), options)
     made = [replace(truth.simulate_synthetic_recording(seed=seed), name=f"held_{seed}") for seed in range(10)]
     problem = EstimationProblem(step, [source], ("elbow.mass",), options, held_out=made)
-    pairs, expected = predict_held_out_with_expected_errors(problem, problem.initial_unknowns)
+    pairs, expected = _predict_held_out_with_expected_errors(problem, problem.initial_unknowns)
     found = [estimation._prediction_error_entry(problem, *pair)["rmse"] for pair in pairs]
     channel = next(name for name in expected["held_0"] if name.endswith(".tip"))
     errors = np.sqrt(np.mean([own[channel] ** 2 for own in found]))

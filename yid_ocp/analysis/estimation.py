@@ -84,7 +84,7 @@ def checked_solution(problem: EstimationProblem, solution: Solution, progress: P
     data_std = solution.std
     solution, checks = _with_discretisation_errors(problem, solution, progress)
     progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
-    held_out, expected = predict_held_out_with_expected_errors(problem, solution.x)
+    held_out, expected = _predict_held_out_with_expected_errors(problem, solution.x)
     problem = _with_equilibrium_guesses(problem, (), [outcome for _, outcome in held_out])
     solution, issues = _checked_solution_and_issues(problem, solution, held_out)
     checks = replace(
@@ -146,7 +146,7 @@ def _checked_solution_and_issues(
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_and_units(problem, solution, held_out)
     found = drift_and_overstated_noise_issues(problem, solution.x, solution.evaluation)
-    found += worse_than_baseline_issues(errors, units)
+    found += _worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
         marked = free_estimates_marked_not_trusted(solution.parameters)
@@ -317,7 +317,7 @@ def _prediction_error_entry(
     return entry
 
 
-def predict_held_out_with_expected_errors(
+def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
 ) -> tuple[list[tuple[Episode, EpisodePrediction | str]], dict[str, dict[str, float]]]:
     """Held-out predictions as of `predict_held_out`, and the error that noise makes of each, by recording and channel.
@@ -398,7 +398,7 @@ def channels_worse_than_naive_guess(
     return worse
 
 
-def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
+def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
     """Issues for sensors that a model-free baseline predicts better than the model, over all their channels.
 
     Single channels that say little of what the model is about may well be worse; see `channels_worse_than_naive_guess`.

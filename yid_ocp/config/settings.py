@@ -19,6 +19,7 @@ from ruamel.yaml.comments import CommentedSeq
 from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
+from yid_ocp.effects.law import LawDependence
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.model.objects import OBJECT_KINDS, ObjectKind
@@ -94,9 +95,11 @@ class _JointSpringSettings:
 class EffectSettings:
     """An effect beyond the nominal model; its parameters are named kind@location.quantity."""
 
-    kind: Annotated[str, OptionInfo("kelvin_voigt, joint_coulomb, ...")]
+    kind: Annotated[str, OptionInfo("kelvin_voigt, joint_coulomb, ..., or law")]
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
     values: Annotated[Mapping[str, float], OptionInfo("quantities that are not neutral")] = field(default_factory=dict)
+    depends_on: Annotated[LawDependence | None, OptionInfo("what the torque of a law depends on")] = None
+    table: Annotated[_FilePath | None, OptionInfo("table of a law, as law.csv of a diagnosis")] = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -219,9 +219,8 @@ def _diagnosed(
     law = None
     if verdict == "unknown" or (accepted and rest):
         sought = rest if accepted else where
-        law = find_gap_law(
-            search, problem, final, [place.location for place in main_gap_locations(sought)], seen.events
-        )
+        places = [name for place in sought for name in (place.location, *place.indistinguishable_from)]
+        law = find_gap_law(search, problem, final, places, seen.events)
     # what a better model explains was no event
     events = _happened(seen.whole, final, limits)[0] if accepted else seen.events
     clock["remaining"] = time.perf_counter()

@@ -127,6 +127,7 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
         exceeds = residuals_exceed_noise(tests, finding.thresholds.null_test_limits)
         size = _model_error(finding) if exceeds else ""
         text += [_nameless(finding), f"What remains is model error{size}." if size else ""]
+    text.append("" if finding.law is None else finding.law.sentence)
     if finding.untried:
         rest = ", ".join(finding.untried[:8]) + (", ..." if len(finding.untried) > 8 else "")
         text.append(f"The search stopped after {finding.search_seconds:.3g} s; it would go on with {rest}.")

@@ -29,15 +29,17 @@ from yid_ocp.effects.law import (
 )
 from yid_ocp.files import to_json_types
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.options import MultivariateGaussianPrior
 
 _N_KNOTS = 12
-_MAX_PLACES = 2  # places of the gap at which a law is sought
+_MAX_PLACES = 3  # places of the gap at which a law is sought
 _MAX_REFITS = 5  # the torque over time included
 _ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # of the curvature, among which the evidence chooses
 _RIDGE_STD_RATIO = 3.0  # standard deviation of a value at a knot, beside its curvature, over the torques there
+_MIN_VISITED_PART = 0.7  # of the knots' range that a fitted law must visit for its knots to stay
 _MIN_LEFTOVER_CLOSURE = 0.2  # part of what effects leave that a law beside them must close to be told
 
 
@@ -128,36 +130,85 @@ def find_gap_law(
     places : sequence of str
         Locations of the gap, the likeliest first.
     """
-    system = problem.system
-    places = [place for place in places if law_quantities_at_location(system, place)][:_MAX_PLACES]
+    places = [p for p in dict.fromkeys(places) if law_quantities_at_location(problem.system, p)][:_MAX_PLACES]
     if not places or search.note_skip_past_deadline("a law"):
         return None
-    search.progress.begin_stage(f"estimating a law at {' and '.join(places)}", 3.0, 2.5)
-    laws = [_law_with_all_quantities(last, place) for place in places]
+    search.progress.begin_stage(f"estimating a law at {' or '.join(places)}", 3.0, 2.5)
+    laws = [_neutral_law(last, place, law_quantities_at_location(problem.system, place)) for place in places]
+    before, found = _refitted_families(search, problem, last, laws, events)
+    if before is None or not found:
+        return None
+    found.sort(key=lambda entry: entry.loss.chi2_per_sample)
+    # of two quantities where one alone does as well, one is enough
+    slack = search.thresholds.min_gap_closed * before.held_out_loss.excess_chi2_per_sample
+    found = sorted(found, key=lambda entry: not _is_simplest_of_the_best(entry, found, slack))
+    best, *others = found
+    runner_up = None
+    if others:
+        rival, closed = others[0].law, held_out_gap_closure(before.held_out_loss, others[0].loss, search.thresholds)
+        runner_up = (rival.location, "+".join(rival.quantities), closed.fraction)
+    # the model without the law may move far from where the robot was: knots are placed anew where it visits less
+    if any(_is_much_narrower(best, quantity) for quantity in best.law.quantities):
+        finer = _neutral_law(best.fit, best.law.location, best.law.quantities, last.problem.system)
+        again, better = _refitted_families(search, problem, last, [finer], events, best.law.quantities)
+        if again is not None and better and better[0].loss.chi2_per_sample <= best.loss.chi2_per_sample:
+            best = better[0]
+    closure = held_out_gap_closure(before.held_out_loss, best.loss, search.thresholds)
+    if not _closes(before.held_out_loss, best.loss, closure, bool(last.effects)):
+        return None
+    ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
+    tables = _tables(best.law, best.fit)
+    return GapLaw(best.law.location, tables, ranges, closure, runner_up, best.fit, bool(last.effects))
+
+
+@dataclass(frozen=True)
+class _RefittedLaw:
+    law: Law
+    fit: RefittedModel
+    loss: HeldOutLoss  # without what the prior of the law adds
+
+
+def _refitted_families(
+    search: RefitContext,
+    problem: EstimationProblem,
+    last: RefittedModel,
+    laws: Sequence[Law],
+    events: EventSet,
+    only: Sequence[str] = (),
+) -> tuple[RefittedModel | None, list[_RefittedLaw]]:
+    """The model without a law, refitted beside the laws in one step, and the refits of the likeliest families."""
     composed = _composed_with_laws(search, problem, last, laws, events)
     before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
     if before is None:
-        return None
+        return None, []
     composed = replace(composed, problem=before.problem.with_free_parameters_without_recompiling(problem.free))
-    families = _ranked_families(composed, before, laws)
-    found: list[tuple[_Family, RefittedModel, HeldOutLoss]] = []
-    for family in families:
-        fit = _refitted(composed, before, family, search)
+    found = []
+    for family in _ranked_families(composed, before, laws):
+        fit = None if only and family.law.quantities != tuple(only) else _refitted(composed, before, family, search)
         if fit is not None:
-            found.append((family, fit, replace(fit.held_out_loss, baseline_chi2=before.held_out_loss.baseline_chi2)))
-    found.sort(key=lambda entry: entry[2].chi2_per_sample)
-    closures = [held_out_gap_closure(before.held_out_loss, loss, search.thresholds) for *_, loss in found]
-    if not found or not _closes(before.held_out_loss, found[0][2], closures[0], bool(last.effects)):
-        return None
-    family, fit, _ = found[0]
-    rivals = [
-        (f.law.location, "+".join(f.law.quantities), c.fraction) for (f, *_), c in zip(found, closures, strict=True)
-    ]
-    ranges = {name: _visited_range(last, family.law.location, name) for name in family.law.quantities}
-    runner_up = rivals[1] if len(rivals) > 1 else None
-    return GapLaw(
-        family.law.location, _tables(family.law, fit), ranges, closures[0], runner_up, fit, bool(last.effects)
-    )
+            loss = replace(fit.held_out_loss, baseline_chi2=before.held_out_loss.baseline_chi2)
+            found.append(_RefittedLaw(family.law, fit, loss))
+    return before, found
+
+
+def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw], slack: float) -> bool:
+    """Whether a refit is as good as the best, the first, and has no more quantities than any other such refit.
+
+    It is where its held-out chi2/n is not surely higher, or by no more than `slack`.
+    """
+
+    def is_as_good(own: _RefittedLaw) -> bool:
+        gained, error = held_out_improvement(own.loss, found[0].loss)
+        return gained <= max(2 * error, slack)
+
+    fewest = min(len(own.law.quantities) for own in found if is_as_good(own))
+    return is_as_good(entry) and len(entry.law.quantities) == fewest
+
+
+def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
+    """Whether a fitted law's knots reach far beyond what its model visits."""
+    low, high = _visited_range(found.fit, found.law.location, quantity)
+    return high - low < _MIN_VISITED_PART * float(np.ptp((found.law.knots or {})[quantity]))
 
 
 def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, is_beside_effects: bool) -> bool:
@@ -166,17 +217,15 @@ def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, is_bes
     return gained > error and closure.ci_low > (_MIN_LEFTOVER_CLOSURE if is_beside_effects else 0.0)
 
 
-def _law_with_all_quantities(model: RefittedModel, place: str) -> Law:
-    """A law at a place as a sum over everything it may depend on there, neutral, with knots over what was visited."""
+def _neutral_law(model: RefittedModel, place: str, quantities: Sequence[str], system: System | None = None) -> Law:
+    """A neutral law at a place as a sum over quantities, with knots over what a model visits there."""
     tables, zeros = [], np.zeros(_N_KNOTS)
-    for quantity in law_quantities_at_location(model.problem.system, place):
+    for quantity in quantities:
         low, high = _visited_range(model, place, quantity)
         room = max(high - low, 1e-6) / (_N_KNOTS - 3)
         # half a gap of room, so that the ends are estimated and what lies beyond is flat
-        knots = np.linspace(low - room / 2, high + room / 2, _N_KNOTS)
-        tables.append(LawTable(quantity, knots, zeros, zeros))
-    scale = _torque_scale(model, place)
-    return make_law(place, model.problem.system, tables, _RIDGE_STD_RATIO * scale)
+        tables.append(LawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
+    return make_law(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * _torque_scale(model, place))
 
 
 def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:

@@ -12,7 +12,8 @@ from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
-_SIGN_SMOOTHING_SPEED = 0.02  # v_s in sgn(v) = tanh(v/v_s) [rad/s]
+SIGN_SMOOTHING_SPEED = 0.02
+"""v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
 _LOAD_SIGN_SMOOTHING_SPEED = 0.005  # of friction that grows with the load and holds what that would move [rad/s]
 _SMOOTHING_TORQUE = 1e-3  # below which |torque| is smoothed [N m]
 _ABS_SMOOTHING_ANGLE = 1e-7  # turned in a step, below which |d| in Dahl's law is smoothed [rad]
@@ -62,7 +63,7 @@ class JointViscous(_JointFriction):
 
 @EFFECTS.register("joint_coulomb")
 class JointCoulomb(_JointFriction):
-    """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s = `_SIGN_SMOOTHING_SPEED`."""
+    """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s = `SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
     declared_parameters = (
@@ -70,7 +71,7 @@ class JointCoulomb(_JointFriction):
     )
 
     def _friction(self, v: ca.SX) -> ca.SX:
-        return self["tau_c"] * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
+        return self["tau_c"] * ca.tanh(v / SIGN_SMOOTHING_SPEED)
 
 
 @EFFECTS.register("joint_stribeck")
@@ -86,7 +87,7 @@ class JointStribeck(_JointFriction):
     )
 
     def _friction(self, v: ca.SX) -> ca.SX:
-        return self["tau_s"] * ca.exp(-((v / self["v_stribeck"]) ** 2)) * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
+        return self["tau_s"] * ca.exp(-((v / self["v_stribeck"]) ** 2)) * ca.tanh(v / SIGN_SMOOTHING_SPEED)
 
 
 @EFFECTS.register("joint_load_friction")

@@ -10,6 +10,7 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
+import scipy.interpolate
 
 from yid_ocp.arrays import Array
 from yid_ocp.effects.base import (
@@ -44,6 +45,11 @@ class LawTable:
     knots: Array
     torque: Array  # [N m]
     torque_std: Array  # [N m]; NaN where it is not known
+
+    def torque_at(self, x: Array) -> Array:
+        """Torque [N m] at values of the quantity, shape (m,)."""
+        spline = scipy.interpolate.CubicSpline(self.knots, self.torque, bc_type="natural")
+        return np.asarray(spline(np.clip(x, self.knots[0], self.knots[-1])), float)
 
 
 @dataclass(frozen=True)
@@ -157,7 +163,7 @@ def quantity_values_along(
     """
     n, h = system.n_coordinates, float(nodes["time_step"])
     if quantity == "time":
-        return (np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h
+        return np.asarray((np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h, float)
     places, q = _coordinates_and_springs(system, location), nodes["state"][:, :n]
     at = [index for index, _ in places]
     if quantity == "speed":

@@ -277,6 +277,23 @@ def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) ->
     return figure
 
 
+def estimated_curve_figure(
+    curve: tuple[Array, Array, Array], others: Mapping[str, Array], visited: tuple[float, float], x: str, y: str
+) -> Figure:
+    """Figure of a curve (x, y, std) with two standard deviations, other curves dashed, and the visited x marked."""
+    figure, (at, middle, std) = _styled_figure(340, x, y), curve
+    edges = np.concatenate([middle + 2 * std, (middle - 2 * std)[::-1]])
+    band = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False, "opacity": 0.25}
+    figure.add_scatter(x=[*at, *at[::-1]], y=list(edges), mode="lines", fillcolor=AFTER_COLOR, **band)
+    figure.add_scatter(x=list(at), y=list(middle), mode="lines", name="law", line={"color": AFTER_COLOR})
+    for i, (name, values) in enumerate(others.items()):
+        line = {"color": _line_color(i + 1), "dash": "dash"}
+        figure.add_scatter(x=list(at), y=list(values), mode="lines", name=name, line=line)
+    for edge in visited:
+        figure.add_vline(x=edge, line={"color": _TEXT_COLOR, "dash": "dot"})
+    return figure
+
+
 def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
     """At most `_MAX_CURVE_POINTS` of a curve, in single precision, which takes half the room in a page."""
     count = len(t)

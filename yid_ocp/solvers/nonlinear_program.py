@@ -38,7 +38,7 @@ QUIET_NLPSOL_OPTIONS = {"show_eval_warnings": False, "error_on_fail": False, "pr
 _SIZE_DEPENDENT_OPTIONS = ("iteration_callback", "discrete", "equality", "structure_detection", "N", "nx", "nu", "ng")
 
 
-class ThreadSafeCachedProperty(cached_property[Any]):
+class _ThreadSafeCachedProperty(cached_property[Any]):
     """Cached property that one thread computes under CasADi's lock while other threads wait."""
 
     def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
@@ -69,7 +69,7 @@ class LocalVariableFunction:
     def _compiled(self, function: ca.Function) -> ca.Function:
         return compiled_casadi_function(function) if self._use_compiler else function
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def _weighted_hessian_function(self) -> ca.Function | None:
         """CasADi function (v, d, s, weight) of the sparse Hessian of weight . y by v; None where y is linear."""
         # one product with a direction, for each colour of the pattern: the whole would be millions of operations
@@ -179,7 +179,7 @@ class ResidualTerm:
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Jacobian (nr, nw) of the residuals r with respect to the program's unknowns w, sparse."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
-        placed = sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
+        placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
         matrix = self._residual_jacobian_by_term_values(p)
         return placed if matrix is None else ca.mtimes(matrix, placed)
 
@@ -226,7 +226,7 @@ def _nonzero_values(matrix: ca.MX) -> ca.MX:
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
 
 
-def sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
+def _sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
     """Assemble a sparse matrix from entries at distinct positions."""
     order = np.lexsort((row, column))
     start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
@@ -234,7 +234,7 @@ def sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shap
     return ca.MX(sparsity, entries[order.tolist()])
 
 
-def sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
+def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
     """Assemble a sparse square matrix from entries, summing those at the same position."""
     keys, place = np.unique(column * size + row, return_inverse=True)
     start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
@@ -365,12 +365,12 @@ class NonlinearProgram(ReprMixin):
         terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def f(self) -> ca.MX:
         """Symbolic objective f(w, p), a scalar."""
         return sum((*self._losses, *(extra.objective for extra in self.user_terms)), ca.MX(0))
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def g(self) -> ca.MX:
         """Symbolic constraint functions g(w, p), shape (ng, 1)."""
         terms = (term._symbolic_outputs(self.w, self.p) for term in self.constraint_terms)
@@ -389,11 +389,11 @@ class NonlinearProgram(ReprMixin):
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
         return {"x0": self.initial_guess, "p": self.parameter_values, **bounds}
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def _residuals(self) -> list[ca.MX]:
         return [term._symbolic_outputs(self.w, self.p) for term in self.residual_terms]
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def _slopes(self) -> list[ca.MX]:
         return [term.jacobian(self.w, self.p) for term in self.residual_terms]
 
@@ -401,17 +401,17 @@ class NonlinearProgram(ReprMixin):
     def _losses(self) -> list[ca.MX]:
         return [term._evaluate_loss(r) for term, r in zip(self.residual_terms, self._residuals, strict=True)]
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def residual(self) -> ca.MX:
         """Symbolic residuals r(w, p) of the objective's least-squares terms, shape (nr, 1)."""
         return ca.vertcat(ca.MX(0, 1), *self._residuals)
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def jac_r(self) -> ca.MX:
         """Jacobian of all residuals r with respect to the unknowns w, sparse."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def jac_g(self) -> ca.MX:
         """Jacobian of the constraints g with respect to the unknowns w, sparse."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
@@ -422,10 +422,10 @@ class NonlinearProgram(ReprMixin):
             columns.append(column)
             at += term.n_values
         where = np.concatenate(rows), np.concatenate(columns)
-        placed = sparse_mx_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
+        placed = _sparse_mx_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
         return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def grad_f(self) -> ca.MX:
         """Gradient of the objective f with respect to the unknowns w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
@@ -434,17 +434,17 @@ class NonlinearProgram(ReprMixin):
             total += ca.mtimes(slope.T, term._loss_gradient_by_residual(r))
         return total
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def lam_f(self) -> ca.MX:
         """Symbolic factor on the objective f in the Lagrangian, in which `hessian` is expressed."""
         return ca.MX.sym("lam_f")
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def lam_g(self) -> ca.MX:
         """Symbolic multipliers of the constraints g in the Lagrangian, shape (ng, 1)."""
         return ca.MX.sym("lam_g", self.g.numel())
 
-    @ThreadSafeCachedProperty
+    @_ThreadSafeCachedProperty
     def _hessians(self) -> dict[HessianKind, ca.MX]:
         return {}
 
@@ -489,7 +489,7 @@ class NonlinearProgram(ReprMixin):
     def _curvature(self, term: MappedFunctionTerm, weight: ca.MX) -> ca.MX | int:
         """Hessian of weight . values of a term."""
         curved = term._weighted_hessian_triplets(self.w, self.p, weight)
-        return 0 if curved is None else sparse_matrix_summing_duplicates(*curved, self.w.numel())
+        return 0 if curved is None else _sparse_matrix_summing_duplicates(*curved, self.w.numel())
 
     def _ridge(self, ridge: GaussNewtonHessianRidge) -> ca.MX:
         count = sum(residual.n_residuals for residual in self.residual_terms)

@@ -161,7 +161,7 @@ def simulate_in_mujoco(
         controller: TrackingController | _ServoCommander
         if system.servos:
             controller = _ServoCommander(scene, motion)
-            settle_under_servo_commands(scene, nominal_damping, controller.initial_command)
+            _settle_under_servo_commands(scene, nominal_damping, controller.initial_command)
         else:
             controller = TrackingController(scene, motion, settle_to_equilibrium(scene, nominal_damping))
         if injected is not None:
@@ -291,7 +291,7 @@ class _ServoCommander:
         return commands
 
 
-def initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
+def _initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
     """Set the commands of all actuators and fill the history of delayed ones with them."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
@@ -301,7 +301,7 @@ def initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
             scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
 
 
-def settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Array) -> None:
+def _settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Array) -> None:
     """Bring the scene to rest under constant servo commands, with `damping` increased meanwhile."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
@@ -312,7 +312,7 @@ def settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Ar
     posture = data.qpos.copy()
     scene.mujoco.mj_resetData(model, data)
     data.qpos[:] = posture
-    initialize_actuator_history(scene, commands)
+    _initialize_actuator_history(scene, commands)
 
 
 def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
@@ -496,7 +496,7 @@ def _driven(scene: MujocoScene, path: _Path, t: Array, effort: Array | None) -> 
     start = np.array(data.qpos[at])
     if model.na:  # torques that follow are what they were before
         data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
-    initialize_actuator_history(scene, effort[0])
+    _initialize_actuator_history(scene, effort[0])
     inertia = np.zeros((model.nv, model.nv))
 
     def control(k: int, now: float) -> None:
@@ -513,7 +513,7 @@ def _driven(scene: MujocoScene, path: _Path, t: Array, effort: Array | None) -> 
 
 
 def _commanded(scene: MujocoScene, system: System, t: Array, commands: Array) -> _Played:
-    settle_under_servo_commands(scene, np.array(scene.model.dof_damping), commands[0])
+    _settle_under_servo_commands(scene, np.array(scene.model.dof_damping), commands[0])
     times = _step_times(scene, t[-1])
     held = commands[np.searchsorted(t, times + 1e-9, side="right") - 1]
     is_held = [system.servos[name].command_interpolation == "held" for name in system.driven]

@@ -390,7 +390,7 @@ def tube_link_lengths_and_radii(
     return {s.name: (entry[:-1], float(entry[-1])) for s, entry in zip(segments, numbers, strict=True)}
 
 
-def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
+def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
     """Cylinders along the object's links with balls between them, by joint, in its frame; `DataError` without tubes."""
     if not system.segment_layouts:
         raise DataError("the model has no object to see", hint="give it segments")
@@ -532,7 +532,7 @@ def render_virtual_frames(
     course = CubicSpline(times, np.asarray(q, float), axis=0)
     configuration = np.asarray(course(taken))
     tree = scene.system.numeric_mechanism(scene.parameter_values)
-    meshes = tube_meshes_by_joint(scene.system, scene.parameter_values)
+    meshes = _tube_meshes_by_joint(scene.system, scene.parameter_values)
     robot = load_robot_meshes_by_joint(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
     around = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in _FLOOR_AND_WALL]
     still = [*(around if robot else []), *([robot.pop(-1)] if -1 in robot else [])]

@@ -99,7 +99,7 @@ def run_blind(
     try:
         commitment, cases = proof.commit()
         progress.begin_stage(f"diagnosing {count} cases")
-        answers = proof.done(diagnose_case_from_recordings_task, cases, "answers")
+        answers = proof.done(_diagnose_case_from_recordings_task, cases, "answers")
         sealed = read_input_text(proof.folder / "sealed/labels.json")
         labels = blind.open_sealed_labels(sealed, commitment["sha256"])
         progress.begin_stage("scoring")
@@ -270,7 +270,7 @@ def _draw_case(
     return dict(to_json_types({"label": label.to_dict(), "case": told}))
 
 
-def diagnose_case_from_recordings_task(
+def _diagnose_case_from_recordings_task(
     experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], without: Sequence[str]
 ) -> dict[str, Any]:
     """Task: diagnose a case from its recordings, the last one held out; returns {seconds, result}.

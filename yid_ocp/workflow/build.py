@@ -12,13 +12,14 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import GraspSettings, ParameterSettings, RunSettings
+from yid_ocp.config.settings import EffectSettings, GraspSettings, ParameterSettings, RunSettings
 from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
-from yid_ocp.effects import make_effect
+from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
-from yid_ocp.errors import DataError, YidError, nearest_name_hint
+from yid_ocp.effects.law import make_law, read_law_tables
+from yid_ocp.errors import ConfigError, DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
@@ -184,7 +185,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
         system = system.with_effects([make_effect(k, joint, system) for k in kinds if f"{k}@{joint}" not in named])
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
-            system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
+            system = system.with_effects([_stated_effect(said, system)])
     system = _with_robot_file_constants(run, system)
     chosen, entries = settings_by_parameter_name(run, system.parameters), []
     for entry in system.parameters:
@@ -201,6 +202,17 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
                 entry = replace(entry, value=value, lower=lower, upper=upper)
         entries.append(entry)
     return replace(system, parameters=Parameters(entries))
+
+
+def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
+    if said.kind != "law":
+        if said.table is not None or said.depends_on is not None:
+            raise ConfigError(f"{said.kind} has no table", hint="a law has; its kind is law")
+        return make_effect(said.kind, said.location, system, dict(said.values))
+    if said.table is None or said.depends_on is None or said.values:
+        hint = "state depends_on and table, and no values: they stand in the table"
+        raise ConfigError("a law needs its table and what it depends on", hint=hint)
+    return make_law(said.location, system, read_law_tables(Path(said.table), said.depends_on))
 
 
 def _with_robot_file_constants(run: RunSettings, system: System) -> System:

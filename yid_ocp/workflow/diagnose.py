@@ -20,6 +20,7 @@ from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.effects import EFFECTS
+from yid_ocp.effects.law import law_tables_csv
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import (
     dataclass_from_plain_data,
@@ -28,6 +29,7 @@ from yid_ocp.files import (
     to_json_types,
     to_lossless_plain_data,
     write_strict_json,
+    write_text,
 )
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
@@ -64,7 +66,7 @@ def run_diagnose(
     """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
         folder.record_run_start(run, "diagnose", _flags(run))
-        refits = SingleJsonFileRefitStore(
+        refits = _SingleJsonFileRefitStore(
             folder, folder.input_hashes, config_yaml_with_defaults(run), software_and_plugin_versions()
         )
         logged = _LoggedProgress(progress, folder)
@@ -100,6 +102,8 @@ def run_diagnose(
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
         prediction_outputs.write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
+        if finding.law is not None:
+            write_text(folder.path / "law.csv", law_tables_csv(finding.law.tables))
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
         moving = not last.problem.options.clamp_pose_definitions_from_points and bool(
@@ -256,7 +260,7 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[EpisodeWithNominalAndE
     return scenes
 
 
-class SingleJsonFileRefitStore:
+class _SingleJsonFileRefitStore:
     """A store of refits in one JSON file, replaced as a whole after every refit.
 
     One that was made from other inputs, by another configuration or version is skipped with a notice. Refits run in

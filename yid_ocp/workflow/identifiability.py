@@ -213,7 +213,7 @@ class _IdentifiabilityTasks:
 
     def with_profile_likelihoods(self, analysis: IdentifiabilityResult, names: Sequence[str]) -> IdentifiabilityResult:
         """The analysis with profile likelihoods of the named parameters, one task per parameter."""
-        found = self._done(profile_likelihood_task, {name: {"name": name} for name in names})
+        found = self._done(_profile_likelihood_task, {name: {"name": name} for name in names})
         parameters, profiles = dict(analysis.parameters), dict(analysis.profiles)
         for name, told in zip(names, found, strict=True):
             parameters[name] = dataclass_from_plain_data(fisher.ParameterIdentifiability, told["parameter"])
@@ -244,7 +244,7 @@ class _IdentifiabilityTasks:
         return require_task_values(run_tasks(function, listed, self.results_folder, self.workers, report))
 
 
-def profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, Any]:
+def _profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Task: profile likelihood of one parameter and its updated verdict, as plain data."""
     run, problem = _problem(common)
     known = {key: common[key] for key in ("start", "grasp_std")} | {"limits": run.diagnosis.null_test_residual_limits}

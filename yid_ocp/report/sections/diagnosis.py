@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages
 from yid_ocp.diagnosis.screening import smoothed_unknown_units, z_scores_of_smoothed_unknowns
+from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
+from yid_ocp.effects.law import LAW_QUANTITY_UNITS, LawTable
 from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.inference.smoother import SmoothedUnknownsResult
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -43,6 +46,7 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
         "events": _events(finding),
         "where": _where(finding),
         "which": _which(finding, result),
+        "law": _law(finding),
         "alike": _alike(finding, result),
         "curves": _curves(finding, findings.section_data["predictions"]),
         "absorbed": _absorbed(finding),
@@ -239,6 +243,53 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return title, sentences, [("", figures.candidate_ranking_figure(entries, *axes))]
+
+
+def _law(finding: DiagnosisResult) -> _Chapter | None:
+    law = finding.law
+    if law is None:
+        return None
+    shown: _TitledFigures = []
+    for table in law.tables:
+        low, high = table.knots[0], table.knots[-1]
+        at = np.linspace(low, high, 200)
+        torque, std = table.torque_at(at), np.interp(at, table.knots, table.torque_std)
+        nearest = _library_curves(table, at)
+        words = (f"{table.quantity} [{LAW_QUANTITY_UNITS[table.quantity]}]", "torque [N m]")
+        visited = law.visited_range[table.quantity]
+        shown.append((law.location, figures.estimated_curve_figure((at, torque, std), nearest, visited, *words)))
+    rival = law.runner_up
+    sentences = [
+        law.sentence,
+        "The band is two standard deviations. Between the dotted lines the recordings visit; beyond, the torque is "
+        "taken to stay what it is. Dashed is the nearest law of the library.",
+        "" if rival is None else f"Next best: {rival[1]} at {rival[0]}, which closes {100 * rival[2]:.3g} %.",
+        "law.csv holds the table; an effect {kind: law, location, depends_on, table} puts it into a model.",
+    ]
+    return "A law without a name", sentences, shown
+
+
+def _library_curves(table: LawTable, at: Array) -> dict[str, Array]:
+    """The curve of the library's laws that is nearest to a table, by weighted least squares of its amplitudes."""
+    shapes: dict[str, Callable[[Array], Sequence[Array]]] = {}
+    if table.quantity == "speed":
+        shapes = {
+            "viscous": lambda v: [v],
+            "viscous and Coulomb": lambda v: [v, np.tanh(v / SIGN_SMOOTHING_SPEED)],
+        }
+    elif table.quantity == "angle":
+        shapes = {"spring": lambda q: [np.ones_like(q), q], "cubic spring": lambda q: [np.ones_like(q), q, q**3]}
+    weight = 1 / np.where(table.torque_std > 0, table.torque_std, np.inf)
+    best: tuple[float, dict[str, Array]] = (np.inf, {})
+    for name, shape in shapes.items():
+        columns = np.column_stack(shape(table.knots)) * weight[:, None]
+        amplitudes = np.linalg.lstsq(columns, table.torque * weight, rcond=None)[0]
+        error = float(np.sum((columns @ amplitudes - table.torque * weight) ** 2)) / max(
+            len(weight) - len(amplitudes), 1
+        )
+        if error < best[0]:
+            best = error, {f"nearest of the library: {name}": np.column_stack(shape(at)) @ amplitudes}
+    return best[1]
 
 
 def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
