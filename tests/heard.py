@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from yid_ocp.progress import Progress
+from yid_ocp.display import Progress
 
 
 class Heard(Progress):

@@ -17,10 +17,10 @@ import pytest
 from light_tasks import deadly, squared
 
 from yid_ocp.config.reader import load_config
+from yid_ocp.display import Progress
 from yid_ocp.errors import WorkerError
 from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, run_tasks
 from yid_ocp.parallel.resumable_tasks import _dask_executor as connected
-from yid_ocp.progress import Progress
 from yid_ocp.version import software_fingerprint
 from yid_ocp.workflow.blind import run_blind
 

@@ -1,10 +1,13 @@
-"""Short text and notebook representations of objects, without printing their arrays."""
+"""How objects show themselves in a line and a notebook, and how work that takes long tells how far it is"""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+import logging
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows are only counted
 
@@ -46,3 +49,57 @@ def _row(cells: Sequence[str], kind: str) -> str:
 def count_with_noun(number: int, noun: str) -> str:
     """A number with its noun, such as `1 joint` and `2 joints`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+class Progress:
+    """Base class of receivers of progress reports, called by one thread at a time; it ignores all reports."""
+
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
+        """Report that a new stage of the work begins.
+
+        `work` is the time that it usually takes, `ahead` that of all stages after it, on one scale [s]. A stage whose
+        time says nothing of those after it (it may compile) is a part of `ahead`; absent, that falls by `work`.
+        """
+
+    def report_iterate(self, entry: Any) -> None:
+        """Report the point that a search accepted, a `solvers.base.Iterate`."""
+
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
+        """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
+
+    def report_table(self, rows: Sequence[Sequence[str]]) -> None:
+        """Report a table of all results so far, header first, then best first; it replaces the previous table."""
+
+
+NULL_PROGRESS = Progress()
+
+
+@dataclass(frozen=True)
+class LoggingProgress(Progress):
+    """A progress receiver that writes reports to a logger."""
+
+    log: logging.Logger
+
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
+        """Log the name of the stage."""
+        self.log.info("%s", text)
+
+    def report_parts_done(self, done: int, total: int, text: str) -> None:
+        """Log the number of finished parts."""
+        self.log.info("%d of %d, %s", done, total, text)
+
+
+class PartsDoneCounter:
+    """Thread-safe counter of a stage's `total` parallel parts; reports every count, the first with the text `first`."""
+
+    def __init__(self, progress: Progress, total: int, first: str) -> None:
+        self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()
+        progress.report_parts_done(0, total, first)
+
+    def count_done(self, text: str, table: Callable[[], Sequence[Sequence[str]]] | None = None) -> None:
+        """Report one more finished part, with the table of results if there is one; may be called from any thread."""
+        with self._lock:
+            self._count += 1
+            self._progress.report_parts_done(self._count, self._total, text)
+            if table is not None:
+                self._progress.report_table(table())

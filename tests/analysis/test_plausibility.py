@@ -27,7 +27,7 @@ from yid_ocp.analysis.point_checks import (
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
-from yid_ocp.data.issues import QUALITY_LIMITS
+from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from made_series import without
 
-from yid_ocp.data.channel_checks import typical_point_pair_distances
+from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, Issue, typical_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
-from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.problem.options import SensorOptions

@@ -35,7 +35,7 @@ from yid_ocp.diagnosis.verdict import (
     inflate_fit_stds_by_disagreement,
     is_barely_significant_and_unexplained,
 )
-from yid_ocp.progress import NULL_PROGRESS
+from yid_ocp.display import NULL_PROGRESS
 
 LIMITS = Thresholds(min_explained_fraction=0.5)
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")

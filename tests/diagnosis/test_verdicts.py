@@ -10,9 +10,9 @@ import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text
+from yid_ocp.display import Progress
 from yid_ocp.errors import YidError
 from yid_ocp.problem import ProblemOptions, SensorOptions
-from yid_ocp.progress import Progress
 
 FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
 

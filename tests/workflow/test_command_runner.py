@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.progress import Progress as Bars
 
-from yid_ocp.progress import NULL_PROGRESS
+from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.report.terminal import SummaryStatement
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow import command_runner

@@ -17,10 +17,10 @@ from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_conf
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import StoredFit
 from yid_ocp.diagnosis.refit import REFIT_SOLVER
+from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.whitening import problem_whitened_at, torque_biases_and_stds_by_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.progress import Progress
 from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
 from yid_ocp.workflow.run_folder import atomic_run_folder
 

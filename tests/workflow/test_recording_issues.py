@@ -8,7 +8,7 @@ from made_series import without
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
-from yid_ocp.data.issues import Issue
+from yid_ocp.data.channel_checks import Issue
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build import build_system

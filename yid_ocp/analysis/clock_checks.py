@@ -19,7 +19,13 @@ import scipy.optimize
 
 from yid_ocp.analysis.joint_checks import known_effect_config_line
 from yid_ocp.arrays import Array
-from yid_ocp.data.issues import MIN_DIFFERENCES_FOR_NOISE_STD, QUALITY_LIMITS, Issue, Severity, median_sample_period
+from yid_ocp.data.channel_checks import (
+    MIN_DIFFERENCES_FOR_NOISE_STD,
+    QUALITY_LIMITS,
+    Issue,
+    Severity,
+    median_sample_period,
+)
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.problem import EstimationProblem

@@ -12,6 +12,7 @@ import scipy.optimize
 
 from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, ParameterEstimate, verdict_by_relative_std
@@ -25,7 +26,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_PREFIX, Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.options import DiscretisationName
-from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96

@@ -13,7 +13,8 @@ from yid_ocp.analysis.clock_checks import drift_and_overstated_noise_issues
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
-from yid_ocp.data.issues import MAX_EVIDENCE_RATIO, Issue
+from yid_ocp.data.channel_checks import MAX_EVIDENCE_RATIO, Issue
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import named_attributes
 from yid_ocp.inference.linearized_residual import solve_step_within_unknown_sizes
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
@@ -25,7 +26,6 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.sensors.base import Sensor
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers import base as solvers

@@ -17,6 +17,7 @@ from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unk
 from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_sensor_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError, SolverError, YidError
 from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
@@ -26,7 +27,6 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.sensors import recorded_camera_pose
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,

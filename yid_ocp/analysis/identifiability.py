@@ -18,7 +18,7 @@ from yid_ocp.analysis.profile import (
     results_by_parameter_at_optimum,
 )
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
@@ -46,7 +46,6 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers.base import Solution
 
 InitialStateKnowledge = Literal["assumed", "unknown"]

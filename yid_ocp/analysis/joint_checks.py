@@ -13,8 +13,7 @@ import numpy as np
 import scipy.interpolate
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.channel_checks import white_noise_std
-from yid_ocp.data.issues import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period
+from yid_ocp.data.channel_checks import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period, white_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects.base import joint_names_by_arm
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives

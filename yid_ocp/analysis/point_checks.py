@@ -20,7 +20,7 @@ from yid_ocp.analysis.clock_checks import (
 )
 from yid_ocp.analysis.joint_checks import RecordedJointsModel, known_effect_config_line
 from yid_ocp.arrays import Array
-from yid_ocp.data.issues import Issue, median_sample_period
+from yid_ocp.data.channel_checks import Issue, median_sample_period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System

@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from yid_ocp.arrays import Array
+from yid_ocp.display import NULL_PROGRESS, PartsDoneCounter, Progress
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, linearization_without_weak_priors
 from yid_ocp.inference.uncertainty import (
     CHI2_95_TWO_SIDED,
@@ -26,7 +27,6 @@ from yid_ocp.inference.uncertainty import (
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.progress import NULL_PROGRESS, PartsDoneCounter, Progress
 from yid_ocp.solvers import GaussNewton, Solution
 
 log = logging.getLogger(__name__)

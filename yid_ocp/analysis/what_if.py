@@ -23,13 +23,12 @@ from yid_ocp.analysis.experiment_design import (
 )
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers.base import Solution
 
 _FASTER_CAMERA_RATES = (10.0, 30.0)  # rates of the camera to try [Hz]

@@ -16,7 +16,13 @@ from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data import channel_checks
-from yid_ocp.data.issues import MAX_EVIDENCE_RATIO, QUALITY_LIMITS, Issue, SensorOptionsLookup, median_sample_period
+from yid_ocp.data.channel_checks import (
+    MAX_EVIDENCE_RATIO,
+    QUALITY_LIMITS,
+    Issue,
+    SensorOptionsLookup,
+    median_sample_period,
+)
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import count_with_noun
 

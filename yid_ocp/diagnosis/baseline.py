@@ -20,6 +20,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_channel_errors
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.display import Progress
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, nearest_name_hint
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
@@ -27,7 +28,6 @@ from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
-from yid_ocp.progress import Progress
 from yid_ocp.solvers import Status
 
 _MIN_INFORMED_FRACTION = 0.05

@@ -61,6 +61,7 @@ from yid_ocp.diagnosis.verdict import (
     inflate_fit_stds_by_disagreement,
     is_barely_significant_and_unexplained,
 )
+from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.null_test import (
     NullTestResult,
@@ -75,7 +76,6 @@ from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.measurements import subtract_estimated_biases
-from yid_ocp.progress import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import INITIAL_VALUE_RESTART_FACTORS
 

@@ -17,6 +17,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, std_from_covariance
@@ -30,7 +31,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
-from yid_ocp.progress import PartsDoneCounter, Progress
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 

@@ -12,6 +12,7 @@ import numpy as np
 from yid_ocp.analysis.experiment_design import extended_step_and_observable_frames
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_RELATIVE_STD_TAKEN_AS_INFINITE
@@ -28,7 +29,6 @@ from yid_ocp.planning.motion_search import (
 )
 from yid_ocp.planning.planned_experiment import ParameterizedExperiment
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _UNOBSERVABLE_STDS = 1e-2  # stds by which no reading moves when a parameter changes by its whole value: nothing sees it
 _RANDOM_COEFFICIENT_STD = 0.3  # of random motions from which a search begins, before limits shrink them [rad or m]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from yid_ocp.arrays import Array
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.integrator.step import Step, copy_of_step_with_time_step
 from yid_ocp.model.system import System
@@ -27,7 +28,6 @@ from yid_ocp.planning.joint_paths import (
     start_joint_positions_as_array,
 )
 from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionSearch, TargetMotionSearchResult
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
 _MAX_STEP_HALVINGS = 3  # of the time step

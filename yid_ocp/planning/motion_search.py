@@ -22,11 +22,11 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares, minimize
 
 from yid_ocp.arrays import Array
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions, memoize_last_call
 from yid_ocp.planning.planned_experiment import ParameterizedExperiment
-from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
 _QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]

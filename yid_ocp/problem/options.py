@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Len
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.issues import Issue
+from yid_ocp.data.channel_checks import Issue
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.objects.base import CableTopology, ClampPoseDefinition
 from yid_ocp.options import OptionInfo

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS
+from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS
 from yid_ocp.data.readers import FilePreview
 from yid_ocp.data.readers.base import mean_sample_rate
 from yid_ocp.inference.uncertainty import (

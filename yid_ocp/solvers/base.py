@@ -16,7 +16,7 @@ import numpy as np
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.issues import Issue
+from yid_ocp.data.channel_checks import Issue
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.inference.linearized_residual import is_stationary_point

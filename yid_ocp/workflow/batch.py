@@ -18,10 +18,10 @@ from typing import Any
 
 from yid_ocp.analysis.estimate_history import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_strict_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions

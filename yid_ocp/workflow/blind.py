@@ -25,10 +25,10 @@ from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_decision_statistics
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from yid_ocp import interruption
 from yid_ocp.config.reader import load_config
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report import diagnosis_summaries, summaries  # noqa: F401, they register
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, aligned_table_lines, summary_terminal_lines
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods, explain_paper_estimates
 from yid_ocp.config.settings import RunSettings
+from yid_ocp.display import Progress
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_method_convergence
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.solvers.base import EstimateChecks

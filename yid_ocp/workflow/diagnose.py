@@ -19,6 +19,7 @@ from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.law import law_tables_csv
 from yid_ocp.errors import DataError, OutputError
@@ -35,7 +36,6 @@ from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covarianc
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve

@@ -17,6 +17,7 @@ from yid_ocp.config.settings import ParameterSettings, RunSettings, config_yaml_
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check
+from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FeatureExportSupport
@@ -28,7 +29,6 @@ from yid_ocp.export.signals import (
 )
 from yid_ocp.files import file_sha256, named_attributes, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
-from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.virtual.mjcf import mujoco_xml

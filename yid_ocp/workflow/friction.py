@@ -9,10 +9,10 @@ from typing import Any
 from yid_ocp.analysis import friction_ladder
 from yid_ocp.analysis.friction_ladder import FrictionLawFit, mean_and_std_error_over_motion_kinds
 from yid_ocp.config.settings import FrictionLawSettings, RunSettings
+from yid_ocp.display import Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import Progress
 from yid_ocp.solvers import Solution, Status, solve
 from yid_ocp.workflow.build import friction_joints, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem

@@ -25,10 +25,10 @@ from yid_ocp.analysis.profile import ParameterProfileLikelihood, is_small_enough
 from yid_ocp.analysis.what_if import ChangedExperimentResult
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import dataclass_from_plain_data, to_lossless_plain_data
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm_holding_object
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data

@@ -23,9 +23,9 @@ from yid_ocp.data.readers.base import (
     guess_units,
     parse_quantity_units,
 )
+from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.files import named_attributes
-from yid_ocp.progress import Progress
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display

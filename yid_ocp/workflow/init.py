@@ -14,13 +14,13 @@ from typing import Any, cast
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
+from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitCommandObject, comma_separated_numbers, init_command_object_factories
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
-from yid_ocp.progress import Progress
 from yid_ocp.report.animation import recording_animation
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData

@@ -16,6 +16,7 @@ from yid_ocp.analysis.step_symbols import EquationOrDerivativeFormula, NamedStep
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
+from yid_ocp.display import Progress
 from yid_ocp.errors import ModelError
 from yid_ocp.export.equations import export_step_functions, write_equation_sheet
 from yid_ocp.files import named_attributes
@@ -23,7 +24,6 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.mounted import MountedSensor

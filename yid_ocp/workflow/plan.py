@@ -15,6 +15,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_recording
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
 from yid_ocp.files import named_attributes
@@ -24,7 +25,6 @@ from yid_ocp.planning.motion_plan import ParameterCovariance, TargetMotionPlan, 
 from yid_ocp.problem.measurements import recording_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem

@@ -21,9 +21,9 @@ from filelock import FileLock, Timeout
 
 from yid_ocp import interruption
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
+from yid_ocp.display import Progress
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_text
-from yid_ocp.progress import Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions

@@ -20,11 +20,11 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.files import file_sha256, is_file, named_attributes, read_input_json
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import Progress
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import resolve_recording_path

@@ -11,10 +11,10 @@ import numpy as np
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import recording_from_prediction
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, animation_of_trajectories, recording_animation
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options

@@ -17,9 +17,9 @@ from yid_ocp.analysis.estimation import (
     solve,
 )
 from yid_ocp.config.settings import RunSettings
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import Iterate, Solution, Status
 from yid_ocp.solvers import base as solvers
 from yid_ocp.solvers.base import EpisodeAndPrediction, EstimateChecks, IterationCallback

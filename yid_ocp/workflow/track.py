@@ -18,6 +18,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import OutputSettings, RecordingsSettings, RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
+from yid_ocp.display import Progress
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.files import (
     dataclass_from_plain_data,
@@ -31,7 +32,6 @@ from yid_ocp.files import (
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, require_task_values, run_tasks
-from yid_ocp.progress import Progress
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.vision import camera_registration as registration
 from yid_ocp.vision import surface_meshes, track_result

@@ -16,8 +16,8 @@ from yid_ocp.data.readers.base import READERS as READERS
 from yid_ocp.data.readers.base import FilePreview, TopicOrColumnSummary, mean_sample_rate
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
-from yid_ocp.progress import NULL_PROGRESS, Progress
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)

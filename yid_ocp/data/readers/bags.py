@@ -18,9 +18,9 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.foreign_formats import JOINT_MESSAGE_TYPES, joint_values_of_fields, joint_values_of_message
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limited_memory
-from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
 JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"

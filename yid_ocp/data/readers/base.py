@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.issues import median_sample_period
+from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.registry import Registry
