@@ -13,7 +13,7 @@ import yid_ocp
 REPOSITORY = Path(__file__).resolve().parents[1]
 SECTIONS = {
     "Start": ("index.md", "tutorial.md", "choosing.md", "recordings.md", "settings.md", "real_data.md"),
-    "Questions": ("diagnosis.md", "identifiability.md", "comparison.md", "plan.md", "vision.md", "servo.md"),
+    "Questions": ("diagnosis.md", "identifiability.md", "comparison.md", "plan.md", "vision.md", "servo.md", "law.md"),
     "Tools": ("export.md", "extending.md", "inspection.md", "program.md", "reports.md", "workers.md"),
     "Inside": ("theory.md", "architecture.md", "glossary.md"),
 }

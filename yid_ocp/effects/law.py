@@ -21,6 +21,7 @@ from yid_ocp.effects.base import (
     segment_names,
 )
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
+from yid_ocp.files import read_input_text
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -233,10 +234,7 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
     the quantities of `depends_on`.
     """
     hint = f"the header is {','.join(_TABLE_COLUMNS)}, as in the file law.csv that `diagnose` writes"
-    try:
-        lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"the law's table cannot be read: {error}", where=str(path), hint=hint) from error
+    lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]
     if not lines or tuple(word.strip() for word in lines[0]) != _TABLE_COLUMNS:
         raise DataError("this is no table of a law", where=str(path), hint=hint)
     rows: dict[str, list[list[float]]] = {}
