@@ -23,9 +23,8 @@ PENDULUM = {"elbow.stiffness": 4.0, "elbow.damping": 0.15, "elbow.rest": 0.3}
 
 
 @pytest.fixture(scope="session")
-def golden_problem(golden, paper_systems, single_step, dual_step):
+def golden_problem(request, golden, paper_systems):
     """golden_problem("single", vision): arm points 1 mm at 100 Hz, vision 5 mm at every 33rd step, start known."""
-    steps = {"single": single_step, "dual": dual_step}
 
     def build(name: str, vision: bool) -> EstimationProblem:
         trep, system = golden(name), paper_systems[name]
@@ -47,7 +46,7 @@ def golden_problem(golden, paper_systems, single_step, dual_step):
         )
         values = dict(zip(STIFFNESSES, map(float, trep.rho), strict=True))
         recording = Recording(joints, tuple(groups), name="golden")
-        return EstimationProblem(steps[name], [recording], STIFFNESSES, options, values)
+        return EstimationProblem(request.getfixturevalue(f"{name}_step"), [recording], STIFFNESSES, options, values)
 
     return build
 
