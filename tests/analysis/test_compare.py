@@ -23,9 +23,9 @@ from yid_ocp.analysis.compare import (
     is_within_ensemble_range,
 )
 from yid_ocp.analysis.estimation import (
+    _predict_held_out_with_expected_errors,
     channels_worse_than_naive_guess,
     choose_cable_memory_fit,
-    predict_held_out_with_expected_errors,
     prediction_errors_and_units,
     worse_than_baseline_issues,
 )
@@ -583,7 +583,7 @@ def test_the_error_to_expect_is_that_of_the_sensors_and_of_torques_as_wrong_as_s
         recordings = [replace(r, joints=replace(r.joints, effort_std=size, effort_bias_std=size)) for r in recordings]
         options = ProblemOptions(path_cutoff=math.inf, **how)
         made = EstimationProblem(step, recordings[:1], ("elbow.stiffness",), options, None, recordings[1:])
-        [(_, outcome)], found = predict_held_out_with_expected_errors(made, made.initial_unknowns)
+        [(_, outcome)], found = _predict_held_out_with_expected_errors(made, made.initial_unknowns)
         [(_, plain)] = made.predict_held_out(made.initial_unknowns)
         np.testing.assert_array_equal(outcome.predicted_outputs[0], plain.predicted_outputs[0])
         return found["run_4"]["points_arm.tip"]

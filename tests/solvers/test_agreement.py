@@ -76,7 +76,7 @@ CONDENSED = MultipleShooting(condensing=True)
 
 
 @pytest.mark.parametrize(
-    ("solver", "duration"), [(MultipleShooting(), 0.2), (MultipleShooting(condensing=True, node_interval=10), 1.0)]
+    ("solver", "duration"), [(MultipleShooting(), 0.1), (MultipleShooting(condensing=True, node_interval=10), 0.6)]
 )
 def test_multiple_shooting_agrees(make_problem, solver, duration):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=duration)
