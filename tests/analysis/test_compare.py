@@ -24,10 +24,10 @@ from yid_ocp.analysis.compare import (
 )
 from yid_ocp.analysis.estimation import (
     _predict_held_out_with_expected_errors,
+    _worse_than_baseline_issues,
     channels_worse_than_naive_guess,
     choose_cable_memory_fit,
     prediction_errors_and_units,
-    worse_than_baseline_issues,
 )
 from yid_ocp.cli import main
 from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME
@@ -545,12 +545,12 @@ def test_a_channel_is_worse_than_a_guess_where_the_best_one_is_clearly_nearer():
         **{"baseline": "stays", "guess": pytest.approx(0.01), "rmse": pytest.approx(0.02)},
     }
     # of a group only a guess that all of its channels have counts, over all of them
-    [issue] = worse_than_baseline_issues([ENTRY], units)
+    [issue] = _worse_than_baseline_issues([ENTRY], units)
     error, guess = (math.sqrt((a**2 + b**2) / 2) for a, b in ((0.02, 0.01), (0.01, 0.0099)))
     assert issue.evidence_ratio == pytest.approx(error / (1.05 * guess))
     assert (issue.recording, issue.group, issue.weight) == ("run", "points", "not_trusted")
     better = ENTRY | {"rmse": {"points.a": 0.0101, "points.b": 0.01}}
-    assert worse_than_baseline_issues([better], units) == channels_worse_than_naive_guess([better], units) == []
+    assert _worse_than_baseline_issues([better], units) == channels_worse_than_naive_guess([better], units) == []
 
 
 @pytest.mark.parametrize(("start", "window"), [("equilibrium", -1.0), ("fitted_to_points", 0.1)])
