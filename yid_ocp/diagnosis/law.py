@@ -154,7 +154,8 @@ def find_gap_law(
         if again is not None and better and better[0].loss.chi2_per_sample <= best.loss.chi2_per_sample:
             best = better[0]
     closure = held_out_gap_closure(before.held_out_loss, best.loss, search.thresholds)
-    if not _closes(before.held_out_loss, best.loss, closure, bool(last.effects)):
+    least = _MIN_LEFTOVER_CLOSURE if last.effects else search.thresholds.min_gap_closed
+    if not _closes(before.held_out_loss, best.loss, closure, least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
     tables = _tables(best.law, best.fit)
@@ -211,10 +212,10 @@ def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
     return high - low < _MIN_VISITED_PART * float(np.ptp((found.law.knots or {})[quantity]))
 
 
-def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, is_beside_effects: bool) -> bool:
-    """Whether a law surely closes a part of the gap; beside named effects a part that is worth telling."""
+def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, least: float) -> bool:
+    """Whether a law surely closes at least a part of the gap."""
     gained, error = held_out_improvement(before, after)
-    return gained > error and closure.ci_low > (_MIN_LEFTOVER_CLOSURE if is_beside_effects else 0.0)
+    return gained > error and closure.ci_low > least
 
 
 def _neutral_law(model: RefittedModel, place: str, quantities: Sequence[str], system: System | None = None) -> Law:

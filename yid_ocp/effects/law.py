@@ -55,7 +55,9 @@ class LawTable:
 
 @dataclass(frozen=True)
 class Law(EffectBase):
-    """A torque F = f(x) on an arm joint, or on every joint of a segment, with x its own angle, speed, load or command.
+    """A torque F = f(x) on an arm joint, or on every joint that bends a segment.
+
+    x is that joint's own angle, speed, load or command.
 
     f is the natural cubic spline through values at equally spaced knots, which are the parameters, and a sum of such
     where it depends on two quantities. Beyond the knots it is constant. `time` is that since the recording began, the
@@ -121,7 +123,9 @@ def _coordinates_and_springs(system: System, location: str) -> list[tuple[int, E
     """Indices of the coordinates on which a law at a location acts, each with its spring where it has one."""
     index = system.mechanism.joint_index
     if location in segment_names(system):
-        return [(index(s.joint_name), s) for s in elastic_joints_within_segment(system, location)]
+        springs = elastic_joints_within_segment(system, location)
+        bends = [spring for spring in springs if spring.deformation == "bend"]
+        return [(index(spring.joint_name), spring) for spring in bends or springs]
     return [(index(location), None)]
 
 
