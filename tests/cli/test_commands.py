@@ -23,7 +23,7 @@ SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
     "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation",
         "covariance", "discretisation_notes", "stability",
-    "doubts", "torque_offsets",
+    "doubts", "torque_offsets", "to_use",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval"}
 

@@ -10,16 +10,19 @@ from small_problems import pendulum_step, taken
 
 from yid_ocp.analysis import estimation
 from yid_ocp.analysis.estimation import _predict_held_out_with_expected_errors
+from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
+from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import torque_offset_table_rows
 from yid_ocp.workflow import prediction_outputs
+from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.check import _input_noise
 
 
@@ -269,3 +272,28 @@ def test_a_group_without_a_sample_has_no_expected_error():
     nothing = SimpleNamespace(sensor=sensor, value=np.zeros((0, 3)), std=np.zeros((0, 3)))
     outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
+
+
+def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
+    system = build_system(load_config(None))
+    theta = system.parameters.vector({"T1.bend": 22.0})
+    problem = SimpleNamespace(system=system, theta_and_initial_state_deviation=lambda x, i: (theta, None))
+
+    def estimate(value, verdict):
+        return ParameterEstimate(value, 0.5, "N m/rad", 3.0, 0.0, np.inf, True, verdict)
+
+    found = {
+        "T1.bend": estimate(22.0, "identifiable"),
+        "T1.twist": estimate(7.0, "not_identifiable"),
+    }
+    told = prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
+    assert told["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
+    assert told["joints"] == [
+        {"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0},
+    ]
+    assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
+    assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']
+    assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
+    assert told["export"] == "yid-ocp export runs/a --out model.xml"
+    lost = {"T1.twist": found["T1.twist"]}
+    assert prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=lost), "runs/a") == {}

@@ -82,6 +82,13 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from (SummaryStatement(text, "verdict") for text in _found_and_lost(free))
         if result["fit"]["explains"]:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
+    if use := result.get("to_use"):
+        yield "to use these numbers (± is one standard deviation, all that is counted in it):"
+        yield CodeBlock(
+            "\n".join(
+                [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
+            )
+        )
     yield result.get("safeguard", "")
     ended = f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")

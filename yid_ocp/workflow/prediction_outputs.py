@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import casadi as ca
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike
@@ -52,6 +54,47 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
                 if prior > 0
             }
     return found
+
+
+def numbers_to_use(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
+    """What a reader copies from an estimate, of the parameters that are found: empty where none is.
+
+    `values` with total standard deviations, `joints` (of each segment and deformation the number of links and the
+    lowest and highest stiffness of a joint [N m/rad]), lines of `yaml` and `mjcf`, rows of `latex`, the command that
+    exports the model of the run folder, and what to cite.
+    """
+    found = {n: e for n, e in solution.parameters.items() if e.free and e.verdict == "identifiable"}
+    if not found:
+        return {}
+    system, theta = problem.system, problem.theta_and_initial_state_deviation(solution.x, 0)[0]
+    joints, lines = [], []
+    for layout in system.segment_layouts:
+        for deformation in ("bend", "twist"):
+            own = [s for s in system.elastic_joints if (s.segment_name, s.deformation) == (layout.name, deformation)]
+            values, symbols = ca.vertcat(*(spring.stiffness for spring in own)), system.parameters.symbols
+            stiffness = np.array(ca.Function("k", [symbols], [values])(theta))
+            moved = {name for name in found if own and ca.depends_on(values, system.parameters[name].symbol)}
+            if not moved:
+                continue
+            low, high, links = float(stiffness.min()), float(stiffness.max()), len(layout.link_joints)
+            known = {"segment": layout.name, "deformation": deformation, "links": links}
+            joints.append(known | {"lowest": low, "highest": high})
+            same = f'stiffness="{low:.4g}"' if high - low < 1e-9 * high else f'stiffness="{low:.4g}" to "{high:.4g}"'
+            lines.append(
+                f"<joint {same}/> <!-- {layout.name} {deformation}, {links} links; n links: times n/{links} -->"
+            )
+    return {
+        "values": [f"{n} = {e.value:.4g} ± {e.std:.2g} {e.unit}" for n, e in found.items()],
+        "joints": joints,
+        "yaml": ["parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
+        "mjcf": lines,
+        "latex": [
+            f"{n.replace('_', chr(92) + '_')} & ${e.value:.4g} \\pm {e.std:.2g}$ & {e.unit} \\\\"
+            for n, e in found.items()
+        ],
+        "export": f"yid-ocp export {folder} --out model.xml",
+        "cite": "CITATION.cff of yid_ocp, and Caldwell, Coleman and Correll (ISER 2014) for the problem",
+    }
 
 
 def _has_torque_bias(episode: Episode) -> bool:
