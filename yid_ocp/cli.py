@@ -228,6 +228,8 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", metavar="FORMAT", help=text)
     text = "folder for CSV or MCAP files, or file for the model; its manifest stands beside it"
     parser.add_argument("--out", metavar="PATH", required=True, help=text)
+    text = "write a model although the format cannot hold all of it; the manifest says what is left out"
+    parser.add_argument("--lossy", action="store_true", help=text)
     _printing(parser, "files' paths")
 
 

@@ -49,7 +49,7 @@ def exported(cli):
     """exported(run, out, form): write a model; returns its manifest."""
 
     def export(run, out, form="mjcf"):
-        done = cli("export", run, "--out", out, "--format", form, "--json")
+        done = cli("export", run, "--out", out, "--format", form, "--json", "--lossy")
         assert done.code == 0, done.err
         return json.loads(done.out)
 
@@ -189,7 +189,10 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
         ((broken,), ["result.json", "not JSON"]),
         ((tmp_path,), ["no finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),
-        ((found, "--format", "urdf", "--out", tmp_path / "no" / "y.urdf"), ["folder to write to does not exist"]),
+        (
+            (found, "--format", "urdf", "--lossy", "--out", tmp_path / "no" / "y.urdf"),
+            ["folder to write to does not exist"],
+        ),
     ):
         done = cli("export", *arguments, *(() if "--out" in arguments else ("--out", tmp_path / "y.xml")))
         assert done.code == 2, done.err
@@ -200,8 +203,17 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
 
 def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
     (tmp_path / "y.urdf.manifest.json").mkdir()
-    assert cli("export", found, "--format", "urdf", "--out", tmp_path / "y.urdf").code == 2
+    assert cli("export", found, "--format", "urdf", "--lossy", "--out", tmp_path / "y.urdf").code == 2
     assert not (tmp_path / "y.urdf").exists()
+
+
+def test_a_format_that_cannot_hold_all_is_refused_before_anything_is_replayed(cli, found, tmp_path) -> None:
+    done = cli("export", found, "--format", "urdf", "--out", tmp_path / "y.urdf")
+    assert done.code == 2
+    assert "URDF cannot hold T1.bend, T1.twist, T2.bend" in done.err
+    assert "grasp left" in done.err
+    assert "--lossy" in done.err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path, exported) -> None:

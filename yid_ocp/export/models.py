@@ -130,6 +130,11 @@ class FeatureExportSupport:
     status: _SupportStatus
     how: str
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the format leaves out something that moves or holds; what only sensors read is no part of a model."""
+        return self.status == "not representable" and self != _READING
+
 
 def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
     """The worst status of several parts that belong together, with the explanations of those that have it."""

@@ -61,7 +61,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     source, form, out = Path(arguments.source), arguments.format, arguments.out
     if source.is_dir() and form not in ("csv", _MCAP):
         with stderr_progress_display(arguments) as progress:
-            manifest = _export_model(source, Path(out), form or "mjcf", progress)
+            manifest = _export_model(source, Path(out), form or "mjcf", arguments.lossy, progress)
         print_result(arguments, manifest, lambda: summary_terminal_lines(export_summary(manifest)), out, out)
         return EXIT_DONE
     if source.is_dir() and form == "csv":
@@ -141,8 +141,11 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
     return _CalibratedModel(whole, nominal, values, std)
 
 
-def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dict[str, Any]:
-    """Write the final model of a run and, but for `yaml`, a manifest of what the format represents; returns this."""
+def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: Progress) -> dict[str, Any]:
+    """Write the final model of a run and, but for `yaml`, a manifest of what the format represents; returns this.
+
+    `ConfigError` where the format cannot hold an estimate, an effect or a grasp, unless `is_lossy` accepts that.
+    """
     if form not in _MODEL_FORMATS:
         why = "mjcf: UsdPhysics has no schema for cables yet, nor springs on joints that turn about three axes"
         hint, allowed = why if form == "usd" else "", ", ".join(_MODEL_FORMATS)
@@ -168,6 +171,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
+    _refuse_losses(form, is_lossy, supports, parameters, [own.name for own in full.grasps] if grasp.is_lost else [])
     manifest: dict[str, Any] = {
         "format": EXPORT_MANIFEST_FORMAT,
         "file": out.name,
@@ -191,6 +195,27 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
         out.unlink(missing_ok=True)  # a model without its manifest would be silent about what it lacks
         raise
     return manifest
+
+
+def _refuse_losses(
+    form: str,
+    is_lossy: bool,
+    effects: Mapping[str, FeatureExportSupport],
+    parameters: Mapping[str, Mapping[str, Any]],
+    grasps: Sequence[str],
+) -> None:
+    """Refuse a file that lacks effects, estimates or grasps of the model, unless that is accepted."""
+    lost = [label for label, entry in effects.items() if entry.is_lost]
+    for name, entry in parameters.items():
+        is_lost = (
+            entry["estimated"] and name.rpartition(".")[0] not in effects and entry["status"] == "not representable"
+        )
+        lost += [name] if is_lost else []
+    lost += [f"grasp {name}" for name in grasps]
+    if lost and not is_lossy:
+        what = f"{form.upper()} cannot hold {', '.join(lost)}"
+        hint = "accept a file without them by --lossy; its manifest says why of each"
+        raise ConfigError(what, where=f"--format {form}", allowed="a format that holds all, or --lossy", hint=hint)
 
 
 def _expressible(
