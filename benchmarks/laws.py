@@ -56,12 +56,12 @@ CASES: Mapping[str, Case] = {
     "one_way_damping": Case("T1", "speed", lambda q, v: -0.6 * np.maximum(v, 0.0)),
     "lopsided_spring": Case("T1", "angle", lambda q, v: -60.0 * q**2),
     "quadratic_drag": Case("left_w1", "speed", lambda q, v: -4.0 * v * np.abs(v)),
-    "soft_stop": Case("left_s1", "angle", lambda q, v: -200.0 * np.maximum(q + 0.3, 0.0) ** 2),
+    "soft_stop": Case("left_s1", "angle", lambda q, v: -600.0 * np.maximum(q + 1.15, 0.0) ** 2),
     "detent": Case("left_e1", "angle", detent),
     "falling_friction": Case("left_w1", "speed", lambda q, v: -3.0 * v / (1.0 + (v / 0.15) ** 2)),
     "slack_spring": Case("T2", "angle", lambda q, v: 8.0 * np.clip(q, -0.03, 0.03)),
     "quadratic_loss": Case("T1", "speed", lambda q, v: -1.5 * v * np.abs(v)),
-    "crooked_spring": Case("left_w0", "angle", lambda q, v: 3.0 * np.abs(q - 0.1)),
+    "crooked_spring": Case("left_w0", "angle", lambda q, v: 6.0 * np.abs(q + 0.1)),
     "one_way_gear": Case("left_e1", "speed", lambda q, v: -3.0 * np.maximum(v, 0.0)),
     "stop_and_drag": Case(
         "left_e1", "angle+speed", lambda q, v: -60.0 * np.maximum(q - 1.2, 0.0) ** 2 - 4.0 * v * np.abs(v)
