@@ -1,0 +1,171 @@
+"""Questions with a known answer on real recordings: what is said, how sure, how far off, at what cost.
+
+    python benchmarks/real.py [QUESTION ...] [--json FILE]
+
+The recordings stand in ../shared/recordings beside the repository; a question without them is skipped. Every question
+is a command of a shipped configuration with the same thresholds as everything else. `z` is (said - true) over ±. With
+`--json` answers are added to those that the file has, so that questions can be asked one by one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+RECORDINGS = REPOSITORY.parent / "shared" / "recordings"
+_PANDA = ("diagnosis.max_effects=1", "model.frames={}")
+_SERVO = RECORDINGS / "servo_pendulum"
+
+
+@dataclass(frozen=True)
+class Question:
+    """A diagnosis of a configuration with settings, the quantity that is asked and its true value or range."""
+
+    configuration: str
+    needs: str  # folder of the recordings
+    settings: tuple[str, ...] = ()
+    asked: str = ""  # kind.parameter of a candidate; empty where nothing is to be named
+    true: tuple[float, float] | None = None  # lowest and highest
+    baseline: tuple[str, ...] | None = None  # settings of a `solve` that comes before
+
+
+def _files(*names: str) -> str:
+    return f"[{', '.join(str(_SERVO / f'{name}.h5') for name in names)}]"
+
+
+QUESTIONS: Mapping[str, Question] = {
+    "panda, weight withheld": Question(
+        "panda_beam.yaml",
+        "panda_beam",
+        ("model.object.gravity_fraction=0", *_PANDA),
+        "gravity_scale.fraction",
+        (1.0, 1.0),
+    ),
+    "panda, beam left out": Question(
+        "panda_beam.yaml",
+        "panda_beam",
+        (
+            "model.object=null",
+            *_PANDA,
+            "parameters={}",
+            "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}",
+        ),
+        "payload.mass",
+        (0.33, 0.33),
+    ),
+    "soft beam, load withheld": Question(
+        "soft_beam.yaml",
+        "soft_beam",
+        (f"recordings.estimate=[{RECORDINGS / 'soft_beam' / 'beam_load52_a.h5'}]",),
+        "point_mass.mass",
+        (0.052, 0.052),
+        (),
+    ),
+    "servo, friction withheld": Question(
+        "servo_pendulum.yaml", "servo_pendulum", ("model.friction={law: viscous}",), "joint_load_friction.share"
+    ),
+    "servo, gain of 400 is 100": Question(
+        "servo_pendulum.yaml",
+        "servo_pendulum",
+        (
+            f"recordings.estimate={_files('sines_100', 'sweep_100', 'lift_100', 'drop_100')}",
+            f"recordings.held_out={_files('up_down_100')}",
+            'parameters={"*.servo_gain_factor": {initial: 400}}',
+        ),
+        "servo_gain.scale",
+        (0.25, 0.25),
+        (
+            f"recordings.estimate={_files('sines_400', 'sweep_400', 'lift_400', 'drop_400')}",
+            f"recordings.held_out={_files('up_down_400')}",
+        ),
+    ),
+    "servo, nothing withheld": Question("servo_pendulum.yaml", "servo_pendulum"),
+    "baxter": Question("baxter_arm.yaml", "baxter"),
+    "double pendulum": Question("double_pendulum.yaml", "double_pendulum"),
+}
+
+
+def _carried_out(command: str, configuration: str, settings: tuple[str, ...], out: Path, *more: str) -> dict[str, Any]:
+    said = [part for setting in settings for part in ("--set", setting)]
+    own = [sys.executable, "-m", "yid_ocp", command, str(REPOSITORY / "configs" / configuration), *said, *more]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(
+        [*own, "--out", str(out), "--quiet"], env=environment, capture_output=True, text=True, check=False
+    )
+    if not (out / "result.json").is_file():
+        raise SystemExit(done.stderr)
+    found: dict[str, Any] = json.loads((out / "result.json").read_text())
+    return found
+
+
+def asked(name: str) -> dict[str, Any]:
+    """Answer to a question as a row of the table."""
+    question, begun = QUESTIONS[name], os.times()
+    with tempfile.TemporaryDirectory() as folder:
+        more: tuple[str, ...] = ()
+        if question.baseline is not None:
+            _carried_out("solve", question.configuration, question.baseline, Path(folder) / "baseline")
+            more = ("--baseline", str(Path(folder) / "baseline"))
+        found = _carried_out("diagnose", question.configuration, question.settings, Path(folder) / "run", *more)
+    ended = os.times()
+    named = [f"{effect['kind']}@{effect['location']}" for effect in found["effects"]]
+    kind, _, parameter = question.asked.partition(".")
+    first = next((entry for entry in found["which"] if entry["kind"] == kind), None)
+    value = None if first is None else first["parameters"][parameter]
+    row: dict[str, Any] = {"question": name, "verdict": found["verdict"], "named": ", ".join(named) or "-"}
+    row |= {"truth": "-" if question.true is None else f"{question.asked} = {question.true[0]:g}"}
+    row |= {"said": "-", "±": None, "z": None, "closes": None}
+    if value is not None and first is not None:
+        row |= {"said": value["value"], "±": value["std"], "closes": first["closure"]}
+        if question.true is not None and value["std"]:
+            low, high = question.true
+            off = value["value"] - min(max(value["value"], low), high)
+            row["z"] = off / value["std"]
+    law = found["law"]
+    row["law"] = "-" if law is None else f"{law['depends_on']}@{law['location']}, {100 * law['closure']:.0f} %"
+    row["CPU [s]"] = round(ended.children_user + ended.children_system - begun.children_user - begun.children_system)
+    return row
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.3g}" if isinstance(value, float) and math.isfinite(value) else str(value)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Questions with a known answer on real recordings.")
+    parser.add_argument("questions", nargs="*", default=list(QUESTIONS), help=", ".join(QUESTIONS))
+    parser.add_argument("--json", type=Path, metavar="FILE", help="answers, added to those that it has")
+    arguments = parser.parse_args()
+    file: Path | None = arguments.json
+    rows: dict[str, Any] = json.loads(file.read_text()) if file is not None and file.exists() else {}
+    for name in arguments.questions:
+        if not (RECORDINGS / QUESTIONS[name].needs).is_dir():
+            print(f"{name}: skipped, there is no {RECORDINGS / QUESTIONS[name].needs}", file=sys.stderr)
+            continue
+        rows[name] = row = asked(name)
+        row["date"] = time.strftime("%Y-%m-%d")
+        if file is not None:
+            file.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    for i, row in enumerate(rows.values()):
+        if i == 0:
+            print("| " + " | ".join(row) + " |")
+            print("|" + "---|" * len(row))
+        print("| " + " | ".join(map(_cell, row.values())) + " |")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
