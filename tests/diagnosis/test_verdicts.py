@@ -7,11 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pendulum_bench import Bench
 
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text
+from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.display import Progress
 from yid_ocp.errors import YidError
+from yid_ocp.integrator.step import copy_of_step_with_time_step
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
 FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
@@ -105,6 +108,26 @@ def test_a_model_that_is_right_has_no_gap(bench):
     told = result["statistics"]
     assert told["p_value"] > 0.01
     assert {told[name] for name in ("closure", "fall", "explained", "carried", "evidence")} == {None}
+
+
+@pytest.mark.parametrize(
+    ("friction", "verdict", "steps"), [({}, "no_gap", (0.04, 0.02)), ({"tau_c": 0.1}, "effect", None)]
+)
+def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench, friction, verdict, steps):
+    """Steps four times as long as those of the recordings; refits of the finer step have names of their own."""
+    own = {"joint_coulomb@elbow": friction} if friction else {}
+    recordings = [bench.recording(own, seed, duration=3.0) for seed in (1, 2)]
+    coarse, names = Bench(bench.system, copy_of_step_with_time_step(bench.step, 0.04)), []
+    known = NominalSolutionAndRefitStore(
+        store=SimpleNamespace(get=lambda name: None, put=lambda name, fit: names.append(name))
+    )
+    candidates = ["joint_coulomb", "effort_offset"]
+    finding = diagnose(coarse.problem(recordings[:1]), candidates, recordings[1:], known_fits=known)
+    assert (finding.verdict, finding.stated_and_finer_time_step) == (verdict, steps)
+    told = finding.to_dict()
+    assert told["gap"]["finer_time_step"] == (steps and steps[1])
+    assert ("Steps of 0.04 s made a gap of their own" in told["summary"]) is (steps is not None)
+    assert ("the nominal model at 0.02 s" in names) is (steps is not None)
 
 
 def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):

@@ -87,18 +87,19 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
     return found
 
 
-def _parameter_shifts_in_finer_model(
+def _gauss_newton_step_in_finer_model(
     refined: _FinerDiscretisationProblem,
     coarse: EstimationProblem,
     x: Array,
     at_x: Evaluation,
     *,
     model_difference_only: bool = False,
-) -> dict[str, float] | str:
+) -> tuple[dict[str, float], Array] | str:
     """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns x (nx,).
 
-    Data, bounds and priors are those of the coarse problem, whose evaluation is `at_x`; its prediction replaces the
-    data with `model_difference_only`, for points away from an estimate. A message where the step cannot be made.
+    With the residual that the step leaves where all is linear. Data, bounds and priors are those of the coarse problem,
+    whose evaluation is `at_x`; its prediction replaces the data with `model_difference_only`, for points away from an
+    estimate. A message where the step cannot be made.
 
     Where noise drives the motion, its estimate, the weights and the Jacobian are the coarse ones: the finer model adds
     its residual alone (Richardson's extrapolation), which saves a filter of its own.
@@ -124,7 +125,19 @@ def _parameter_shifts_in_finer_model(
     low, high = ((bound - point) / scale for bound in problem.bounds)
     step = scale * bounded_levenberg_marquardt_step(jacobian * scale, residual, 0.0, low, high)
     moved = dict(zip(problem.unknown_names, map(float, step), strict=True))
-    return {name: moved[name] / (1.0 if weighted else refined._factor(name)) for name in problem.shared_parameters}
+    factors = {name: 1.0 if weighted else refined._factor(name) for name in problem.shared_parameters}
+    return {name: moved[name] / factor for name, factor in factors.items()}, residual + jacobian @ step
+
+
+def refitted_residual_at_finer_step(
+    fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
+) -> Array | None:
+    """Whitened residual at a finer time step after one Gauss-Newton step from the coarse fit x (nx,); None if unknown.
+
+    `at_x` is the coarse evaluation with Jacobian. Beside process noise the weights are the coarse ones.
+    """
+    made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
+    return None if isinstance(made, str) else made[1]
 
 
 @dataclass(frozen=True)
@@ -176,7 +189,7 @@ def measure_discretisation_shifts(
         progress.begin_stage(f"trying {words}", 2.5, 2.7)
         try:
             refined = _refined_problem(problem, key)
-            own = _parameter_shifts_in_finer_model(
+            own = _gauss_newton_step_in_finer_model(
                 refined, problem, x, at_x, model_difference_only=model_difference_only
             )
         except YidError as error:
@@ -184,7 +197,7 @@ def measure_discretisation_shifts(
         if isinstance(own, str):
             notes.append(f"what {words} would change is not known: {own}")
         else:
-            found[key] = own
+            found[key], _ = own
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
     return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes

@@ -94,6 +94,8 @@ class DiagnosisResult(ReprMixin):
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
     untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
     search_seconds: float = 0.0  # from the start to the end of the search for effects
+    # time steps as given, and as used where the error of the given one was part of the gap [s]
+    stated_and_finer_time_step: tuple[float, float] | None = None
     law: GapLaw | None = None  # of the gap, or of what the effects leave, where something unnamed closes it
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -131,6 +133,7 @@ class DiagnosisResult(ReprMixin):
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
         smoothed, accepted, since = self.smoother_result, self.accepted_effects, self.baseline_comparison
+        finer = self.stated_and_finer_time_step
         cuts = "recording kept=kept_duration whole=full_duration"
         carried = "effect=effect_label parameter value=estimation_value std=estimation_std again=held_out_value"
         carried += " again_std=held_out_std unit agrees=is_consistent"
@@ -145,6 +148,7 @@ class DiagnosisResult(ReprMixin):
                 "after": _state(self.final_model, self.remaining_test),
                 **_closure(closed),
                 "held_out": list(self.held_out_names),
+                "finer_time_step": None if finer is None else finer[1],
                 "cut": [object_attributes_to_json_dict(c, cuts) for c in self.truncated_recordings],
             },
             "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.gap_locations],

@@ -150,6 +150,14 @@ class AllCandidatesProblem:
         x = self.problem.vector(values)
         return replace(self, problem=problem_with_whitened_held_out(problem_whitened_at(self.problem, x, rounds=2), x))
 
+    def with_time_step(self, time_step: float) -> AllCandidatesProblem:
+        """The problem of the whole recordings with another time step [s], whitened by sensor noise alone."""
+        made = self.problem.with_time_step(time_step)
+        if self.is_split_in_blocks:
+            return replace(self, problem=_in_blocks(made))
+        held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(time_step)
+        return replace(self, problem=made.with_episodes(made.episodes, held.episodes))
+
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], margin: float
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
