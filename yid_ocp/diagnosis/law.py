@@ -39,6 +39,7 @@ _MAX_PLACES = 3  # places of the gap at which a law is sought
 _MAX_REFITS = 5  # the torque over time included
 _ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # of the curvature, among which the evidence chooses
 _RIDGE_STD_RATIO = 3.0  # standard deviation of a value at a knot, beside its curvature, over the torques there
+_MIN_KNOT_RANGE = 1e-3  # over which knots are spread where hardly anything is visited [unit of the quantity]
 _MIN_VISITED_PART = 0.7  # of the knots' range that a fitted law must visit for its knots to stay
 _MIN_LEFTOVER_CLOSURE = 0.2  # part of what effects leave that a law beside them must close to be told
 
@@ -134,7 +135,12 @@ def find_gap_law(
     if not places or search.note_skip_past_deadline("a law"):
         return None
     search.progress.begin_stage(f"estimating a law at {' or '.join(places)}", 3.0, 2.5)
-    laws = [_neutral_law(last, place, law_quantities_at_location(problem.system, place)) for place in places]
+    # a torque over time would predict the blocks between those that it was fitted to
+    left_out = ("time",) if search.problem.is_split_in_blocks else ()
+    laws = []
+    for place in places:
+        quantities = [q for q in law_quantities_at_location(problem.system, place) if q not in left_out]
+        laws.append(_neutral_law(last, place, quantities))
     before, found = _refitted_families(search, problem, last, laws, events)
     if before is None or not found:
         return None
@@ -223,7 +229,7 @@ def _neutral_law(model: RefittedModel, place: str, quantities: Sequence[str], sy
     tables, zeros = [], np.zeros(_N_KNOTS)
     for quantity in quantities:
         low, high = _visited_range(model, place, quantity)
-        room = max(high - low, 1e-6) / (_N_KNOTS - 3)
+        room = max(high - low, _MIN_KNOT_RANGE) / (_N_KNOTS - 3)
         # half a gap of room, so that the ends are estimated and what lies beyond is flat
         tables.append(LawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
     return make_law(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * _torque_scale(model, place))
