@@ -22,6 +22,7 @@ from yid_ocp.analysis.discretisation import (
     _gauss_newton_step_in_finer_model,
     inflate_estimates_by_discretisation,
     largest_alternating_error_growth,
+    measure_discretisation_shifts,
     refitted_residual_at_finer_step,
 )
 from yid_ocp.analysis.estimation import _checked_solution_and_step_stability
@@ -186,6 +187,11 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     found = solve(coarse, GaussNewton())
     finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
     own, _ = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
+    # without segments there are no links to divide
+    told, notes = measure_discretisation_shifts(coarse, found.x, found.evaluation, ("links", "time_step"))
+    assert notes == []
+    assert {name: entry.time_step for name, entry in told.items()} == pytest.approx(own, rel=1e-6)
+    assert {entry.links for entry in told.values()} == {None}
     change = finer.x - found.x
     assert np.abs(change).max() > 1e-5
     np.testing.assert_allclose(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from heard import Heard
 from made_recordings import chain_of_motors, group, holding_pendulum, setting
-from small_problems import places
+from small_problems import pendulum_step, places, taken
 
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis import torque_error_propagation as propagation
@@ -505,3 +505,37 @@ def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
     assert torque[-1] == np.median(recorded.torque_std)
     assert bias[-1] == np.median(recorded.torque_bias_std)
     np.testing.assert_array_equal(angle[:-1], recorded.angle_std)
+
+
+@pytest.mark.parametrize("feedback", ["none", "proportional"])
+def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_folder, feedback):
+    """Also of an arm that nothing brings back to its motion."""
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made = taken(step, 3, camera=False)
+    [tip] = made.points
+    made = replace(made, points=(replace(tip, std=np.ones(tip.position.shape), sensor="arm"),))
+    levels = {"effort_std": 0.3, "effort_bias_std": 0.2, "position_std": 0.0}
+    made = replace(made, joints=replace(made.joints, **levels))
+    options = ProblemOptions(
+        path_cutoff=math.inf,
+        arm_tracking_feedback=feedback,
+        arm_tracking_feedback_gains=(9.0,),
+        initial_state="equilibrium",
+    )
+    problem = EstimationProblem(step, [made], ("elbow.stiffness",), options)
+    x, [episode] = problem.initial_unknowns, problem.episodes
+    slopes, _ = propagation.point_sensitivities_and_joint_sensor_information(
+        problem, problem.evaluate(x), x, 0, {tip.name: 1e-6}
+    )
+    [found] = (own[:, :, len(x) :].reshape(-1, own.shape[2] - len(x)) for own in slopes.values())
+
+    def seen(change):
+        moved = replace(episode, torque=episode.torque + change[:, None], input_errors=None)
+        result = problem.predictor.predict_episode(moved, *problem.theta_and_initial_state_deviation(x, 0), False)
+        return result.predicted_outputs[0].ravel()
+
+    count, size = len(episode.torque), 1e-4
+    by_torque = np.stack([(seen(size * row) - seen(-size * row)) / (2 * size) for row in np.eye(count)], axis=1)
+    constant = by_torque.sum(axis=1)
+    expected = 0.3**2 * by_torque @ by_torque.T + 0.2**2 * np.outer(constant, constant)
+    np.testing.assert_allclose(found @ found.T, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
