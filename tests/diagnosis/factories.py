@@ -50,6 +50,12 @@ class Local(EffectBase):
     is_local = True
 
 
+class Offset(EffectBase):
+    """A constant error of a recorded torque."""
+
+    is_torque_offset = True
+
+
 def amplitude(name="a", neutral=0.0, lower=0.0, upper=math.inf, expected=(0.0, 1.0), unit="N m"):
     """A quantity whose neutral value alone makes the effect vanish."""
     return ParameterDefinition(name, unit, neutral, lower, upper, expected, "made up")

@@ -135,6 +135,22 @@ def test_the_simplest_within_reach_of_the_best_comes_first(small, large, expecte
     assert labels(_near_best_models(fits[::-1], hundredth)) == expected
 
 
+@cases(
+    "level, ratio, expected",
+    {
+        "worse in every block": (163.0, 1.2, ["small@x"]),
+        "worse in one loud block alone": (163.0, 1.0, ["large@x", "small@x"]),
+        "worse where noise is left alone": (0.9, 1.0, ["large@x", "small@x"]),
+    },
+)
+def test_a_rival_that_is_worse_in_all_blocks_is_told_apart_however_loud_one_block_is(level, ratio, expected):
+    """195 beside 163: a block of half of all squares makes the standard error of the sum as large as the difference."""
+    blocks = [level / 2] * 19 + [level * 10.5] if level > 1 else [level] * 20
+    worse = [ratio * x for x in blocks[:-1]] + [1.2 * blocks[-1] if level > 1 else 1.02 * blocks[-1]]
+    fits = [there(SMALL, *blocks), there(effect("large@x", amplitude()), *worse)]
+    assert sorted(labels(_near_best_models(fits))) == expected
+
+
 @pytest.mark.parametrize(
     ("level", "ratio", "blocks", "expected"),
     [

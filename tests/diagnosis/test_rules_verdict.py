@@ -8,6 +8,7 @@ from factories import (
     BIAS,
     FORCE,
     READ_FORCE,
+    Offset,
     added,
     amplitude,
     cases,
@@ -36,6 +37,8 @@ from yid_ocp.diagnosis.verdict import (
     is_barely_significant_and_unexplained,
 )
 from yid_ocp.display import NULL_PROGRESS
+from yid_ocp.effects import EffectBase
+from yid_ocp.model.parameters import Parameters
 
 LIMITS = Thresholds(min_explained_fraction=0.5)
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
@@ -95,16 +98,16 @@ def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
 
 
 @cases(
-    "label, p, stated, gap",
+    "of, p, stated, gap",
     {
-        "beyond": ("effort_offset@elbow", 4e-05, True, True),
-        "within": ("effort_offset@elbow", 5e-05, True, False),
-        "nobody stated any": ("effort_offset@elbow", 4e-05, False, False),
-        "another effect": ("joint_viscous@elbow", 4e-05, True, False),
+        "beyond": (Offset, 4e-05, True, True),
+        "within": (Offset, 5e-05, True, False),
+        "nobody stated any": (Offset, 4e-05, False, False),
+        "another effect": (EffectBase, 4e-05, True, False),
     },
 )
-def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(label, p, stated, gap):
-    ranked = (score(effect(label), p=p), score(effect("friction@wrist"), p=0.9))
+def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(of, p, stated, gap):
+    ranked = (score(of("zero", "elbow", Parameters(())), p=p), score(effect("friction@wrist"), p=0.9))
     assert has_significant_gap(outcome(), outcome(), LIMITS, ranked, stated) is gap
 
 

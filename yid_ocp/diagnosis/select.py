@@ -107,8 +107,7 @@ def _near_best_models(fits: Sequence[RefittedModel], limits: Thresholds = DEFAUL
         fits, best = likely, min(likely, key=_chi2)
     near = []
     for fit in fits:
-        lost, error = held_out_improvement(fit.held_out_loss, best.held_out_loss)
-        close = fit is best or lost <= max(error, limits.chi2_equivalence * _chi2(best))
+        close = fit is best or _is_predicting_as_well(fit.held_out_loss, best.held_out_loss, limits)
         if close or _noise_difference(fit, best, limits) <= CHI2_95_TWO_SIDED or _bic_prefers(fit, best, limits):
             near.append(fit)
     likeliest = min(near, key=lambda fit: penalized_chi2_difference(fit, best))
@@ -119,6 +118,22 @@ def _near_best_models(fits: Sequence[RefittedModel], limits: Thresholds = DEFAUL
         return odd, fit.effect_parameter_count, penalized_chi2_difference(fit, likeliest)
 
     return sorted(near, key=order)
+
+
+def _is_predicting_as_well(loss: HeldOutLoss, best: HeldOutLoss, limits: Thresholds) -> bool:
+    """Whether a loss is within one standard error over blocks of the best, or within `chi2_equivalence` of it.
+
+    Where a model errs, few loud blocks make the error of a sum: then it has to hold of the mean logarithm of the
+    blocks' ratios as well.
+    """
+    lost, error = held_out_improvement(loss, best)
+    if lost <= limits.chi2_equivalence * best.chi2_per_sample:
+        return True
+    count = len(best.block_chi2)
+    if lost > error or count < 2 or _noise_is_left(limits, loss, best):
+        return lost <= error
+    ratios = np.log(np.maximum(loss.block_chi2, 1.0) / np.maximum(best.block_chi2, 1.0))
+    return float(ratios.mean()) <= float(np.std(ratios, ddof=1)) / math.sqrt(count)
 
 
 def _noise_difference(fit: RefittedModel, other: RefittedModel, limits: Thresholds) -> float:

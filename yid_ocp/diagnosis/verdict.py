@@ -131,7 +131,7 @@ def has_significant_gap(
     """
     if residuals_exceed_noise((before, held_out), limits.null_test_limits):
         return True
-    stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
+    stated = [score.p_value for score in ranked if score.effect.is_torque_offset] if offsets else []
     if stated and min(stated) * len(ranked) < limits.gap_significance_level_by_candidate:
         return True
     best = bonferroni_min_p_value(ranked)

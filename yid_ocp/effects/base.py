@@ -91,6 +91,8 @@ class EffectBase(Effect):
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
     # whether its presence at one location says nothing about others, as for a mass; not so for friction
     is_local: ClassVar[bool] = False
+    # whether it is a recorded torque's constant error, whose size recordings state
+    is_torque_offset: ClassVar[bool] = False
     # whether a location is a sensor, `GROUP:FRAME`, which a diagnosis tries where recordings hold it
     is_at_recorded_sensor: ClassVar[bool] = False
     # whether a group of points, by its name, is a location too, which a diagnosis tries where recordings hold it
