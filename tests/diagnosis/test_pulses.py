@@ -142,3 +142,14 @@ def test_the_evidence_is_a_gaussians():
     assert rest.scored == pytest.approx(np.linalg.solve(total(*whole), value), rel=1e-5, abs=1e-4)
     gained = log_density(total(*whole)) - log_density(total(*other))
     assert rest.evidence - less.evidence == pytest.approx(gained, rel=1e-5, abs=1e-3)
+
+
+def test_beside_a_pulse_that_was_taken_in_a_profile_gains_what_it_adds_to_it():
+    made = history(wobble() + bell(3.0, 3.5, 0.3) + bell(5.0, 5.4, -0.4))
+    rest, first = _Rest.of(made, 1.0, 0.05, 0.2), bell(3.0, 3.5, 1.0)
+    profiles = np.stack([bell(3.1, 3.6, 1.0), bell(5.0, 5.4, 1.0), bell(1.0, 2.0, 1.0)], axis=1)
+    beside = rest.beside(first[:, None])
+    both = [rest.beside(np.stack([first, other], axis=1)) for other in profiles.T]
+    added = [each.evidence - beside.evidence for each in both]
+    np.testing.assert_allclose(beside.gains(profiles), added, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(beside.gains(profiles, rest.information(profiles)), added, rtol=1e-6, atol=1e-9)
