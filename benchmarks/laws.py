@@ -1,12 +1,15 @@
 """Laws that are in no library, injected in MuJoCo: is the place, the quantity and the curve found?
 
-    python benchmarks/laws.py [CASE ...] [--json FILE] [--candidates all]
+    python benchmarks/laws.py [CASE ...] [--json FILE] [--candidates all] [--withheld]
 
 One arm moves the foam Y (43 variables, 5 s to estimate on, 5 s of another motion held out, arm and camera points).
 Every other case has torque noise of 0.05 N m and offsets of 0.1 N m, both stated. The torque is added in the
 simulator's own terms; the library is `--candidates` (all, or kinds separated by commas). A case is right where the
 verdict is `unknown` with a law of the true quantity, or of quantities of which it is one; `band` is the part of the
 visited range in which the true curve lies within two standard deviations and a twentieth of its largest torque.
+
+`--withheld` takes effects of the library instead, each left out of it in turn. There the true curve has to lie in the
+band as it is; of the others, what is linear is left to stiffness, damping and offsets.
 """
 
 from __future__ import annotations
@@ -26,9 +29,11 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
+from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.effects.base import elastic_joints_within_segment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
@@ -45,6 +50,7 @@ class Case:
     location: str
     quantity: str
     torque: Torque
+    withheld: InjectedEffect | None = None  # of the library, which makes this torque
 
 
 def detent(q: Any, v: Any) -> Any:
@@ -67,6 +73,41 @@ CASES: Mapping[str, Case] = {
         "left_e1", "angle+speed", lambda q, v: -60.0 * np.maximum(q - 1.2, 0.0) ** 2 - 4.0 * v * np.abs(v)
     ),
 }
+
+
+def withheld(kind: str, location: str, quantity: str, torque: Torque, **values: float) -> Case:
+    return Case(location, quantity, torque, InjectedEffect(kind, location, values))
+
+
+BEND = {segment: TRUTH[f"{segment}.bend"] for segment in ("T1", "T2")}
+STICTION_SPEED = 0.02  # over which the sign of friction is rounded off [rad/s]
+WITHHELD: Mapping[str, Case] = {
+    "viscous_elbow": withheld("joint_viscous", "left_e1", "speed", lambda q, v: -1.0 * v, b=1.0),
+    "viscous_wrist": withheld("joint_viscous", "left_w1", "speed", lambda q, v: -1.0 * v, b=1.0),
+    "dry_elbow": withheld("joint_coulomb", "left_e1", "speed", lambda q, v: -np.tanh(v / STICTION_SPEED), tau_c=1.0),
+    "stribeck_wrist": withheld(
+        "joint_stribeck",
+        "left_w1",
+        "speed",
+        lambda q, v: -np.exp(-((v / 0.2) ** 2)) * np.tanh(v / STICTION_SPEED),
+        tau_s=1.0,
+        v_stribeck=0.2,
+    ),
+    "shoulder_spring": withheld(
+        "joint_spring", "left_s1", "angle", lambda q, v: -15.0 * (q + 0.5), stiffness=15.0, rest_angle=-0.5
+    ),
+    "elbow_spring": withheld(
+        "joint_spring", "left_e1", "angle", lambda q, v: -8.0 * (q - 1.0), stiffness=8.0, rest_angle=1.0
+    ),
+    "damped_trunk": withheld("kelvin_voigt", "T1", "speed", lambda q, v: -0.05 * BEND["T1"] * v, tau=0.05),
+    "damped_branch": withheld("kelvin_voigt", "T2", "speed", lambda q, v: -0.05 * BEND["T2"] * v, tau=0.05),
+    "stiffening_trunk": withheld("cubic_stiffness", "T1", "angle", lambda q, v: -400.0 * q**3, k3=400.0),
+    "stiffening_branch": withheld("cubic_stiffness", "T2", "angle", lambda q, v: -400.0 * q**3, k3=400.0),
+    "bent_trunk": withheld(
+        "rest_curvature", "T1", "angle", lambda q, v: BEND["T1"] * 0.03 + 0 * q, qx=0.03, qy=0.03
+    ),
+    "biased_torque": withheld("effort_offset", "left_e1", "angle", lambda q, v: -0.8 + 0 * q, offset=0.8),
+}  # fmt: skip
 
 
 class Injected:
@@ -101,8 +142,10 @@ def record(case: Case, motion_seed: int, noise_seed: int, noisy: bool) -> Record
         seed=noise_seed,
         recording_name=f"motion_{motion_seed}",
         arm_noise=noise,
-        injected_terms=Injected(case, system),
+        injected_terms=None if case.withheld else Injected(case, system),
     )
+    if case.withheld:
+        return run_experiment_with_effects(system, TRUTH, [case.withheld], experiment)
     return run_virtual_experiment(system, TRUTH, experiment)
 
 
@@ -112,19 +155,25 @@ def in_band(case: Case, table: Any, visited: tuple[float, float]) -> float:
     zeros = np.zeros(200)
     true = case.torque(at, zeros) if table.quantity == "angle" else case.torque(zeros, at)
     found, std = table.torque_at(at), np.interp(at, table.knots, table.torque_std)
-    # what is linear or constant is the stiffness's, the damping's or an offset's as much as the law's
-    columns = np.column_stack([np.ones(200), at])
-    weight: Array = 1 / np.maximum(std, 1e-9)
-    shift = columns @ np.linalg.lstsq(columns * weight[:, None], (true - found) * weight, rcond=None)[0]
+    shift: Array = np.zeros(200)
+    if case.withheld is None:
+        # what is linear or constant is the stiffness's, the damping's or an offset's as much as the law's
+        columns = np.column_stack([np.ones(200), at])
+        weight: Array = 1 / np.maximum(std, 1e-9)
+        shift = columns @ np.linalg.lstsq(columns * weight[:, None], (true - found) * weight, rcond=None)[0]
     room = 2 * std + 0.05 * float(np.max(np.abs(true)))
     return float(np.mean(np.abs(true - found - shift) <= room))
 
 
 def run(name: str, candidates: Any) -> dict[str, Any]:
-    case, noisy = CASES[name], list(CASES).index(name) % 2 == 1
+    case = ALL_CASES[name]
+    noisy = case.withheld is None and list(CASES).index(name) % 2 == 1
     estimate, held_out = (record(case, *pair, noisy) for pair in zip(MOTION_SEEDS, NOISE_SEEDS, strict=True))
     nominal = build_problem(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
     problem = EstimationProblem(nominal.step, [estimate], nominal.free, nominal.options)
+    if case.withheld is not None:
+        library = make_candidate_effects(problem.system, [estimate], candidates)
+        candidates = [effect.label for effect in library if effect.kind != case.withheld.kind]
     begun = time.process_time()
     found = diagnose(problem, candidates, [held_out])
     law = found.law
@@ -146,16 +195,20 @@ def run(name: str, candidates: Any) -> dict[str, Any]:
     return row
 
 
+ALL_CASES = {**CASES, **WITHHELD}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="Laws that are in no library, injected in MuJoCo.")
-    parser.add_argument("cases", nargs="*", default=list(CASES), help=", ".join(CASES))
+    parser.add_argument("cases", nargs="*", help=", ".join(ALL_CASES))
+    parser.add_argument("--withheld", action="store_true", help="effects of the library, each left out in turn")
     parser.add_argument("--candidates", default="all", help="all, or kinds separated by commas")
     parser.add_argument("--json", type=Path, metavar="FILE", help="answers, added to those that it has")
     arguments = parser.parse_args()
     library = "all" if arguments.candidates == "all" else arguments.candidates.split(",")
     file: Path | None = arguments.json
     rows: dict[str, Any] = json.loads(file.read_text()) if file is not None and file.exists() else {}
-    for i, name in enumerate(arguments.cases):
+    for i, name in enumerate(arguments.cases or (WITHHELD if arguments.withheld else CASES)):
         rows[name] = row = run(name, library)
         if i == 0:
             print("| " + " | ".join(row) + " |")

@@ -4,14 +4,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.interpolate
-from small_problems import H, assert_slopes_are_those_of_differences, joints, recording
+from small_problems import H, assert_slopes_are_those_of_differences, joints, pendulum_step, recording
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.effects.law import LawTable, law_tables_csv, make_law, read_law_tables
+from yid_ocp.effects.law import LawTable, law_tables_csv, make_law, quantity_values_along, read_law_tables
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MotorOptions, PositionServoOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow.build import build_system
@@ -103,6 +104,23 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
     np.testing.assert_allclose((efforts[0] - efforts[1])[1:, 1], (expected[1:] + expected[:-1]) / 2, atol=1e-9)
     np.testing.assert_allclose(table.torque_at(middle), expected, atol=1e-12)
     assert np.ptp(middle) > 2 * np.ptp(table.knots)
+
+
+def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
+    servos = PositionServoOptions(motor=MotorOptions("dc"))
+    plain = pendulum_step(urdf_folder, driven=JOINTS, servos=servos)
+    law = make_law("elbow", plain.system, tables(quantities=("command",)))
+    with_law = compile_step(plain.system.with_effects([law]), H, use_compiler=False)
+    commands = np.tile([0.4, -0.3], (40, 1))
+    commands[:20] = MOTOR_OFF_COMMAND
+    runs = [simulate(s, s.system.parameters.vector(), [0.4, -0.3, 0, 0], 40, commands) for s in (plain, with_law)]
+    # the torque of a node has half of the next step's force
+    np.testing.assert_allclose(runs[1].state[:20], runs[0].state[:20], atol=1e-12)
+    assert np.abs(runs[1].state[40] - runs[0].state[40]).max() > 1e-4
+    nodes = {"state": runs[1].state, "torque": commands, "multipliers": np.zeros((40, 0)), "time_step": np.array(H)}
+    theta = with_law.system.parameters.vector()
+    seen = quantity_values_along(with_law.system, "elbow", "command", theta, nodes)
+    np.testing.assert_array_equal(seen[:, 0], [np.nan] * 20 + [-0.3] * 20)
 
 
 @pytest.mark.parametrize("quantities", [("angle",), ("speed",), ("angle", "speed"), ("time",)])

@@ -248,12 +248,13 @@ def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
         theta = problem.predictor.theta_with_episode_values(episode, problem.theta_and_initial_state_deviation(x, i)[0])
         nodes = _along(result, episode.grid.time_step)
         found.append(quantity_values_along(problem.system, place, quantity, theta, nodes).ravel())
-    return np.concatenate(found)
+    values = np.concatenate(found)
+    return values[np.isfinite(values)]
 
 
 def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[float, float]:
     values = _visited(model, place, quantity)
-    return float(values.min()), float(values.max())
+    return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
 
 
 def _torque_scale(model: RefittedModel, place: str) -> float:

@@ -25,6 +25,7 @@ from yid_ocp.files import read_input_text
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
 LawDependence = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
@@ -60,8 +61,9 @@ class Law(EffectBase):
     x is that joint's own angle, speed, load or command.
 
     f is the natural cubic spline through values at equally spaced knots, which are the parameters, and a sum of such
-    where it depends on two quantities. Beyond the knots it is constant. `time` is that since the recording began, the
-    internal coordinate s with ds/dt = 1. Of a segment, the load of a joint is that of its spring.
+    where it depends on two quantities. Beyond the knots it is constant, and zero of the command while the motor is off.
+    `time` is that since the recording began, the internal coordinate s with ds/dt = 1. Of a segment, the load of a
+    joint is that of its spring.
     """
 
     knots: Mapping[str, Array] | None = None  # of every quantity
@@ -89,7 +91,9 @@ class Law(EffectBase):
         force = ca.SX(state.system.n_coordinates, 1)
         for index, spring in _coordinates_and_springs(state.system, self.location):
             for quantity in self.quantities:
-                force[index] += self._torque(quantity, _quantity(quantity, state, self.label, index, spring))
+                x = _quantity(quantity, state, self.label, index, spring)
+                torque = self._torque(quantity, x)
+                force[index] += ca.if_else(x < MOTOR_OFF_COMMAND / 2, torque, 0) if quantity == "command" else torque
         equations, at_rest = {}, {}
         for name in self.internal_coordinate_symbols:
             row = state.internal_rows[name]
@@ -162,7 +166,7 @@ def law_quantities_at_location(system: System, location: str) -> tuple[str, ...]
 def quantity_values_along(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
-    """Values of a quantity at a location at all midpoints of a rollout, shape (N, joints).
+    """Values of a quantity at a location at all midpoints of a rollout, shape (N, joints); NaN for no command.
 
     `nodes` holds `state` (N + 1, nx), `torque` (N, nu), `multipliers` (N, m) and the `time_step` [s] as an array.
     """
@@ -176,7 +180,8 @@ def quantity_values_along(
     if quantity == "angle":
         return np.asarray((q[1:, at] + q[:-1, at]) / 2, float)
     if quantity == "command":
-        return nodes["torque"][:, [system.driven_coordinate_indices.index(index) for index in at]]
+        commands = nodes["torque"][:, [system.driven_coordinate_indices.index(index) for index in at]]
+        return np.where(commands < MOTOR_OFF_COMMAND / 2, commands, np.nan)
     internal = system.effect_internal_coordinate_symbols
     sizes = {"q": n, "v": n, "z": len(internal), "u": len(system.driven), "lam": system.n_constraints}
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
