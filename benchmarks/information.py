@@ -51,7 +51,7 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_step
 from yid_ocp.workflow.build_problem import build_problem, problem_options
 from yid_ocp.workflow.command_runner import StderrLogLinesProgress
-from yid_ocp.workflow.plan import parameter_and_effect_values
+from yid_ocp.workflow.plan import _parameter_and_effect_values
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
@@ -133,7 +133,7 @@ def pair(name: str, starts: int, share: float) -> None:
     print(f"withheld: {', '.join(effect.label for effect in case.withheld)}")
     print(f"before: {before.verdict}, {', '.join(labels)}")
     problem = EstimationProblem(nominal.step, made[:1], nominal.free, nominal.options)
-    values, sizes = parameter_and_effect_values(before.to_dict())
+    values, sizes = _parameter_and_effect_values(before.to_dict())
     planned = []
     for seed in (0, 100):
         options = replace(OPTIONS, identify=None, discriminate=labels, n_random_starts=starts, seed=seed)

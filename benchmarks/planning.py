@@ -47,8 +47,8 @@ from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.plan import (
+    _configured_or_recorded_start_positions,
     compile_step_for_planning,
-    configured_or_recorded_start_positions,
     identified_parameters_with_covariance,
 )
 from yid_ocp.workflow.solve import run_solve
@@ -316,7 +316,7 @@ def two_hands() -> None:
         run = load_config(CONFIG.with_name(f"{config}.yaml"), more)
         step = compile_step_for_planning(run)
         made = plan_motion_to_target(
-            step, replace(run.plan, start_joint_positions=configured_or_recorded_start_positions(run, step))
+            step, replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))
         )
         points = tuple(dict.fromkeys((*step.system.point_frames, made.target_point)))
         twin = replace(step.system, driven=step.system.prescribed, prescribed=(), point_frames=points)

@@ -38,7 +38,7 @@ from yid_ocp.vision.frame_folder import read_frame_folder, write_frame_folder
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.track import camera_scene, simulate_recording_and_camera_frames
+from yid_ocp.workflow.track import _camera_scene, _simulate_recording_and_camera_frames
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SHIPPED = (CONFIGS / "track_single_arm.yaml", CONFIGS / "track_dual_arm.yaml")
@@ -65,7 +65,7 @@ def main() -> int:
 
 def _film(run: RunSettings, folder: Path, count: int = 0) -> Recording:
     """Write a virtual film as depth images, over and over until it has so many frames; the joints' recording."""
-    recording, made = simulate_recording_and_camera_frames(run, build_system(run))
+    recording, made = _simulate_recording_and_camera_frames(run, build_system(run))
     write_frame_folder(made.sequence, folder)
     joints, lens, o3d = recording.joints, made.sequence.intrinsics, import_open3d()
     assert joints is not None
@@ -94,7 +94,7 @@ def _speed(config: Path, folder: Path) -> tuple[str, ...]:
     run = load_config(config)
     recording = _film(run, folder)
     tracker = FrameTracker(
-        camera_scene(run, build_system(run)), recording, read_frame_folder(folder), run.track.options
+        _camera_scene(run, build_system(run)), recording, read_frame_folder(folder), run.track.options
     )
     begun = time.process_time()
     common = tracker.estimate_sequence_calibration()

@@ -10,7 +10,7 @@ from small_problems import pendulum_step, taken
 from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
-    estimated_constant_errors,
+    _estimated_constant_errors,
     subtract_estimated_biases,
     whitened_for_sensor_biases,
     whitened_measurement_sensitivities_to_biases,
@@ -55,7 +55,7 @@ def test_the_map_is_that_of_generalised_least_squares():
     made = whitened_for_sensor_biases(slopes, columns)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
     expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
-    found = estimated_constant_errors(slopes, columns[:, 0])
+    found = _estimated_constant_errors(slopes, columns[:, 0])
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 

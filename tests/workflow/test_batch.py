@@ -20,7 +20,7 @@ from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
 from yid_ocp.workflow import blind
 from yid_ocp.workflow.batch import batch_runs_from_configs, run_batch
-from yid_ocp.workflow.blind import EXPERIMENT_VARIATIONS, blind_experiments_and_refinable_subset, run_blind
+from yid_ocp.workflow.blind import EXPERIMENT_VARIATIONS, _blind_experiments_and_refinable_subset, run_blind
 
 HERE = InlineExecutor()
 SHORT = "problem.duration=0.6"
@@ -199,7 +199,7 @@ def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monke
 
 def test_an_experiment_is_varied_as_far_as_its_configuration_allows(repository, driven, pendulum):
     whole = repository / "configs" / "single_arm_vision.yaml"
-    experiments, chains = blind_experiments_and_refinable_subset({"whole": whole, "pendulum": pendulum}, 1, "report")
+    experiments, chains = _blind_experiments_and_refinable_subset({"whole": whole, "pendulum": pendulum}, 1, "report")
     with_object = {name for name, varied in EXPERIMENT_VARIATIONS.items() if not varied.is_without_object}
     # from the pendulum there is nothing to take out of its hands
     assert set(experiments) == {

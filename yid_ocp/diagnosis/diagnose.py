@@ -33,7 +33,7 @@ from yid_ocp.diagnosis.hypotheses import (
     exclude_candidates,
     make_candidate_effects,
 )
-from yid_ocp.diagnosis.law import find_gap_law
+from yid_ocp.diagnosis.law import GapLaw, find_gap_law
 from yid_ocp.diagnosis.refit import (
     FinerStepRefitStore,
     NominalSolutionAndRefitStore,
@@ -263,11 +263,8 @@ def _diagnosed(
     accepted = added if verdict in ("effect", "confusable") else ()
     final = last if accepted else nominal
     remaining, where, rest = _after(nominal, accepted, where, before, held, limits)
-    law = None
-    if verdict == "unknown" or (accepted and rest):
-        sought = rest if accepted else where
-        places = [name for place in sought for name in (place.location, *place.indistinguishable_from)]
-        law = find_gap_law(search, problem, final, places, seen.events)
+    law = _law(problem, seen, verdict, final, rest if accepted else where)
+    clock["law"] = time.perf_counter()
     # what a better model explains was no event
     events = _happened(seen.whole, final, limits)[0] if accepted else seen.events
     clock["remaining"] = time.perf_counter()
@@ -307,6 +304,18 @@ def _diagnosed(
         law=law,
     )
     return replace(finding, summary=diagnosis_summary_text(finding))
+
+
+def _law(
+    problem: EstimationProblem, seen: _Examined, verdict: str, final: RefittedModel, where: Sequence[GapLocation]
+) -> GapLaw | None:
+    """The law of what a model leaves, where no effect explains it or the named ones leave something."""
+    if verdict != "unknown" and not (final.effects and where):
+        return None
+    places = [name for place in where for name in (place.location, *place.indistinguishable_from)]
+    if seen.stated_and_finer_time_step is not None:
+        problem = problem.with_time_step(seen.stated_and_finer_time_step[1])
+    return find_gap_law(seen.search, problem, final, places, seen.events)
 
 
 def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> EstimationProblem:

@@ -267,7 +267,7 @@ def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
     return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
 
 
-def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
+def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
     """Constant sensor errors (m,), measured minus true, from a residual and its `slopes` (r, m), all in std units."""
     left, size, right = np.linalg.svd(slopes, full_matrices=False)
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
@@ -301,7 +301,7 @@ def subtract_estimated_biases(
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)
     residual = np.concatenate([s.whitened_residual(y)[s.positive_weight_mask] for s, y in pairs])
-    left = estimated_constant_errors(slopes, residual)
+    left = _estimated_constant_errors(slopes, residual)
     made = []
     for s in samples:
         error, own = s.bias_std.copy(), s.bias_std > 0

@@ -195,7 +195,7 @@ class _Proof:
         for name, text in configs.items():
             write_text(self.config_file(name), text)
         files = {name: self.config_file(name) for name in configs}
-        experiments, chains = blind_experiments_and_refinable_subset(files, self.seed, self.purpose)
+        experiments, chains = _blind_experiments_and_refinable_subset(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
         plan = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
@@ -435,7 +435,7 @@ def _require_compatible(run: RunSettings) -> None:
         raise run.config_error("a blind proof moves driven arms", "model", "arms", "mode", allowed=allowed)
 
 
-def blind_experiments_and_refinable_subset(
+def _blind_experiments_and_refinable_subset(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, _BlindExperiment], frozenset[str]]:
     """Virtual experiments by name, and the names of those whose object's links can be divided further.

@@ -54,7 +54,7 @@ def run_plan(
         else:
             step = compile_step_for_planning(run)
             theta, known, source = identified_parameters_with_covariance(run, step)
-            options = replace(run.plan, start_joint_positions=configured_or_recorded_start_positions(run, step))
+            options = replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))
             with add_setting_location_to_errors(run, "plan"):
                 found = plan_motion_to_target(step, options, theta, known, progress)
         recording = _plan_as_recording(run, found)
@@ -85,7 +85,7 @@ def compile_step_for_planning(run: RunSettings) -> Step:
     return build_step(replace(run, model=model, recordings=recordings))
 
 
-def configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapping[str, float] | None:
+def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapping[str, float] | None:
     """Joint positions at the start of the motion: from the settings, else from the first recording.
 
     None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a
@@ -196,7 +196,7 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
     origin = None
     if run.plan.parameter_run is not None:
         result, origin = _read_parameter_run(run, ("solve", "diagnose"))
-        found, sizes = parameter_and_effect_values(result)
+        found, sizes = _parameter_and_effect_values(result)
         _require_same_effects(run, found, known.names)
         values |= {name: value for name, value in found.items() if name in known}
     with add_setting_location_to_errors(run, "plan"):
@@ -212,7 +212,7 @@ def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collectio
         raise run.config_error(what, "plan", "parameter_run", allowed="a run of `solve` on the same model", hint=hint)
 
 
-def parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+def _parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Parameter values of a solve or diagnosis result, and effect sizes of a diagnosis, in display units."""
     if "parameters" in result:
         return {name: entry["value"] for name, entry in result["parameters"].items()}, {}

@@ -227,7 +227,7 @@ def _truth_errors(
 # -- frames -----------------------------------------------------------------------------------------------------------
 
 
-def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFramesWithTruth]:
+def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFramesWithTruth]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
     from yid_ocp.virtual.experiment import VirtualExperimentSettings, record_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -253,11 +253,11 @@ def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tu
         depth = surface_meshes.DepthSensorModel(outlier_probability=settings.outlier_fraction)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
         camera = surface_meshes.VirtualCameraSetup(pose, depth, timing, seed=seed)
-        made = surface_meshes.render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
+        made = surface_meshes.render_virtual_frames(_camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
 
-def camera_scene(run: RunSettings, system: System) -> ObservedScene:
+def _camera_scene(run: RunSettings, system: System) -> ObservedScene:
     """The scene seen by the camera: system, robot meshes and extra meshes."""
     return ObservedScene(system, run.model.robot, extra_meshes=run.model.extra_meshes)
 
@@ -279,7 +279,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
 def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Recording | None]:
     """The tracker of the frames in files, and the recording with the joints, None where none is listed."""
     recording = _read_joints(run)
-    sequence, scene = _read_frames(run, "frames_path"), camera_scene(run, system)
+    sequence, scene = _read_frames(run, "frames_path"), _camera_scene(run, system)
     background = None if run.track.background_frames_path is None else _read_frames(run, "background_frames_path")
     return FrameTracker(scene, recording, sequence, run.track.options, background), recording
 
@@ -346,7 +346,7 @@ def _frame_tasks(
         frames = Path(said.frames_path)
     else:
         progress.begin_stage("simulating a virtual experiment in MuJoCo")
-        recording, made = simulate_recording_and_camera_frames(run, system)
+        recording, made = _simulate_recording_and_camera_frames(run, system)
         progress.begin_stage("filming it")
         work.mkdir(parents=True, exist_ok=True)
         frames, joints = own_files = work / "frames", work / f"{run.name}.h5"
