@@ -16,9 +16,10 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, ParameterEstimate, verdict_by_relative_std
+from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step, compile_step, simulate
+from yid_ocp.integrator.step import Step, compile_step, copy_of_step_with_time_step, simulate
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -32,6 +33,7 @@ _NORMAL_QUANTILE_95 = 1.96
 # Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
 # m + m/2 + m/4 + ... What falls faster has less to go.
 _EXTRAPOLATION_FACTOR = 2.0
+_MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 
@@ -140,6 +142,40 @@ def refitted_residual_at_finer_step(
     return None if isinstance(made, str) else made[1]
 
 
+def time_step_for_motion(problem: EstimationProblem) -> float:
+    """Return the longest time step [s] whose error is small beside what a prediction at the initial unknowns leaves.
+
+    From 20 ms on it is halved, at most five times, until half of it changes the prediction of the recordings to
+    estimate on by at most 3 % of its residual or of the noise, whichever is more (root mean squares, whitened). A guess
+    far from the truth has larger errors of the step, in proportion to its residual.
+    """
+    x, problem = problem.initial_unknowns, problem.with_time_step(_MAX_TIME_STEP)
+    for _ in range(_MAX_HALVINGS):
+        fine = problem.with_time_step(problem.step.time_step / 2)
+        error = _half_step_error(problem, fine, x)
+        if error is not None and error <= _MAX_STEP_ERROR_FRACTION:
+            break
+        problem = fine
+    return problem.step.time_step
+
+
+def _half_step_error(problem: EstimationProblem, fine: EstimationProblem, x: Array) -> float | None:
+    """Change of whitened predictions by a finer step as a fraction of their residual; None if they do not compare."""
+    try:
+        coarse = problem_whitened_at(problem, x)
+        if any(own is not None for own in coarse.whitening_filters):
+            fine = _with_coarse_weights(fine, coarse)
+        before, after = coarse.evaluate(x, False), fine.evaluate(x, False)
+    except YidError:
+        return None
+    rows = coarse.residual_rows, fine.residual_rows
+    if not (before.ok and after.ok) or rows[0].measurements != rows[1].measurements:
+        return None
+    left = before.residual[rows[0].data]
+    change = after.residual[rows[1].data] - left
+    return float(np.sqrt(np.mean(change**2)) / max(1.0, np.sqrt(np.mean(left**2))))
+
+
 @dataclass(frozen=True)
 class _CoarseWeights:
     """Filter of a coarser rollout, in each of whose steps `ratio` finer ones make a mean torque."""
@@ -209,7 +245,10 @@ def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> _F
         return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
     recordings = [episode.recording for episode in problem.episodes]
     steps, factors = sum(e.grid.steps for e in problem.episodes), options.divided_links_model.parameter_factors
-    step = options.divided_links_model.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE)
+    step = copy_of_step_with_time_step(
+        options.divided_links_model.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE),
+        problem.step.time_step,
+    )
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     made = EstimationProblem(

@@ -286,12 +286,20 @@ class ParameterSettings:
 class ProblemSettings(ProblemOptions):
     """Estimation problem: residuals, initial state and time discretisation."""
 
-    time_step: Annotated[float, Gt(0), Le(0.1), OptionInfo("of the integrator", "s")] = 0.01
+    time_step: Annotated[
+        Annotated[float, Gt(0), Le(0.1)] | Literal["auto"],
+        OptionInfo("of the integrator; auto halves 20 ms until half of it hardly changes the first prediction", "s"),
+    ] = 0.01
     force_split: Annotated[ForceSplit, OptionInfo("rule for forces; left is the paper's")] = "symmetric"
     constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node is the paper's")] = (
         "midpoint"
     )
     use_compiler: Annotated[bool, OptionInfo("whether to compile the step where a C compiler is found")] = True
+
+    @property
+    def time_step_or_default(self) -> float:
+        """Time step [s] as it is set; 10 ms for `auto` where there is no recording to choose by."""
+        return 0.01 if self.time_step == "auto" else self.time_step
 
 
 @dataclass(frozen=True, kw_only=True)

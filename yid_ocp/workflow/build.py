@@ -105,7 +105,9 @@ def build_step(run: RunSettings, system: System | None = None) -> Step:
     """The compiled discrete Euler-Lagrange step of a run's system."""
     said = run.problem
     system = build_system(run) if system is None else system
-    return compile_step(system, said.time_step, said.force_split, said.constraint_force, use_compiler=said.use_compiler)
+    return compile_step(
+        system, said.time_step_or_default, said.force_split, said.constraint_force, use_compiler=said.use_compiler
+    )
 
 
 def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:

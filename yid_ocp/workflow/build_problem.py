@@ -5,6 +5,7 @@ Recordings are checked before: those given twice count once, gaps are cut out; e
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -15,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.discretisation import min_closure_error_by_grasp
+from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, time_step_for_motion
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
@@ -23,7 +24,7 @@ from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, Issue, typical
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, copy_of_step_with_time_step
 from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -36,6 +37,7 @@ from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.run_inputs import read_recordings_of_role, unknown_name_error
 
+log = logging.getLogger(__name__)
 _START_FRAMES = 2  # of a cable's free points, from which every prediction starts
 _MAX_GRASP_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
 _EFFECTS_BY_CAUSE = {
@@ -158,6 +160,10 @@ def build_problem(
     step = build_step(run, system) if step is None else step
     said = replace(options, data_issues=issues)
     problem = EstimationProblem(step, estimate, free, said, None, held_out)
+    if run.problem.time_step == "auto":
+        step = copy_of_step_with_time_step(step, time_step_for_motion(problem))
+        log.info("problem.time_step: auto chooses %g s for these recordings", step.time_step)
+        problem = EstimationProblem(step, estimate, free, said, None, held_out)
     _check_grasps_close(run, problem)
     more = _object_point_issues(problem)
     if more:

@@ -206,7 +206,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
 
     Under `links` and `time_step` are lists of {value, hertz, growing, message}, empty where there is nothing to vary.
     """
-    system, h = build_system(run), run.problem.time_step
+    system = build_system(run)
+    h = run.problem.time_step_or_default if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
         return {"links": [], "time_step": [], "message": "no posture is known: the run names no recording"}
