@@ -184,10 +184,15 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     ensemble = drawn()
     wanted = [PlannedBlindCase(i, "one", "single", 3.0) for i in range(4)]
     first = [ensemble.draw_planned_case(entry)[1] for entry in wanted]
+    made = list(drawn.made)
     assert drawn().draw_planned_case(wanted[3])[1] == first[3]
     assert CaseGroundTruth.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
     assert first[3].experiment == "one"
     assert len({json.dumps(entry.truth) for entry in first}) == 4
+    # no two recordings share their motion or their noise
+    seeds = [seed for own in made for seed in (own["motion"]["seed"], own["seed"])]
+    assert len(set(seeds)) == len(seeds) == 16
+    assert max(seeds) > 2**24
     assert drawn(seed=9).draw_planned_case(wanted[3])[1].truth != first[3].truth
     # an ensemble to calibrate by shares no case with the one that is reported
     calibrating = drawn(conditions=SyntheticMeasurementConditions(purpose="calibration"))

@@ -10,6 +10,12 @@ from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 from yid_ocp.integrator.step import simulate_rollouts
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions, episode_prediction
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
+from yid_ocp.problem.model_functions import (
+    central_difference_velocity,
+    central_difference_velocity_adjoint,
+    second_difference_acceleration,
+    second_difference_acceleration_adjoint,
+)
 
 MISREAD = (("encoder_offset", "shoulder", {"offset": 0.03}), ("effort_gain", "shoulder", {"scale": 0.9}))
 LATE = (("camera_latency", "camera", {"delay": 0.0137}), ("clock_scale", "clock", {"scale": 0.97}))
@@ -315,6 +321,21 @@ def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, c
         np.testing.assert_array_equal(samples.value, before.value[early])
         np.testing.assert_allclose(two.predicted_outputs[k], one.predicted_outputs[k][early], atol=1e-9)
     assert truncate_episode(whole, 99).grid.steps == STEPS
+
+
+def test_rates_at_nodes_are_those_of_a_parabola_and_of_one_step_at_the_ends():
+    t, h = 0.1 * np.arange(6), 0.1
+    q, nodes = np.stack([1.0 + 2.0 * t + 3.0 * t**2, -t], axis=1), np.arange(6)
+    speed, rate = central_difference_velocity(q, nodes, h), second_difference_acceleration(q, nodes, h)
+    expected = 2.0 + 6.0 * np.array([h / 2, *t[1:-1], t[-1] - h / 2])
+    np.testing.assert_allclose(speed, np.stack([expected, -np.ones(6)], axis=1))
+    np.testing.assert_allclose(rate, np.tile([6.0, 0.0], (6, 1)), atol=1e-9)
+    pull = np.random.default_rng(0).standard_normal((6, 2))
+    for forward, back in (
+        (speed, central_difference_velocity_adjoint),
+        (rate, second_difference_acceleration_adjoint),
+    ):
+        assert np.sum(back(pull, nodes, 6, h) * q) == pytest.approx(np.sum(pull * forward))
 
 
 @pytest.mark.parametrize(("share", "calls"), [(0.0, [1, 1, 1]), (1.5, [1, 1, 1]), (2.5, [2, 1]), (9.0, [3])])
