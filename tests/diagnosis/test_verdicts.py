@@ -34,7 +34,7 @@ def found(bench, effects, candidates, **how):
     assert bool(result["effects"]) is (result["verdict"] in ("effect", "confusable"))
     assert (result["reason"] != "") is (result["verdict"] == "unknown")
     assert bool(result["message"]) is (result["verdict"] == "insufficient_data")
-    stages = "compose nominal events screening other_starts localisation refits carry_over remaining"
+    stages = "compose nominal events screening other_starts localisation refits carry_over law remaining"
     assert list(result["seconds"]) == stages.split()
     assert finding.summary == diagnosis_summary_text(finding) == result["summary"]
     return finding, result
@@ -89,7 +89,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
     result = stopped(Hurried())
     assert (result["verdict"], result["effects"]) == ("effect", [{"kind": "joint_coulomb", "location": "elbow"}])
     assert [entry["closure"] is not None for entry in result["which"]] == [True, False, False, False]
-    assert result["stopped"]["after"] == pytest.approx(sum(list(result["seconds"].values())[:-2]))
+    assert result["stopped"]["after"] == pytest.approx(sum(list(result["seconds"].values())[:-3]))
     assert result["stopped"]["next"][-1] == "what is left beside joint_coulomb@elbow"
     assert result["carried_over"], "what was named was held against the held-out recordings as ever"
     clock[0] = math.inf

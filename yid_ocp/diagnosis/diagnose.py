@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.discretisation import refitted_residual_at_finer_step
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
@@ -35,7 +34,6 @@ from yid_ocp.diagnosis.hypotheses import (
 )
 from yid_ocp.diagnosis.law import GapLaw, find_gap_law
 from yid_ocp.diagnosis.refit import (
-    FinerStepRefitStore,
     NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
@@ -58,6 +56,7 @@ from yid_ocp.diagnosis.verdict import (
     check_effect_amplitude_transfer,
     decide_verdict,
     find_unknown_verdict_reason,
+    finer_step_that_explains_gap,
     fraction_of_smoother_chi2_decrease,
     has_significant_gap,
     inflate_fit_stds_by_disagreement,
@@ -165,7 +164,7 @@ def _examined(
     clock["nominal"] = time.perf_counter()
     found = _examined_about_fit(problem, search, nominal, cuts, clock)
     while found.has_gap and found.has_enough_samples:
-        finer = _finer_step_that_explains_gap(found, limits)
+        finer = finer_step_that_explains_gap(found.search, found.nominal, found.events, found.screened.candidate_scores)
         again = None if finer is None else _settled(finer, found.nominal.values, "")
         if finer is None or again is None:
             break
@@ -199,29 +198,6 @@ def _examined_about_fit(
     found = _tested(search, nominal, cuts, whole, events, smoothed)
     clock["screening"] = time.perf_counter()
     return found
-
-
-def _finer_step_that_explains_gap(seen: _Examined, limits: Thresholds) -> RefitContext | None:
-    """All hypotheses at half the time step, where that explains more than half of what the best candidate promises.
-
-    It is asked by one prediction at the nominal fit and one Gauss-Newton step from there, on the recordings to estimate
-    on; None where it explains less.
-    """
-    search, fit = seen.search, seen.nominal
-    h = fit.problem.step.time_step / 2
-    search.progress.begin_stage("trying half the time step", 1.0, 8.5)
-    finer = search.problem.with_time_step(h)
-    fine = problem_corrected_for_events(finer.problem, seen.events)
-    left = refitted_residual_at_finer_step(fine, fit.problem, fit.problem.vector(fit.values), fit.evaluation)
-    if left is None:
-        return None
-    excess, rest = (float(r @ r) - np.count_nonzero(r) for r in (fit.evaluation.residual, left))
-    promised = max((score.predicted_chi2_decrease for score in seen.screened.candidate_scores), default=excess)
-    if excess - rest <= promised / 2:
-        return None
-    search.progress.begin_stage(f"half the time step lowers chi2 by {excess - rest:.3g}: going on at {h:g} s")
-    store = None if search.store is None else FinerStepRefitStore(search.store, h)
-    return replace(search, problem=finer, store=store)
 
 
 def _diagnosed(

@@ -108,22 +108,6 @@ class RefitStore(Protocol):
 
 
 @dataclass(frozen=True)
-class FinerStepRefitStore:
-    """The refits of another store that were made at a finer time step [s] than stated, under names of their own."""
-
-    store: RefitStore
-    time_step: float
-
-    def get(self, name: str) -> StoredFit | None:
-        """Return the refit stored under a name at this time step; None if there is none."""
-        return self.store.get(f"{name} at {self.time_step:g} s")
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit under a name and this time step."""
-        self.store.put(f"{name} at {self.time_step:g} s", refitted)
-
-
-@dataclass(frozen=True)
 class NominalSolutionAndRefitStore:
     """Results known before a diagnosis begins: the nominal problem's solution, and refits of an interrupted run."""
 

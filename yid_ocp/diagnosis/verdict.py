@@ -11,8 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
+from yid_ocp.analysis.discretisation import refitted_residual_at_finer_step
+from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
-from yid_ocp.diagnosis.refit import RefitContext, RefittedModel, refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, RefitStore, RefittedModel, StoredFit, refit_with_effects
 from yid_ocp.diagnosis.screening import CandidateScore, DetectableAmplitudes, bonferroni_min_p_value
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -137,6 +141,45 @@ def has_significant_gap(
     best = bonferroni_min_p_value(ranked)
     largest = max((*before.channel_chi2.values(), *held_out.channel_chi2.values()), default=1.0)
     return best < limits.gap_significance_level_by_candidate and largest > 1 + limits.min_channel_excess_chi2_per_dof
+
+
+@dataclass(frozen=True)
+class _FinerStepRefitStore:
+    """The refits of another store that were made at a finer time step [s] than stated, under names of their own."""
+
+    store: RefitStore
+    time_step: float
+
+    def get(self, name: str) -> StoredFit | None:
+        """Return the refit stored under a name at this time step; None if there is none."""
+        return self.store.get(f"{name} at {self.time_step:g} s")
+
+    def put(self, name: str, refitted: StoredFit) -> None:
+        """Store a refit under a name and this time step."""
+        self.store.put(f"{name} at {self.time_step:g} s", refitted)
+
+
+def finer_step_that_explains_gap(
+    search: RefitContext, fit: RefittedModel, events: EventSet, ranked: Sequence[CandidateScore]
+) -> RefitContext | None:
+    """Return all hypotheses at half the time step if that explains more than half of what the best candidate promises.
+
+    It is asked by one prediction at the nominal `fit` and one Gauss-Newton step from there, on the recordings to
+    estimate on without their `events`; None where it explains less or cannot be predicted.
+    """
+    h = fit.problem.step.time_step / 2
+    search.progress.begin_stage("trying half the time step", 1.0, 8.5)
+    finer = search.problem.with_time_step(h)
+    fine = problem_corrected_for_events(finer.problem, events)
+    left = refitted_residual_at_finer_step(fine, fit.problem, fit.problem.vector(fit.values), fit.evaluation)
+    if left is None:
+        return None
+    excess, rest = (float(r @ r) - np.count_nonzero(r) for r in (fit.evaluation.residual, left))
+    if excess - rest <= max((score.predicted_chi2_decrease for score in ranked), default=excess) / 2:
+        return None
+    search.progress.begin_stage(f"half the time step lowers chi2 by {excess - rest:.3g}: going on at {h:g} s")
+    store = None if search.store is None else _FinerStepRefitStore(search.store, h)
+    return replace(search, problem=finer, store=store)
 
 
 def is_barely_significant_and_unexplained(
