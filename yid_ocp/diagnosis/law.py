@@ -40,6 +40,7 @@ _MAX_REFITS = 5  # the torque over time included
 _ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # of the curvature, among which the evidence chooses
 _RIDGE_STD_RATIO = 3.0  # standard deviation of a value at a knot, beside its curvature, over the torques there
 _MIN_KNOT_RANGE = 1e-3  # over which knots are spread where hardly anything is visited [unit of the quantity]
+_EVEN_STD_RATIO = 1 / 300  # of a drive's even part, f(x) + f(-x), over the prior's width: it has no favourite direction
 _MIN_VISITED_PART = 0.7  # of the knots' range that a fitted law must visit for its knots to stay
 _MIN_LEFTOVER_CLOSURE = 0.2  # part of what effects leave that a law beside them must close to be told
 
@@ -229,6 +230,8 @@ def _neutral_law(model: RefittedModel, place: str, quantities: Sequence[str], sy
     tables, zeros = [], np.zeros(_N_KNOTS)
     for quantity in quantities:
         low, high = _visited_range(model, place, quantity)
+        if quantity == "command":
+            low, high = min(low, -high), max(high, -low)
         room = max(high - low, _MIN_KNOT_RANGE) / (_N_KNOTS - 3)
         # half a gap of room, so that the ends are estimated and what lies beyond is flat
         tables.append(LawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
@@ -332,7 +335,11 @@ def _prior_precision(law: Law, roughness_weight: float) -> Array:
         count = len(law.parameter_names_of(quantity))
         width = law.prior_ranges[law.parameter_names_of(quantity)[0]][1]
         bends = np.diff(np.eye(count), n=2, axis=0) * (_RIDGE_STD_RATIO / width)
-        blocks.append(roughness_weight * bends.T @ bends + np.eye(count) / width**2)
+        block = roughness_weight * bends.T @ bends + np.eye(count) / width**2
+        if quantity == "command":
+            even = (np.eye(count) + np.eye(count)[::-1]) / (_EVEN_STD_RATIO * width)
+            block += even.T @ even
+        blocks.append(block)
     size, made, at = sum(map(len, blocks)), np.zeros((sum(map(len, blocks)),) * 2), 0
     for block in blocks:
         made[at : at + len(block), at : at + len(block)] = block

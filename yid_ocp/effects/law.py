@@ -30,7 +30,7 @@ from yid_ocp.model.system import MidpointState, StepTerms, System
 
 LawDependence = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
 """What a law's torque depends on: one quantity, or a sum of functions of two."""
-LAW_QUANTITY_UNITS: Mapping[str, str] = {"angle": "rad", "speed": "rad/s", "load": "N m", "command": "rad", "time": "s"}
+LAW_QUANTITY_UNITS: Mapping[str, str] = {"angle": "rad", "speed": "rad/s", "load": "N m", "command": "N m", "time": "s"}
 """Unit of each quantity that a law may depend on, of revolute joints."""
 _TABLE_COLUMNS = ("quantity", "unit", "at", "torque", "std")
 _SPACING_RTOL = 1e-3  # by which knots that are read may be apart unevenly
@@ -58,7 +58,8 @@ class LawTable:
 class Law(EffectBase):
     """A torque F = f(x) on an arm joint, or on every joint that bends a segment.
 
-    x is that joint's own angle, speed, load or command.
+    x is that joint's own angle, speed, load or command: the torque that its servo asks of the motor within its
+    limit, of a direct-current motor the duty's, before the counter-voltage takes its part.
 
     f is the natural cubic spline through values at equally spaced knots, which are the parameters, and a sum of such
     where it depends on two quantities. Beyond the knots it is constant, and zero of the command while the motor is off.
@@ -93,7 +94,9 @@ class Law(EffectBase):
             for quantity in self.quantities:
                 x = _quantity(quantity, state, self.label, index, spring)
                 torque = self._torque(quantity, x)
-                force[index] += ca.if_else(x < MOTOR_OFF_COMMAND / 2, torque, 0) if quantity == "command" else torque
+                if quantity == "command":
+                    torque = ca.if_else(_servo_input(state, index) < MOTOR_OFF_COMMAND / 2, torque, 0)
+                force[index] += torque
         equations, at_rest = {}, {}
         for name in self.internal_coordinate_symbols:
             row = state.internal_rows[name]
@@ -133,6 +136,10 @@ def _coordinates_and_springs(system: System, location: str) -> list[tuple[int, E
     return [(index(location), None)]
 
 
+def _servo_input(state: MidpointState, index: int) -> ca.SX:
+    return state.u[state.system.driven_coordinate_indices.index(index)]
+
+
 def _quantity(quantity: str, state: MidpointState, label: str, index: int, spring: ElasticJoint | None) -> ca.SX:
     system = state.system
     if quantity == "time":
@@ -142,7 +149,9 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
     if quantity == "speed":
         return state.v[index]
     if quantity == "command":
-        return state.u[system.driven_coordinate_indices.index(index)]
+        u, servo = _servo_input(state, index), system.servos[system.mechanism.joints[index].name]
+        drag = servo.damping * state.v[index] if servo.motor_kind == "dc" else 0
+        return ca.if_else(u < MOTOR_OFF_COMMAND / 2, servo.torque(u, state.q[index], state.v[index]) + drag, 0)
     if spring is not None:
         return spring.stiffness * state.q[index]
     return system.input_force(state.u, state.q, state.v)[index] - system.weight_and_grasp_force_on_coordinate(
@@ -179,9 +188,6 @@ def quantity_values_along(
         return np.asarray(np.diff(q[:, at], axis=0) / h, float)
     if quantity == "angle":
         return np.asarray((q[1:, at] + q[:-1, at]) / 2, float)
-    if quantity == "command":
-        commands = nodes["torque"][:, [system.driven_coordinate_indices.index(index) for index in at]]
-        return np.where(commands < MOTOR_OFF_COMMAND / 2, commands, np.nan)
     internal = system.effect_internal_coordinate_symbols
     sizes = {"q": n, "v": n, "z": len(internal), "u": len(system.driven), "lam": system.n_constraints}
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
@@ -199,13 +205,17 @@ def quantity_values_along(
         rows,
         ca.SX(h),
     )
-    load = ca.vertcat(*(_quantity("load", state, "", index, spring) for index, spring in places))
-    load = ca.substitute(load, ca.vertcat(*internal.values()), symbols["z"]) if internal else load
-    function = ca.Function("load", [*symbols.values(), system.parameters.symbols], [load])
+    wanted = ca.vertcat(*(_quantity(quantity, state, "", index, spring) for index, spring in places))
+    wanted = ca.substitute(wanted, ca.vertcat(*internal.values()), symbols["z"]) if internal else wanted
+    function = ca.Function("quantity", [*symbols.values(), system.parameters.symbols], [wanted])
     z = nodes["state"][:-1, 2 * n :]
     inputs = ((q[1:] + q[:-1]) / 2, np.diff(q, axis=0) / h, z, nodes["torque"], nodes["multipliers"] / h)
     columns = [own.T if own.shape[1] else ca.DM(0, len(own)) for own in inputs]
-    return np.asarray(function.map(len(q) - 1)(*columns, np.tile(theta[:, None], len(q) - 1)), float).T
+    values = np.asarray(function.map(len(q) - 1)(*columns, np.tile(theta[:, None], len(q) - 1)), float).T
+    if quantity == "command":
+        inputs_there = nodes["torque"][:, [system.driven_coordinate_indices.index(index) for index in at]]
+        values[inputs_there >= MOTOR_OFF_COMMAND / 2] = np.nan
+    return values
 
 
 def make_law(location: str, system: System, tables: Sequence[LawTable], torque_scale: float = math.inf) -> Law:
