@@ -297,7 +297,7 @@ def test_no_workers_and_workers_in_two_places_are_refused():
     assert available_processor_count() >= 1
     with pytest.raises(ConfigError, match="0 workers"):
         WorkerConfig(n_processes=0)
-    with pytest.raises(ConfigError, match="here and of a scheduler"):
+    with pytest.raises(ConfigError, match="together with a scheduler"):
         WorkerConfig(n_processes=2, scheduler_address="localhost:8786")
 
 

@@ -76,7 +76,7 @@ def _printing(parser: argparse.ArgumentParser, path: str) -> None:
 
 def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     _configured(parser, optional)
-    text = "stop, with exit code 2, where anything about a recording is in doubt"
+    text = "stop with exit code 2 if any recording has an issue"
     _setting(parser, "--strict", "recordings.strict=true", text)
 
 
@@ -99,7 +99,7 @@ def _identifiability(parser: argparse.ArgumentParser) -> None:
     text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all if they are few"
     parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)
     _switch(parser, "--initial", "judge at the initial values, without solving")
-    _switch(parser, "--unknown-start", "judge with initial states estimated along, whatever the settings assume")
+    _switch(parser, "--unknown-start", "also estimate the initial states, regardless of the settings")
     _working(parser, "this process alone")
     _switch(parser, "--unknown-grasp", "judge with the places of grasps estimated along")
 
@@ -133,7 +133,7 @@ def _batch(parser: argparse.ArgumentParser) -> None:
 
 def _track(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
-    text = "keep the told pose and depth of the camera, as of a hand-eye calibration; the arm then checks them"
+    text = "keep the specified camera pose and depth (of a hand-eye calibration); the arm only checks them"
     _setting(parser, "--fix-pose", "track.options.calibration.fix_pose=true", text)
     _working(parser, "this process alone")
 
@@ -159,7 +159,7 @@ def _import(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", metavar="FILE", nargs="+", help=files)
     parser.add_argument("--out", metavar="RECORDING.h5", help="recording to write; needed without --preview")
     _switch(parser, "--preview", "show what there is, and the command that imports it, and write nothing")
-    text = "its section `import` says how; a flag goes before what stands there"
+    text = "its section `import` sets the options; flags override it"
     parser.add_argument("--config", metavar="CONFIG.yaml", help=text)
     _importing(parser)
     _printing(parser, "recording's path")
@@ -226,7 +226,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     text = "of a recording: csv (default) or mcap; of a run: mjcf (default), urdf, sdf, yaml for a configuration that "
     text += "starts at the estimates, or mcap for what was measured, predicted and left over"
     parser.add_argument("--format", metavar="FORMAT", help=text)
-    text = "folder for CSV or MCAP files, or file for the model; its manifest stands beside it"
+    text = "folder for CSV or MCAP files, or file for the model; its manifest is written next to it"
     parser.add_argument("--out", metavar="PATH", required=True, help=text)
     text = "write a model although the format cannot hold all of it; the manifest says what is left out"
     parser.add_argument("--lossy", action="store_true", help=text)
@@ -309,7 +309,7 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 
 # -- commands ---------------------------------------------------------------------------------------------------------
 
-_SAID_IDENTIFIABILITY = "say which parameters the recordings determine, and which experiment would tell more"
+_SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and experiments that would determine more"
 _SAID_BLIND = "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted"
 _SAID_COMPLETION = "print what makes a shell complete commands, options, files and settings"
 _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"

@@ -1,4 +1,4 @@
-"""How objects show themselves in a line and a notebook, and how work that takes long tells how far it is"""
+"""Display of objects in one line and in notebooks, and progress reports of long computations"""
 
 from __future__ import annotations
 

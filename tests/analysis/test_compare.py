@@ -209,7 +209,7 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compar
     [
         (LIMIT, 1.0, "it ended with 'iteration_limit' before reaching the optimum"),
         (Status.STALLED, 99.0, "it ended with 'stalled' before reaching the optimum"),
-        (CONVERGED, 3.1, "it stopped in another valley of the cost"),
+        (CONVERGED, 3.1, "it stopped in another local minimum"),
         (CONVERGED, 3.0, "its cost weighs the measurements otherwise"),
     ],
 )

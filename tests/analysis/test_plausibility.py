@@ -238,8 +238,8 @@ def test_motion_of_another_robot_or_with_a_counterbalance(arms, runs):
     for arm, many, times_off, ratio in ((arms[1], 4, "4.3", 1.425), (free, 7, "6.6", 2.212)):
         (doubt,) = check_efforts_by_inverse_dynamics(arm, quick)
         assert (doubt.cause, doubt.evidence_ratio) == ("effort_unlike", pytest.approx(ratio, rel=2e-3))
-        assert f"efforts of {many} of 7 joints are not" in doubt.what
-        assert f"{times_off} times what a robot's model is off by" in doubt.what
+        assert f"efforts of {many} of 7 joints do not match this robot" in doubt.what
+        assert f"{times_off} times the usual model error" in doubt.what
     balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
     assert check_efforts_by_inverse_dynamics(arms[1], balanced) == []
 
@@ -545,7 +545,7 @@ def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
 def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(drives):
     slow = swung(drives, size=0.03, **SLOW)
     (unstated,) = check_inertial_effort_excitation(drives, with_joints(slow, effort_std=lambda _: None), USUAL)
-    assert "beside noise of 0.049 N m from sample to sample" in unstated.what
+    assert "noise between samples is 0.049 N m" in unstated.what
     assert list(check_inertial_effort_excitation(drives, slow, replace(USUAL, std=1e-4))) == []
     assert len(list(check_inertial_effort_excitation(drives, slow, replace(USUAL, std=10.0)))) == 1
     assert list(check_inertial_effort_excitation(drives, slow, replace(USUAL, use=False))) == []

@@ -50,7 +50,7 @@ def test_springs_that_cannot_be_told_apart(carried_out, repository):
         assert lower == pytest.approx(1.2, rel=0.02)
         assert upper is None
     report = (done.folder / "report.html").read_text()
-    assert "What another experiment would tell" in report
+    assert "What another experiment would identify" in report
     assert "cannot be found" in report
     assert {"config.yaml", "log.jsonl"} <= {entry.name for entry in done.folder.iterdir()}
 

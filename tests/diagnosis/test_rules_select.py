@@ -364,7 +364,10 @@ def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
     assert [kinds for kinds, *_ in rounds.screens] == [["a"]]
     assert added[0].cumulative_closure.fraction == pytest.approx(1 - 0.05 / 2.1)
     assert [of.kind for of in added[0].equivalent_effects] == ["a"]
-    assert rounds.heard.stages == ["added a@x: 97.6 % of the held-out gap closed", "scoring what is left beside a@x"]
+    assert rounds.heard.stages == [
+        "added a@x: 97.6 % of the held-out gap closed",
+        "scoring the residual gap next to a@x",
+    ]
 
 
 def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypatch):
@@ -372,7 +375,7 @@ def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypa
     rounds = Rounds(monkeypatch, losses, before={}, left=1e-3)
     first, chosen, _ = rounds.compose(moved=True, deadline=0.0)
     assert (first, chosen) == (["a", "b", "c"], ["a"])
-    assert rounds.search.skipped == ["candidates from the earlier run's parameters", "what is left beside a@x"]
+    assert rounds.search.skipped == ["candidates from the earlier run's parameters", "the residual gap next to a@x"]
     assert rounds.screens == []
 
 
@@ -438,7 +441,7 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     closed = [entry.cumulative_closure.fraction for entry in added]
     assert closed == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2, 3]
-    assert "scoring what is left beside a@x, b@x" in rounds.heard.stages
+    assert "scoring the residual gap next to a@x, b@x" in rounds.heard.stages
 
 
 def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):

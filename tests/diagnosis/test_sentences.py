@@ -49,7 +49,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 
 FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
-SPEED, ACCELERATION, GRAVITY = "how fast it moves", "how hard it accelerates", "how it stands against gravity"
+SPEED, ACCELERATION, GRAVITY = "how fast it moves", "how hard it accelerates", "its orientation to gravity"
 REASONS = ("unsure", "little", "stand_in")
 NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 
@@ -141,7 +141,10 @@ def unknown():
         yield f"no held-out gap, {reason}", finding("unknown", unknown_reason=reason, **none)
     hurried = {"search_seconds": 12.54, "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
-    yield "stopped with an effect", with_effect(FRICTION, 0.5, **hurried | {"untried": ("what is left beside a@x",)})
+    yield (
+        "stopped with an effect",
+        with_effect(FRICTION, 0.5, **hurried | {"untried": ("the residual gap next to a@x",)}),
+    )
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):

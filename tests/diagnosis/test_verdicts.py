@@ -90,7 +90,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
     assert (result["verdict"], result["effects"]) == ("effect", [{"kind": "joint_coulomb", "location": "elbow"}])
     assert [entry["closure"] is not None for entry in result["which"]] == [True, False, False, False]
     assert result["stopped"]["after"] == pytest.approx(sum(list(result["seconds"].values())[:-3]))
-    assert result["stopped"]["next"][-1] == "what is left beside joint_coulomb@elbow"
+    assert result["stopped"]["next"][-1] == "the residual gap next to joint_coulomb@elbow"
     assert result["carried_over"], "what was named was held against the held-out recordings as ever"
     clock[0] = math.inf
     result = stopped(Progress())

@@ -209,7 +209,7 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     moved = replace(first, value_after=2 * first.value_before)
     text = text_of(page_of(replace(found["effect"], nominal_changes=(moved, *others)), tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
-    assert "A gap would have shown at" in text
+    assert "would have been detected" in text
     assert "By evidence the gap lies in the mechanics or what the effort sensors read" in text
     assert "Closed by joint_coulomb@elbow" in text
     assert "the surest value is that of elbow" in text
@@ -247,7 +247,7 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     assert 'id="events"' in page
     text = text_of(page)
     assert f"{pulse.impulse:.3g} ± {0.0125:.2g}" in text
-    assert "From 1.5 s on nothing is judged in run" in text
+    assert "Data after 1.5 s are ignored in run" in text
     assert 'id="events"' not in page_of(found["no_gap"], tmp_path)
 
 

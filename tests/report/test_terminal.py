@@ -119,7 +119,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
     assert lines[4:6] == ["and so for 2 more channels, in result.json", first]
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in lines[:6]
-    assert "the model does not explain the recordings, so agreement of methods says nothing of the truth" in lines
+    assert "the model does not explain the recordings, so agreement of methods does not confirm the values" in lines
     assert line_of(lines, "a  ").split()[-2:] == ["in", "doubt"]
     judgement = information(parameters={"a": judged("not_trusted")}, fit=BAD)
     assert told("yid-identifiability/1", judgement)[0] == first

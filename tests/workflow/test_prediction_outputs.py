@@ -234,7 +234,7 @@ def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum
     assert result["fit"]["believed"] is believed
     assert [doubt["cause"] for doubt in result["doubts"]] == ([] if believed else ["worse_than_guess"])
     assert result["parameters"]["shoulder.stiffness"]["verdict"] == ("identifiable" if believed else "not_trusted")
-    assert ("a prediction without a model is nearer" in done.out) is not believed
+    assert ("a prediction without a model has a smaller error" in done.out) is not believed
 
 
 def test_a_guess_is_not_judged_by_the_sample_that_made_it():

@@ -196,7 +196,7 @@ from yid_ocp.model.system import StepTerms
 @EFFECTS.register("{kind}")
 class Constant(EffectBase):
     equation = "F = push"
-    required_excitation = "how it stands against gravity"
+    required_excitation = "its orientation to gravity"
 
     @classmethod
     def possible_locations(cls, system):

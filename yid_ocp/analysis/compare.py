@@ -144,7 +144,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
         if run.solution.status != Status.CONVERGED:
             why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
         elif run.whitened_cost > best.whitened_cost + 2.0:
-            why = "it stopped in another valley of the cost"
+            why = "it stopped in another local minimum"
         else:
             why = "its cost weighs the measurements otherwise"
         text = f"{name} = {entry.value:.4g}, while {best.method} finds {reference.value:.4g} +- {reference.std:.2g}"

@@ -46,7 +46,7 @@ def solve(
     The best fit of several starts (`solvers.solve`), a cable without memory where the recordings do not support it,
     profile-likelihood intervals of what is weakly determined, and the error of the discretisations that
     `problem.options.checked_discretisations` names, which the standard deviations include. Verdicts are `not_trusted`
-    where the step is unstable, clocks drift, or a prediction without a model is nearer.
+    where the step is unstable, clocks drift, or a prediction without a model has a smaller error.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
 def prediction_errors_and_units(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodePrediction | str]]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
-    """Errors beside baselines of recordings held out and then of those fitted, units, and errors of channels fitted."""
+    """Errors and baselines of held-out, then fitted recordings, units, and errors of fitted channels."""
     residuals: Mapping[str, Any] = {}
     pairs = list(held_out)
     if solution.evaluation is not None:

@@ -134,7 +134,7 @@ class _ObservableFrame(NamedTuple):
 
 
 def observable_frames(system: System) -> list[_ObservableFrame]:
-    """Measurable frames: segment tips, middles and markers beside the tips, or links and markers without segments."""
+    """Measurable frames: segment tips, midpoints and markers near the tips, or links and markers without segments."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[_ObservableFrame] = []

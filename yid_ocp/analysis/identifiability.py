@@ -171,7 +171,7 @@ def identifiability(
         as_solved, wide = wide is problem, problem_whitened_at(wide, x, rounds=2)
         evaluation = wide.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
-            message = f"the model cannot be rolled out where its information is asked for: {evaluation.message}"
+            message = f"the simulation fails at the parameters where information is computed: {evaluation.message}"
             raise SolverError(message, hint="solve first, or choose other initial values")
         covariance, chi2 = unknowns_covariance_and_reduced_chi2(wide, evaluation)
         inflation, fit = math.sqrt(max(1.0, chi2)), None

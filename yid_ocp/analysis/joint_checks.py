@@ -236,9 +236,9 @@ def check_inertial_effort_excitation(
     seen = float(np.sqrt(len(joints.t) * np.sum((size / noise) ** 2)))
     if seen < _MIN_SIGNAL_STDS:
         j = int(np.argmax(size / noise))
-        asked = f"speed and acceleration ask {arm.joint_names[j]} for {size[j]:.2g} N m (rms)"
-        words = f"{asked}, beside noise of {noise[j]:.2g} N m from sample to sample; no joint tells more"
-        advice = "move faster; from postures alone weight and stiffness can be found, no damping, friction or inertia"
+        asked = f"speed and acceleration require of {arm.joint_names[j]} {size[j]:.2g} N m (rms)"
+        words = f"{asked}; noise between samples is {noise[j]:.2g} N m; no joint is more informative"
+        advice = "move faster; static configurations determine weight and stiffness, not damping, friction or inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
 
@@ -270,7 +270,7 @@ def check_joint_excitation(
             if not name or width > widest:
                 widest, name = width, recording.name
         if name and widest < limit:
-            least = f"{limit:.2g} rad is the least that tells {', '.join(parameters)} from a constant effort"
+            least = f"{limit:.2g} rad is the minimum that separates {', '.join(parameters)} from a constant effort"
             words = f"{joint} turns by {widest:.2g} rad at most, in {name}; {least}"
             advice, depth = f"record a motion that turns {joint}, or fix {parameters[0]}", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
@@ -413,13 +413,19 @@ def _by_joint(data: _Data) -> Iterator[Issue]:
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
             words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion need"
-            yield _issue("effort_gain", words, off / _MIN_Z, "find out what the number stands for", names[j])
+            yield _issue(
+                "effort_gain",
+                words,
+                off / _MIN_Z,
+                "find out what the recorded effort is (unit, gear side, scale)",
+                names[j],
+            )
     yield from _offsets(data, fit, told & ~loaded)
     lost = fit.left > _WRONG_ROBOT_RMS
     if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
-        strange = f"efforts of {lost.sum()} of {len(names)} joints are not what this robot needs for this motion"
-        words = f"{strange}: {left:.2g} times what a robot's model is off by"
+        strange = f"efforts of {lost.sum()} of {len(names)} joints do not match this robot and motion"
+        words = f"{strange}: {left:.2g} times the usual model error"
         advice = "check that the recording is this robot's, its unit of time, and the order of joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 

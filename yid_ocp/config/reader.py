@@ -141,7 +141,7 @@ def _odd(what: str, origin: str, event: Any) -> ConfigError:
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
     """Plain Python values in place of the YAML reader's own; their lines go into `places`."""
     if len(path) > _MAX_DEPTH:
-        raise ConfigError("an alias stands for itself", where=origin, hint="write what the aliases stand for")
+        raise ConfigError("an alias refers to itself", where=origin, hint="replace the aliases by their content")
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
         for key, value in node.items():

@@ -66,7 +66,9 @@ class _MeasuredClampSettings:
     z_axis_point_name: Annotated[str, OptionInfo("point to which its z axis looks, never along the world's x axis")]
     roll_convention: Annotated[
         Literal["level", "transported"],
-        OptionInfo("what two points do not tell: x axis across the world's y, or no turn about z from the start on"),
+        OptionInfo(
+            "rotation that two points leave free: x axis perpendicular to world y, or no initial rotation about z"
+        ),
     ] = "level"
 
 
@@ -118,7 +120,7 @@ class JointActuationSettings:
     servo: Annotated[PositionServoOptions, OptionInfo("of the mode servo")] = field(
         default_factory=PositionServoOptions
     )
-    passive_joints: Annotated[_Names, OptionInfo("joints among them that nothing drives, whatever the mode")] = ()
+    passive_joints: Annotated[_Names, OptionInfo("joints among them without a drive, in any mode")] = ()
     locked_joints: Annotated[Mapping[str, float], OptionInfo("value of joints that do not move", "rad or m")] = field(
         default_factory=dict
     )
@@ -314,13 +316,13 @@ class DiagnosisSettings(Thresholds):
         float,
         Gt(0),
         Le(1),
-        OptionInfo(
-            "part of all stated std, torques' included, that is noise, where the rest stands for the model's error"
-        ),
+        OptionInfo("part of all stated std, torques' included, that is noise, the rest represents model error"),
     ] = 1.0
     baseline: Annotated[
         tuple[_FilePath, ...],
-        OptionInfo("run folders of `solve` or `diagnose`, of the same model: what differs since is asked"),
+        OptionInfo(
+            "run folders of `solve` or `diagnose` with the same model; the diagnosis reports what changed since"
+        ),
     ] = ()
 
     @property
@@ -355,7 +357,7 @@ class _CompareSettings:
         ),
     ] = 300.0
     reference_paper_experiment_name: Annotated[
-        str | None, OptionInfo("experiment of the source paper whose answer stands beside")
+        str | None, OptionInfo("experiment of the source paper whose result is shown for comparison")
     ] = None
 
 
@@ -371,7 +373,7 @@ class _VirtualFramesSettings:
     gripper_start_offsets: Annotated[
         Mapping[str, _Vector3], OptionInfo("by grasp: where it starts beside the end of the undeformed object", "m")
     ] = field(default_factory=dict)
-    camera_position: Annotated[_Vector3, OptionInfo("where the camera stands", "m")] = (2.6, 0.0, 0.45)
+    camera_position: Annotated[_Vector3, OptionInfo("the camera's pose", "m")] = (2.6, 0.0, 0.45)
     camera_target: Annotated[_Vector3, OptionInfo("where it looks", "m")] = (0.85, 0.0, -0.1)
     frame_rate: Annotated[float, Gt(0), Le(60), OptionInfo("mean rate of frames", "Hz")] = 3.0
     dropped_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
@@ -454,7 +456,7 @@ class RunSettings:
     plugins: Annotated[
         tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are run")
     ] = ()
-    model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = ModelSettings()
+    model: Annotated[ModelSettings, OptionInfo("the kind of synthetic world")] = ModelSettings()
     recordings: Annotated[RecordingsSettings, OptionInfo("the data")] = RecordingsSettings()
     import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()
     sensors: Annotated[

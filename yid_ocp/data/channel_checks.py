@@ -220,8 +220,8 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             if alone and again and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
-                advice = "leave what is cut off out, or record within the sensor's range; where it is what a "
-                advice += "controller asked for, say sensors.joints.effort.kind: command"
+                advice = "exclude the saturated samples, or record within the sensor's range; if it is what a "
+                advice += "controller commanded, set sensors.joints.effort.kind: command"
                 ratio = at.sum() / least
                 yield Issue("saturated", what, "not_trusted", ratio, advice, "", group, channel, begin, end)
 
@@ -365,8 +365,8 @@ ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = {
     "point_reach": "points are where the object cannot be",
     "encoder_offset": "an encoder's zero is off",
     "point_unlike": "points are not where the robot holds them",
-    "weak_excitation": "the motion is too weak to tell what is asked",
-    "worse_than_guess": "a prediction without a model is nearer",
+    "weak_excitation": "the motion is too weak to determine the free parameters",
+    "worse_than_guess": "a prediction without a model has a smaller error",
 }
 """Description of every cause of an issue, as shown in tables."""
 

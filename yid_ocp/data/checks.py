@@ -279,7 +279,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         moved.append(size / max(QUALITY_LIMITS.min_point_travel, noise))
     if max(moved, default=2.0) < 1.0:
         what = f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise"
-        advice = "record a motion; what a posture at rest says is all that can be found"
+        advice = "record a motion; at rest only static parameters can be found"
         yield Issue("standstill", what, "warning", 1 / max(*moved, 1e-3), advice, "")
 
 

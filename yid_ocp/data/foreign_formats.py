@@ -115,7 +115,7 @@ _MocapTable = tuple[PointGroup, str, tuple[str, ...]]
 
 
 def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
-    """Function that reads a motion capture export from its rows, by its first row; None where the table is none."""
+    """Function that reads a motion capture export from its rows, chosen by the first row; None for other tables."""
     first = first_row[0].strip() if first_row else ""
     if first == "Format Version":
         return _read_motive

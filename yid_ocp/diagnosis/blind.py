@@ -229,7 +229,7 @@ class BlindCaseGenerator:
         self.conditions = replace(conditions or SyntheticMeasurementConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
-            what, where = "none of the candidates can be done in MuJoCo", "diagnosis.candidates"
+            what, where = "MuJoCo can represent none of the candidates", "diagnosis.candidates"
             raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_EFFECT_KINDS))
 
     def _rng(self, *path: int) -> np.random.Generator:

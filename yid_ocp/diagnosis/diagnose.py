@@ -399,7 +399,9 @@ def _followed(
         names = {cut.recording for cut in cuts}
         found = (*(cut for cut in found if cut.recording not in names), *cuts)
         shorter = replace(search, problem=composed)
-        again = _settled(shorter, nominal.values, f"the nominal model beside what it can follow ({margin:g})")
+        again = _settled(
+            shorter, nominal.values, f"the nominal model, limited to the part that it can follow ({margin:g})"
+        )
         if again is not None:
             search, nominal = shorter, again
     return search, nominal, found

@@ -36,28 +36,28 @@ _PRIOR_RANGE_TOLERANCE = 0.25  # part of its range by which an amplitude may lea
 _GAP_ORIGIN_PHRASES = {
     "plant": ", in the mechanics rather than in what sensors read",
     "sensor": ", in what sensors read",
-    "either": ", in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart",
+    "either": ", in the mechanics or in what the effort sensor reads (efforts alone cannot distinguish them)",
 }
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _MAX_EVENTS_LISTED = 8  # maximum number of events listed one by one
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that cannot be moved by themselves
 _NEXT_EXPERIMENT_TEXTS = {
-    "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
+    "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
     "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
     "places": "Move so that {places} work one at a time, or measure a point between them.",
     "vary": "Vary {aspects} over a wider range.",
     "other": "Record other motions, faster and larger.",
-    "unknown": "Move {place} alone, slowly and fast, and hold it still in several postures.",
-    "unseen": "None is needed; these motions could not have shown {unseen}.",
-    "no_gap": "None is needed.",
-    "effect": "Repeat with other motions to see whether the effect's parameters stay.",
+    "unknown": "Move {place} alone, slowly and fast, and hold it still in several configurations.",
+    "unseen": "None needed: no gap was found. These motions cannot reveal {unseen}.",
+    "no_gap": "None needed: no gap was found.",
+    "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
 }
 """Texts of the recommended next experiment, by situation."""
 _UNKNOWN_REASON_TEXTS = {
     "nothing": "{no} explains it.",
-    "none": "{no} explains it (the best, {best}, is not sure to be there and to close a part).",
-    "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
-    "asked.",
+    "none": "{no} explains it (the best, {best}, is not significant or closes too little).",
+    "unsure": "{names} close{s} {closure:.3g} % of it, but the lower 95 % bound is {low:.3g} %; {least:.3g} % is "
+    "required.",
     "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and {sure}; "
     "{enough:.3g} % {asked}.",
     "stand_in": "{names} imitate{s} it ({closing}) and {are} not its cause: {apart}.",
@@ -101,7 +101,7 @@ def insufficient_data_message(
     if verdict != "insufficient_data":
         return ""
     if not any(entry.is_detectable for entry in seen):
-        return "no candidate of the size that one would expect would show in these recordings."
+        return "no candidate of its expected size would be visible in these recordings."
     needed = f"at least {limits.min_samples_per_unknown * unknowns:.0f} are needed"
     said = f"{before.degrees_of_freedom:.0f} effective samples for {unknowns} unknowns, {needed}"
     return f"{said}; record longer or free fewer parameters."
@@ -110,9 +110,9 @@ def insufficient_data_message(
 def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
     """Return a sentence on how far the nominal model follows a truncated held-out recording."""
     if cut.kept_duration == 0:
-        return f"The nominal model cannot follow {cut.recording} at all, which is left out."
+        return f"The nominal model cannot follow {cut.recording}; this recording is ignored."
     part = f"{cut.kept_duration:.3g} of {cut.full_duration:.3g} s"
-    return f"The nominal model follows {cut.recording} for {part} only; the rest is left out."
+    return f"The nominal model follows {cut.recording} for {part} only; the rest is ignored."
 
 
 def diagnosis_summary_text(finding: DiagnosisResult) -> str:
@@ -155,9 +155,9 @@ def _gap(finding: DiagnosisResult) -> str:
     fitted, other = (f"{x:.3g}" if math.isfinite(x) else "not known" for x in (first.chi2_per_dof, held.chi2_per_dof))
     sizes = f"chi2 per degree of freedom {fitted}, held out {other}"
     if finding.verdict == "insufficient_data":
-        return f"The data do not suffice: {finding.message}"
+        return f"The data are insufficient: {finding.message}"
     if finding.verdict == "no_gap":
-        return f"There is no gap to speak of ({sizes}; p = {p:.2g})."
+        return f"There is no significant gap ({sizes}; p = {p:.2g})."
     best = min(finding.candidate_scores, key=lambda score: score.p_value, default=None)
     if residuals_exceed_noise((first, held), limits.null_test_limits) or best is None:
         return f"The gap is real ({sizes}; p {_p_value_relation(p)})."
@@ -180,7 +180,7 @@ def _places(finding: DiagnosisResult) -> str:
         if finding.smoother_result is None
         else _GAP_ORIGIN_PHRASES.get(finding.smoother_result.plant_or_sensor_origin, "")
     )
-    silent = "These data do not tell where it lies." if shares else ""
+    silent = "These data cannot locate it." if shares else ""
     return f"It lies in {named}{side}." if named else silent
 
 
@@ -191,7 +191,9 @@ def _nameless(finding: DiagnosisResult) -> str:
     count, closed = independent_assumption_count(added), finding.gap_closure
     is_closure_known = math.isfinite(closed.fraction) and math.isfinite(closed.ci_low)
     none = "held-out motions have no gap to close"
-    sure = f"surely close{'s' if len(added) == 1 else ''} {100 * closed.ci_low:.3g} % on held-out motions"
+    sure = (
+        f"close{'s' if len(added) == 1 else ''} at least {100 * closed.ci_low:.3g} % of the held-out gap (95 % bound)"
+    )
     case = "no held-out gap" if reason == "unsure" and not is_closure_known else reason
     return _UNKNOWN_REASON_TEXTS[case if case != "none" or tried else "nothing"].format(
         sure=sure if is_closure_known else none,
@@ -204,7 +206,7 @@ def _nameless(finding: DiagnosisResult) -> str:
         low=100 * finding.gap_closure.ci_low,
         least=100 * finding.thresholds.min_gap_closed,
         explained=100 * finding.explained_fraction,
-        asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
+        asked=f"of the former is required for {count} assumptions" if count > 1 else "is required of both",
         enough=100 * required_fraction_of_smoother_chi2_decrease(added, finding.thresholds),
         apart="; ".join(apart[:2]),
         no="No effect tried so far" if finding.untried else "No known effect",
@@ -221,15 +223,15 @@ def _effects(finding: DiagnosisResult) -> list[str]:
         f"{names} {verb} {100 * total.fraction:.3g} % of it on held-out motions "
         f"(95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %)."
         if total.ci_low > finding.thresholds.min_gap_closed
-        else f"With {names} the held-out motions are far more likely (more than {odds:.0f} times), although so little "
-        "of chi2 tells of it that no part of the gap can be given."
+        else f"With {names} the held-out motions are far more likely (more than {odds:.0f} times), but it "
+        "changes chi2 too little to state which part of the gap it closes."
     ]
     for entry in finding.selected_effects:
         others = [r.label for r in entry.equivalent_effects if r.label != entry.effect.label]
         text += [f"Not separable from {entry.effect.label}: {', '.join(others)}."] if others else []
     odd = [said for effect in finding.accepted_effects for said in _out_of_range(effect, last)]
     if odd:
-        text.append(f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}.")
+        text.append(f"Outside the expected range, so possibly a substitute for another cause: {', '.join(odd)}.")
     if rest.chi2_per_dof > 1 and rest.p_value < finding.thresholds.significance_level:
         mostly = "".join(f", most of it in {place.location}" for place in finding.remaining_gap_locations[:1])
         size = f"held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}"
@@ -278,14 +280,14 @@ def _since(found: EarlierRunsComparison, effects: bool) -> list[str]:
         for e in found.changed_parameters[:4]
     ]
     seen = any(entry.z_score is not None for entry in found.parameter_shifts)
-    none = "no parameter has changed" if seen else "these recordings say nothing of the parameters"
+    none = "no parameter has changed" if seen else "these recordings do not inform the parameters"
     what = f"{'even with that ' if effects else ''}{', '.join(moved)}" if moved else none
     text = [f"Against the baseline{f' of {several} runs' if several > 1 else ''}, {what}."]
     if several > 1 and p_value < _RUNS_DIFFER_LEVEL:
-        text.append(f"The runs of the baseline differ among themselves (p = {p_value:.2g}); their ± is wider for it.")
+        text.append(f"The runs of the baseline differ among themselves (p = {p_value:.2g}); their ± includes this.")
     if not found.is_baseline_explained:
         what = "The model did not explain the baseline's recordings"
-        text.append(f"{what}, so its ± counts that misfit and may be too small.")
+        text.append(f"{what}, so its ± includes that misfit and may be too small.")
     return text
 
 
@@ -309,7 +311,7 @@ def _counterfactual(found: ErrorsWithEffectsRemovedAndAdded) -> list[str]:
         plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
         text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
         if not part.is_improved_by_counterfactual:
-            text.append("That is no better, so it may stand in for something else.")
+            text.append("That is no better, so the effect may be a substitute for another cause.")
     return text
 
 
@@ -319,15 +321,15 @@ def _event_sentences(events: EventSet) -> str:
     if count:
         told = "; ".join(_said(event) for event in events.disturbances[:_MAX_EVENTS_LISTED])
         more = f"; and {count - _MAX_EVENTS_LISTED} more" if count > _MAX_EVENTS_LISTED else ""
-        first = "One event stands" if count == 1 else f"{count} events stand"
-        text.append(f"{first} beside all this, short and in one place: {told}{more}.")
+        first = "One brief local disturbance was" if count == 1 else f"{count} brief local disturbances were"
+        text.append(f"{first} found and excluded: {told}{more}.")
     return " ".join([*text, *ignored_after_overspeed_messages(events)])
 
 
 def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
     """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
-    said, why = "s on nothing is judged in", "moves too fast for the model to follow."
-    return [f"From {e.start_time:.3g} {said} {e.recording}, where {e.joint} {why}" for e in events.overspeeds]
+    said, why = "s are ignored in", "moves too fast for the model."
+    return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
 
 
 def _said(event: ForceOrFaultEvent) -> str:

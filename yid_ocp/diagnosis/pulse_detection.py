@@ -1,4 +1,4 @@
-"""Pulses in the history of an unknown force: short, of one sign, beside a rest that varies slowly or follows the load.
+"""Pulses in the history of an unknown force: short, of one sign, on a slow or load-dependent background.
 
 The data say log p(data | f) = g'f - f'L f / 2 of the force's values f. It is a sum of pulses and a Gaussian rest:
 
@@ -118,7 +118,7 @@ _WINDOW_GROWTH = 1.25  # from one length of a window to the next
 _FLAT_RAMP_FRACTION = 0.5  # part of a flat pulse in which it rises and falls
 _MAX_PROFILES = 12  # pulses and what is like them in one history
 MAX_EVENT_TIME_FRACTION = 1 / 3
-"""Part of the time from which forces in short windows are none of events: the model errs everywhere."""
+"""Part of the time above which forces in short windows are not events: model error dominates."""
 _MIN_PROMINENCE_RATIO = 1.5  # times the median size anywhere that a pulse must have: more than a sine's maximum has
 _MAX_PULSE_RANGE_RATIO = 1.5  # times the range of the history about it that one may have: a larger one is made up
 
@@ -230,7 +230,7 @@ class _Filter:
         return self._seen(windows, t[:, None])
 
     def of_many(self, windows: _Windows, t: Array) -> _SparseMatrix:
-        """The same of windows that are short beside the history."""
+        """The same for windows that are short relative to the history."""
         reach = float(self.delay[-1])
         first, last = (np.searchsorted(t, ends) for ends in (windows.begin - reach, windows.end + reach))
         count = last - first

@@ -274,10 +274,12 @@ def select_effects(
     while len(added) < limits.max_effects:
         base = tuple(entry.effect for entry in added)
         if added:
-            if search.note_skip_past_deadline(f"what is left beside {join_effect_labels(base)}"):
+            if search.note_skip_past_deadline(f"the residual gap next to {join_effect_labels(base)}"):
                 break
             ahead = 3.5 if _little_is_left(current, limits) else 20.0
-            search.progress.begin_stage(f"scoring what is left beside {', '.join(e.label for e in base)}", 1.0, ahead)
+            search.progress.begin_stage(
+                f"scoring the residual gap next to {', '.join(e.label for e in base)}", 1.0, ahead
+            )
             screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)

@@ -31,7 +31,7 @@ class Thresholds(SmootherThresholds):
         DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof
     )
     min_channel_excess_chi2_per_dof: Annotated[
-        float, Ge(0), OptionInfo("the same of the worst channel, where a candidate mends it")
+        float, Ge(0), OptionInfo("the same for the worst channel, if a candidate explains it")
     ] = 0.02
     gap_significance_level_by_candidate: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance from which a candidate alone shows a gap")
@@ -68,7 +68,7 @@ class Thresholds(SmootherThresholds):
     min_gap_closed: Annotated[float, Ge(0), Lt(1), OptionInfo("part of the held-out gap that must be closed")] = 0.05
     chi2_equivalence: Annotated[float, Ge(0), OptionInfo("part of chi2/n within which models are equal")] = 0.0014
     model_error_chi2: Annotated[
-        float, Gt(0), OptionInfo("chi2/n from which a model errs everywhere, and blocks count")
+        float, Gt(0), OptionInfo("chi2/n above which model error dominates: statistics are taken over blocks of time")
     ] = 1e3
     implausible_shape_margin: Annotated[
         float, Ge(0), OptionInfo("part of chi2/n by which an unlikely shape must be better")

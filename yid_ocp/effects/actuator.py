@@ -90,7 +90,7 @@ class EncoderOffset(_DistortedReading):
     """Encoder offset: measured angle = true angle + offset; path, start and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
-    required_excitation = "how it stands against gravity"
+    required_excitation = "its orientation to gravity"
     possible_locations = _recorded_joints
     declared_parameters = (
         ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured less true angle"),
@@ -167,7 +167,7 @@ class _DistortedEffort(_DistortedReading):
     """An error of a joint's recorded effort."""
 
     quantity = "joints.effort"
-    required_excitation = "how it stands against gravity"
+    required_excitation = "its orientation to gravity"
     required_sensors = frozenset({"joints.effort"})
 
 

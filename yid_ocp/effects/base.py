@@ -21,7 +21,7 @@ from yid_ocp.registry import Registry
 
 ORDERED_EXCITATION_DESCRIPTIONS = (
     *("how fast it moves", "how long it is held", "how hard it accelerates", "how far it bends"),
-    *("how it stands against gravity", "how hard it pulls at its ends", "when it is read", "where the camera stands"),
+    *("its orientation to gravity", "how hard it pulls at its ends", "when it is read", "the camera's pose"),
     "how long it is",
 )
 """What a motion has to vary to excite an effect of the library, in the order in which messages list it."""

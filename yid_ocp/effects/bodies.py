@@ -143,7 +143,7 @@ class Payload(EffectBase):
     """
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
-    required_excitation = "how it stands against gravity"
+    required_excitation = "its orientation to gravity"
     is_local = True
     possible_locations = _moving_frames
     # payloads at two frames of one link are equivalent
@@ -320,7 +320,7 @@ class GravityScale(EffectBase):
     """Additional weight of the object, as a fraction of its full weight; its inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
-    required_excitation = "how it stands against gravity"
+    required_excitation = "its orientation to gravity"
     possible_locations = _object
     declared_parameters = (
         ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "weight added over full weight"),
@@ -341,7 +341,7 @@ class GravityTilt(EffectBase):
     """Rotation of the gravity vector by rx about the world's x axis, then by ry about the world's y axis."""
 
     equation = "g = Ry(ry) Rx(rx) g_0"
-    required_excitation = "how it stands against gravity"
+    required_excitation = "its orientation to gravity"
     possible_locations = _world
     declared_parameters = tuple(
         ParameterDefinition(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.05, 0.05), f"turn about {axis}") for axis in "xy"

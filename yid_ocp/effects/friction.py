@@ -28,7 +28,7 @@ EFFECT_KINDS_BY_FRICTION_LAW: Mapping[FrictionLawName, tuple[str, ...]] = {
     "load": ("joint_coulomb", "joint_load_friction"),
     "load_stribeck": ("joint_coulomb", "joint_load_friction", "joint_stribeck"),
 }
-"""The ladder of friction laws, each with the effects that it has at a joint beside the viscous `JOINT.damping`."""
+"""The ladder of friction laws, each with its effects at a joint in addition to the viscous `JOINT.damping`."""
 
 
 class _JointFriction(EffectBase):
@@ -81,7 +81,7 @@ class JointStribeck(_JointFriction):
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
         base.effort_limit_scaled_parameter_definition(
-            "tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"
+            "tau_s", "N m", 10.0, 2.0, "friction at low speed in addition to sliding friction"
         ),
         ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
     )

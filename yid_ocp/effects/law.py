@@ -269,7 +269,7 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
     wanted = depends_on.split("+")
     if set(rows) != set(wanted):
         what = f"the table is of {', '.join(rows) or 'nothing'}, the law depends on {depends_on}"
-        raise DataError(what, where=str(path), hint="set depends_on to what the table is of")
+        raise DataError(what, where=str(path), hint="set depends_on to the quantity of the table's first column")
     tables = []
     for quantity in wanted:
         knots, torque, std = np.array(rows[quantity]).T

@@ -30,7 +30,7 @@ def _clock(system: System) -> tuple[str, ...]:
 class _CameraEffect(EffectBase):
     """An error of what cameras see; other sensors' readings are unchanged."""
 
-    required_excitation = "where the camera stands"
+    required_excitation = "the camera's pose"
     required_sensors = frozenset({"camera"})
     possible_locations = _camera
 
@@ -153,7 +153,7 @@ def _mounted(system: System) -> tuple[str, ...]:
 class _MountedSensorEffect(EffectBase):
     """An error of a wrist sensor or an inertial unit, whose location is `wrist:FRAME` or `imu:FRAME`."""
 
-    required_excitation = "how it stands against gravity"
+    required_excitation = "its orientation to gravity"
     is_at_recorded_sensor = True
     is_local = True
     possible_locations = _mounted

@@ -87,7 +87,7 @@ class ResidualDerivativesAtNodes:
             if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
                 message = f"'{name}' depends on velocities, accelerations or constraint forces"
-                message += ", which cannot be weighted beside noise that drives the motion"
+                message += ", and cannot be weighted together with process noise"
                 raise DataError(message, hint=f"set sensors.{name}.use: false, or prescribe the arms' motion")
             # of each reading by the states and efforts of the node before, its own and the next
             before = 1 if read.needs_neighbours else 0

@@ -92,7 +92,7 @@ def assess_goodness_of_fit(
     evaluation: Evaluation,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> GoodnessOfFit:
-    """Null test of a fit on its own recordings; residuals are in noise units whatever the problem's weighting."""
+    """Null test of a fit on its own recordings; residuals are in noise units for any weighting of the problem."""
     if not evaluation.ok:
         return GoodnessOfFit(math.nan, math.nan, False)
     residual = evaluation.residual

@@ -73,7 +73,7 @@ class WorkerConfig:
         if self.n_processes is not None and self.n_processes < 1:
             raise ConfigError(f"{self.n_processes} workers", where="--workers", allowed="a whole number from 1")
         if self.n_processes is not None and self.scheduler_address:
-            what, where = "workers are asked for here and of a scheduler", "--workers and --scheduler"
+            what, where = "the number of workers is given together with a scheduler", "--workers and --scheduler"
             hint = "leave --workers out: the scheduler knows how many workers it has"
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
@@ -150,7 +150,9 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     ours = {kind.__name__ for kind in YidError.__subclasses__()}
     if first.partition(":")[0] in ours:
         told = "; ".join(line.strip() for line in rest.splitlines())
-        raise WorkerError(f"{what}; {told}" if told else what, hint="mend it: the same command does what failed again")
+        raise WorkerError(
+            f"{what}; {told}" if told else what, hint="correct this; the same command repeats the failed tasks"
+        )
     raise RuntimeError(f"{what}; the same command tries them again")
 
 

@@ -125,13 +125,13 @@ def _chosen(
 ) -> tuple[tuple[str, ...], tuple[EffectBase, ...]]:
     """Parameters that are to be told, or effects that are to be separated."""
     if options.identify is not None and options.discriminate is not None:
-        what = "parameters are to be told and effects to be separated"
+        what = "both parameters to identify and effects to discriminate are given"
         raise ConfigError(what, where="plan.discriminate", allowed="one of the two")
     if options.discriminate is not None:
         return (), _effects(problem, options.discriminate, sizes)
     wanted = problem.free if options.identify is None else options.identify
     if not wanted:
-        raise ConfigError("no parameter is to be told", where="plan.identify", allowed=", ".join(problem.free))
+        raise ConfigError("no parameter to identify is given", where="plan.identify", allowed=", ".join(problem.free))
     for name in wanted:
         if name not in problem.system.parameters:
             hint = nearest_name_hint(name, problem.system.parameters.names)
@@ -249,7 +249,7 @@ def _check_seen(
         raise ConfigError(what, where="plan.identify", allowed="a parameter that a sensor sees", hint=hint)
     for effect in rivals:
         if all(name in unseen for name in effect.amplitude_names):
-            what = f"no motion tells {effect.label} from anything: no sensor sees it to first order"
+            what = f"{effect.label} is unobservable: its first-order sensitivity is zero in every sensor"
             raise ConfigError(what, where="plan.discriminate", hint="add a sensor that sees it")
 
 

@@ -50,7 +50,7 @@ class PlanOptions:
         _PlanGoal,
         OptionInfo(
             "bring a point to a place, there along a path, or there with points kept inside a box; or move so that the "
-            "recordings tell most"
+            "recordings are most informative"
         ),
     ] = "place"
     point: Annotated[str | None, OptionInfo("frame that is to arrive: a tip of the object, T3:50%, a gripper")] = None
@@ -89,14 +89,14 @@ class PlanOptions:
         float, Ge(0), OptionInfo("weight of the mean squared effort in parts of its limit; raise it for calm motions")
     ] = 0.0
     minimize_parameter_sensitivity: Annotated[
-        bool, OptionInfo("whether the error that comes of the parameters' uncertainty is minimised along")
+        bool, OptionInfo("whether the error due to the parameters' uncertainty is minimised as well")
     ] = False
     identify: Annotated[
         tuple[str, ...] | None,
-        OptionInfo("of information: parameters that are to be told most precisely together; all free ones when absent"),
+        OptionInfo("for information: parameters to determine most precisely together; all free ones when absent"),
     ] = None
     discriminate: Annotated[
-        tuple[str, ...] | None, OptionInfo("of information: effects, kind@location, that are to be told apart")
+        tuple[str, ...] | None, OptionInfo("for information: effects, kind@location, to distinguish")
     ] = None
     n_random_starts: Annotated[
         int,

@@ -142,9 +142,7 @@ class ProblemOptions:
     start_point_noise_std: Annotated[
         float | None,
         Gt(0),
-        OptionInfo(
-            "noise standard deviation of these points, where the sensors' one stands for the model's error too", "m"
-        ),
+        OptionInfo("noise standard deviation of these points, if the sensors' value includes model error", "m"),
     ] = None
     initial_state_fit_parameters: Annotated[
         tuple[str, ...],

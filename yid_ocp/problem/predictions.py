@@ -1,4 +1,4 @@
-"""What is made of predictions: baselines without a model, channels beside their measurements, synthetic recordings."""
+"""Results of predictions: model-free baselines, channels with their measurements, synthetic recordings."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Without the effects, and with them")
     yield SummaryTable(torque_offset_table_rows(result), "How far the torques are off")
     if result.get("doubts"):
-        yield "what is in doubt about the recordings may be what the verdict is about"
+        yield "issues of the recordings may have caused this verdict"
     if result["next_plan"] is not None:
         yield "to separate what looks alike, plan a motion:"
         yield CodeBlock(_planning_command(result["next_plan"]))
@@ -233,7 +233,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         drifted, wrong = _drifted_and_distrusted(alike)
         changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
         said.append(changed if drifted else "No parameter differs among the runs by more than they state.")
-        said += [f"Distrust {', '.join(wrong)}: without it the others agree, or agree far better."] if wrong else []
+        said += [f"Distrust {', '.join(wrong)}: without it the others agree (far) better."] if wrong else []
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
@@ -297,11 +297,11 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
         yield f"{name} is not the same in all runs: {ends} (p {_relation(entry['p_value'])})."
     if wrong:
-        yield f"Distrust {' and '.join(wrong)}: without it the others agree, or agree far better."
+        yield f"Distrust {' and '.join(wrong)}: without it the others agree (far) better."
     elif drifted and len(runs) == 2:
-        yield "Two runs that differ do not say which of them to distrust; a third one would."
+        yield "Two differing runs do not show which one is wrong; add a third."
     elif drifted:
-        yield "No single run stands apart from the others."
+        yield "No single run differs from the others."
     poor = [entry["name"] for entry in runs if not entry["explains"]]
     if poor:
         yield (

@@ -257,9 +257,9 @@ def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
                 said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
                 yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
     if not fit["explains"]:
-        yield "the model does not explain the recordings, so agreement of methods says nothing of the truth"
+        yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
     elif not fit["believed"]:
-        yield "the recordings are in doubt, so agreement of methods says nothing of the truth"
+        yield "the recordings have issues, so agreement of methods does not confirm the values"
     elif not found:
         yield "no parameter can be found from these recordings, so there is nothing to agree on"
         yield "`yid-ocp identifiability CONFIG --what-if` says what would have to be measured"
@@ -323,7 +323,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         for entry in [asked["base"], *asked["singles"], *asked["smallest"]]:
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
             rows.append((entry["words"], f"{entry['identifiable']} of {len(parameters)}", gain, entry["message"]))
-        yield SummaryTable(rows, "What another experiment would tell")
+        yield SummaryTable(rows, "What another experiment would identify")
         said = "with no set of up to three changes can all of them be found"
         if asked["smallest"]:
             said = f"fewest changes with which all of them can be found: {asked['smallest'][0]['words']}"
@@ -401,8 +401,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
         cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
-    yield SummaryTable(rows, "What it tells")
-    rows = [("effect", "beside what could be", "apart in the recordings", "apart in this motion")]
+    yield SummaryTable(rows, "Expected precision")
+    rows = [("effect", "compared with", "apart in the recordings", "apart in this motion")]
     for own in result["distances"]:
         rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g} std" for when in ("before", "after"))))
     yield SummaryTable(rows, "Effects")
@@ -410,7 +410,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
     yield (
-        f"start {result['best'] + 1} of {len(starts)} tells most: {best['value'] - best['first']:.3g} nat more than "
+        f"start {result['best'] + 1} of {len(starts)} is the most informative: {best['value'] - best['first']:.3g} nat more than "
         f"the random motion from which it came{others}"
     )
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
@@ -421,7 +421,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"left open by this motion: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
-        yield "the parameters are those of the configuration; where the true ones differ, so does what is told"
+        yield "the parameters are those of the configuration; with other true values the information differs"
 
 
 @register_summary("yid-check/1")
@@ -460,9 +460,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from moved
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
-    ended = "nothing stands in the way of a run"
+    ended = "no problem found: a run is possible"
     if result.get("doubts") or result["warnings"]:
-        ended = f"a run is possible; see {'what is in doubt' if result.get('doubts') else 'the warnings'}"
+        ended = f"a run is possible; see {'the issues' if result.get('doubts') else 'the warnings'}"
     yield SummaryStatement(ended, "conclusion")
 
 

@@ -121,7 +121,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
     yield SummaryTable(rows, "In doubt")
     yield from advice
     if any(entry["weight"] != "warning" for entry in doubts):
-        text = "no number is said to be found while a recording of the run is in doubt"
+        text = "no value counts as found while a recording of the run has issues"
         yield SummaryStatement(text, "verdict")
 
 

@@ -21,7 +21,7 @@ from yid_ocp.options import OptionInfo
 from yid_ocp.registry import Registry
 
 EffortSamplingKind = Literal["sample", "mean", "command"]
-"""What a recorded effort is: the sampled torque, its mean until the next sample, or a command held until then."""
+"""Meaning of a recorded effort: the sampled torque, its mean until the next sample, or a command held until then."""
 _Positive = Annotated[float, Gt(0)]
 _NonNegative = Annotated[float, Ge(0)]
 
@@ -34,7 +34,7 @@ class SensorOptions:
         bool | None,
         OptionInfo(
             "whether the estimation sees it; when absent yes, but for joints.position: the encoders of driven joints "
-            "are measurements where no points of the arm are, never beside them"
+            "are measurements only if the arm has no measured points"
         ),
     ] = None
     std: Annotated[

@@ -72,7 +72,7 @@ class Iterate:
 
 
 EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
-"""A recording and its prediction, or why there is none."""
+"""A recording and its prediction, or the reason why it has no prediction."""
 
 
 @dataclass(frozen=True)

@@ -185,7 +185,7 @@ def grasping_joint_angles(
     start_angles: Mapping[str, float] | None = None,
     offsets: Mapping[str, ArrayLike] | None = None,
 ) -> dict[str, float]:
-    """Arm joint angles at which every gripper meets the end of the undeformed object, or a point beside it.
+    """Arm joint angles at which every gripper meets the end of the undeformed object, or a point near it.
 
     They are those of every driven joint and of all that carry a grasp's holder and are not elastic, which are sought,
     in configuration order [rad or m]. Only positions are matched, by the solution near the start. `ModelError` where

@@ -393,7 +393,7 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
     if terms.cubic_stiffness:
         if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
             what = f"the spring at '{joint.name}' has a cubic part"
-            allowed = "none beside a rest angle, and MuJoCo with polynomial stiffness (3.6 or newer)"
+            allowed = "no cubic part with a rest angle; otherwise MuJoCo 3.6 or newer (polynomial stiffness)"
             raise ModelError(what, where="mujoco_xml", allowed=allowed)
         numbers["stiffness"] = [terms.stiffness, 0.0, terms.cubic_stiffness]
     others = {"armature": [terms.armature], "frictionloss": [terms.dry_friction]}
@@ -492,7 +492,7 @@ def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bo
             allowed = f"{joint}.servo_dead_band: 0"
             raise ModelError(f"the servo of '{joint}' has a dead band", where="mujoco_xml", allowed=allowed)
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
-        raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock that tells the true time")
+        raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock without offset")
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:

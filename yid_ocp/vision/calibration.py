@@ -179,18 +179,18 @@ class CameraCalibrationOptions:
     fix_pose: Annotated[
         bool,
         OptionInfo(
-            "whether the told pose and depth are kept, those of a hand-eye calibration for "
-            "example; the arm then finds the clock and checks the rest"
+            "whether the specified pose and depth are kept (of a hand-eye calibration, for example); "
+            "the arm then determines the clock and checks the rest"
         ),
     ] = False
     n_frames: Annotated[
         int, Ge(_MIN_FRAMES), OptionInfo("so many, spread over the sequence, are compared with the arm")
     ] = 24
     rotation_prior_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of the told directions, about each axis", "rad")
+        PositiveFloat, OptionInfo("standard deviation of the specified orientation, about each axis", "rad")
     ] = 0.06
     translation_prior_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of the told place, along each axis", "m")
+        PositiveFloat, OptionInfo("standard deviation of the specified position, along each axis", "m")
     ] = 0.04
     depth_scale_prior_std: Annotated[PositiveFloat, OptionInfo("standard deviation of the scale of its depth")] = 0.03
     depth_offset_prior_std: Annotated[
@@ -330,12 +330,12 @@ class _Calibrator:
         free = presence.there + presence.through
         if not presence.there >= self.options.min_arm_coverage_over_frames * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
-            hint = "check the told pose, the robot's description and which recording belongs to the frames"
-            raise _UntoldError(f"{seen}, wherever camera and clock are put", hint)
+            hint = "check the specified pose, the robot's description and which recording belongs to the frames"
+            raise _UntoldError(f"{seen}, for every camera pose and clock offset tried", hint)
         covariance = found.state_covariance(self.precision)
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < self.clock.max_offset_std:
-            told = f"it moves too little to tell the time: its clock is known to {1e3 * std:.0f} ms only"
+            told = f"it moves too little to determine the clock offset: its std is {1e3 * std:.0f} ms"
             known = "give the clock's offset with track.options.clock.initial_offset and search_half_width: 0"
             raise _UntoldError(told, f"record a livelier motion, or {known}")
         used_state = state
@@ -394,7 +394,7 @@ class _Calibrator:
             if len(near) >= MIN_ARM_POINTS_PER_FRAME:
                 chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _MIN_FRAMES:
-            hint = "check the told pose and the unit of the clouds"
+            hint = "check the specified pose and the unit of the clouds"
             raise _UntoldError("what the camera sees does not lie on it", hint)
 
         def cost(state: CameraState) -> RobustCostDerivatives:
@@ -430,7 +430,7 @@ class _Calibrator:
                 words.append(f"the arm contradicts the pose that is kept: {off}, which the standard deviations count")
         elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
-            off = f"the told camera sees the arm {1e3 * away:.0f} mm from where the joints have it: turned by"
+            off = f"the camera at its given pose sees the arm {1e3 * away:.0f} mm from its measured place: turned by"
             moved = f"{math.degrees(turn):.1f} degrees, shifted by {1e3 * shift:.0f} mm"
             words.append(f"{off} {moved}, depth scaled by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}")
         return "; ".join(words)

@@ -56,9 +56,7 @@ class TrackOptions:
     ] = "none"
     estimated_dimensions: Annotated[
         tuple[TubeDimensionKind, ...],
-        OptionInfo(
-            "sizes of the tubes that are estimated from the clouds, where these tell them; all are checked anyway"
-        ),
+        OptionInfo("sizes of the tubes estimated from the clouds if these determine them; all sizes are checked"),
     ] = ()
     max_frame_distance_in_radii: Annotated[
         PositiveFloat,

@@ -98,7 +98,7 @@ class CloudFilterOptions:
         ),
     ] = 0.2
     outlier_neighbours: Annotated[
-        int, Ge(1), OptionInfo("of every point, whose mean distance tells whether it is alone")
+        int, Ge(1), OptionInfo("of every point; their mean distance identifies isolated points")
     ] = 12
     outlier_z_max: Annotated[
         PositiveFloat,

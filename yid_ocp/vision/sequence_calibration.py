@@ -315,6 +315,6 @@ def _changed(system: System, given: Mapping[str, float] | None, change: Array) -
 class SequenceCalibration:
     """Camera calibration, object dimensions and background of a sequence."""
 
-    camera_calibration: CameraCalibration  # where the camera stands, how it scales depth, and its clock
+    camera_calibration: CameraCalibration  # the camera's pose, how it scales depth, and its clock
     dimensions: TubeDimensionEstimates  # what the frames say of the object's lengths and radii
     background: BackgroundPoints  # what stands there in all frames

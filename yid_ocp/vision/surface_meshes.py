@@ -1,4 +1,4 @@
-"""Surfaces of the robot, of the tubes and of what stands about, and a virtual depth camera that sees them.
+"""Surfaces of robot, tubes and surroundings, and a virtual depth camera that sees them.
 
 Each surface is in a joint's moving frame. Noise and steps of the camera, a structured-light sensor, are even in the
 pattern's disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.

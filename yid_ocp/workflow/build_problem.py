@@ -50,7 +50,7 @@ _EFFECTS_BY_CAUSE = {
 }
 """Effects by which a model takes such an error into account."""
 _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia", "tau")
-"""Words in the names of parameters that nothing at rest tells."""
+"""Words in the names of parameters that are unobservable at rest."""
 _MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
 
 
@@ -188,7 +188,7 @@ def min_initial_closure_error_by_grasp(problem: EstimationProblem, episode: Epis
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
-        hint = f"first look at what is in doubt: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
+        hint = f"first check these issues: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_initial_closure_error_by_grasp(problem, episode).items():
             if gap > _MAX_GRASP_GAP:

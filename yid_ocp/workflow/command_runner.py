@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from yid_ocp.solvers.base import Iterate
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
-"""Exit codes of commands that ran to their end; the last where they were told to be strict and found something."""
+"""Exit codes of completed commands; the last if a strict command found an issue."""
 _CommandOutput = TypeVar("_CommandOutput")
 
 
@@ -91,7 +91,7 @@ def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig 
 
 
 def print_json(result: Mapping[str, Any]) -> None:
-    """Print a result on standard output as it stands in its file."""
+    """Print a result on standard output exactly as in its file."""
     print(json.dumps(to_json_types(result), indent=1, allow_nan=False))
 
 
@@ -148,7 +148,7 @@ class _RemainingTime:
         return abs(expected - spent) + self._ahead * pace
 
     def of_parts(self, done: int, total: int) -> str:
-        """Text of the time left of a stage of so many parts; empty where that of the command is known."""
+        """Text of the remaining time of a stage with this many parts; empty if the command's is known."""
         now = time.monotonic()
         # what stood there before this run began took no time
         known, begun = self._first = self._first or (done, now)

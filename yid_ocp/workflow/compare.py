@@ -1,4 +1,4 @@
-"""The command `compare`: several methods on one problem, and the answer of the source paper beside them."""
+"""The command `compare`: several methods on one problem, compared with the result of the source paper."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from yid_ocp.sensors.base import ChannelSpecification, channel_kinds_for_group_n
 from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
-"""What the frame at the end of an arm is called, the likeliest first."""
+"""Usual names of the frame at the end of an arm, most likely first."""
 _MAX_TIME_STEP = 0.01  # of the integrator, where nobody has looked yet [s]
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this say nothing of their noise: the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
@@ -277,7 +277,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
         return "driven", "efforts were recorded, and grasps close loops, which exact encoder angles would overstrain"
     if seen:
         return "prescribed", f"the object hangs on the arm and {seen} see it, so the arm moves as its encoders say"
-    return "prescribed", "nothing sees the object, so what it does is read from the efforts that moving the arm takes"
+    return "prescribed", "no sensor measures the object, so its parameters are estimated from the arm's efforts"
 
 
 def _commanded(joints: JointGroup) -> bool:

@@ -51,7 +51,7 @@ _PREDICTION_TOPICS: Mapping[str, Mapping[str, str]] = {
     SOLVE_TRAJECTORIES_FORMAT: {"predicted": "predicted"},
     DIAGNOSIS_TRAJECTORIES_FORMAT: {"before": "nominal", "after": "with_effects"},
 }
-"""Arrays of a sensor's group, and the first part of the topics that tell them."""
+"""Arrays of a sensor's group, and the first part of the topics that contain them."""
 _RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
 _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bias": "vector"}  # by kind of unknown
 

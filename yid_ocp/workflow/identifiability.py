@@ -223,7 +223,7 @@ class _IdentifiabilityTasks:
     def evaluate_experiment_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
-        """What sets of changes of the experiment would tell, one task per changed mechanics; a `ChangeSetEvaluator`."""
+        """Information gained by sets of experiment changes, one task per changed mechanics; a `ChangeSetEvaluator`."""
         groups: dict[str, list[int]] = {}
         for i, changes in enumerate(sets):
             mechanics = sorted({change.mechanical_change for change in changes if change.mechanical_change})

@@ -232,7 +232,7 @@ def _config_lines(
     """Commented YAML lines: every setting has a comment beside it or in the line above."""
     yield f"# yaml-language-server: $schema={_SCHEMA_FILE}"
     yield f"# Written by `yid-ocp init` {package_version()}. Everything may be changed; docs/settings.md has all keys."
-    yield "# What the recordings say stands beside each line. Next: `yid-ocp check` on this file, then `yid-ocp solve`."
+    yield "# Each line ends with its evidence. Next: `yid-ocp check` on this file, then `yid-ocp solve`."
     yield _line("", "description", _text(about), "one sentence for the report")
     yield ""
     yield "model:"
@@ -328,7 +328,7 @@ def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterato
     holder, grasps = proposal.holder_frame, proposal.grasps
     yield "  object:"
     if item.stands_in_world:
-        yield "    # `mount: {parent_frame: FRAME, xyz: [x, y, z], rpy: [r, p, y]}` says where it stands"
+        yield "    # `mount: {parent_frame: FRAME, xyz: [x, y, z], rpy: [r, p, y]}` sets its place"
     else:
         frames = [name for arm in proposal.arms[:1] for name in arm.tool_frames if name != holder]
         yield "    # its root sits in this frame and leaves it along z, unless xyz [m] and rpy [rad] say else"

@@ -1,4 +1,4 @@
-"""What is written of predictions: trajectories, held-out errors beside baselines, estimated torque offsets."""
+"""Output files of predictions: trajectories, held-out errors with baselines, estimated torque offsets."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
 
 
 def numbers_to_use(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
-    """What a reader copies from an estimate, of the parameters that are found: empty where none is.
+    """Lines to copy from an estimate, for the parameters that are found; empty if none is found.
 
     `values` with total standard deviations, `joints` (of each segment and deformation the number of links and the
     lowest and highest stiffness of a joint [N m/rad]), lines of `yaml` and `mjcf`, rows of `latex`, the command that

@@ -63,7 +63,9 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         hint = "give a run in which some parameter was found"
         raise DataError("the run found no parameter", where=str(file), hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
-        raise DataError("its covariance is none", where=str(file), allowed="finite, with a positive diagonal")
+        raise DataError(
+            "its covariance is missing or invalid", where=str(file), allowed="finite, with a positive diagonal"
+        )
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
 
 
@@ -200,7 +202,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 
 
 def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
-    """Recordings without the sought effect, from settings or baseline, and a text on why there are none."""
+    """Recordings without the sought effect, from settings or baseline, and a text on why none exist."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
         file = resolve_recording_path(path)

@@ -99,7 +99,7 @@ def _run_track(
             track_result.write_tracked_points_plot(found, folder.path / "track.png")
             tracked = found.recording_with_points(recording)
             write_recording(tracked, folder.path / "recording.h5")
-            # what was tracked may be elsewhere than the object reaches, where the model says where it stands
+            # what was tracked may be elsewhere than the object reaches, where the model sets its place
             if settings.options.root_placement == "model":
                 own = recording_quality_issues_with_model(run, system, tracked)
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]

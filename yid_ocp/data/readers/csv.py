@@ -192,7 +192,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     table = np.array(numbers).reshape(-1, len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
     if not numeric.any():
-        hint = "see whether it is a table, and what stands between its cells"
+        hint = "check that it is a table, and which delimiter it uses"
         raise DataError("the table has no column of numbers", where=str(path), allowed=_ALLOWED, hint=hint)
     text = ~np.isfinite(table) & (np.array(blank).reshape(table.shape) == 0)
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)

@@ -103,7 +103,8 @@ class CableOptions:
         OptionInfo("how far the rest shape is that of the recording's start; none when absent"),
     ] = None
     has_rest_angle_parameters: Annotated[
-        bool, OptionInfo("whether every bend has a parameter JOINT.rest, its rest angle beside the undeformed shape's")
+        bool,
+        OptionInfo("whether every bend has a parameter JOINT.rest, its rest angle relative to the undeformed shape's"),
     ] = False
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
@@ -161,7 +162,7 @@ def clamped_cable_system(
 
 
 def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
-    text = "rest angle beside the undeformed shape's"
+    text = "rest angle relative to the undeformed shape's"
     bends = (spring.joint_name for spring in item.elastic_joints if spring.deformation == "bend")
     rest = {name: Parameter(f"{name}.rest", 0.0, "rad", -np.pi, np.pi, text) for name in bends}
     added = {name: parameter.symbol for name, parameter in rest.items()}

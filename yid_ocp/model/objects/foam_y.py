@@ -44,7 +44,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
 class FoamY(MountedObjectKind):
-    """The source paper's foam letter Y; without a mount its foot stands where it does in the paper."""
+    """The source paper's foam letter Y; without a mount its foot is placed as in the paper."""
 
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
         "foam_y": InitCommandObjectFactory(4, _init_object)
@@ -66,7 +66,7 @@ model:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the three tubes; nominal joint stiffnesses are those for four links, whatever `links` is."""
+        """Build the three tubes; nominal joint stiffnesses are those for four links, for any value of `links`."""
         n = link_division
         links = self.links * n
         return [

@@ -25,7 +25,9 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 class FlexibleSegmentSettings:
     """Settings of one segment (tube, branch, beam) of rigid links; stiffness and damping are set in `parameters`."""
 
-    length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed beside link_lengths", "m")] = None
+    length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed if link_lengths is given", "m")] = (
+        None
+    )
     mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]
     radius: Annotated[
         float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; or give a section", "m")

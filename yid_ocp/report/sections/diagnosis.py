@@ -106,8 +106,8 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         "plant": "the mechanics, not what sensors read",
         "sensor": "what sensors read, not the mechanics",
         "both": "both the mechanics and what sensors read",
-        "either": "the mechanics or what the effort sensors read, which efforts alone do not tell apart",
-        "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can tell",
+        "either": "the mechanics or what the effort sensors read (efforts alone cannot distinguish them)",
+        "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can show",
     }
     evidence = smoothed.log_evidence
     side = (
@@ -121,9 +121,9 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         "Every coordinate was given an unknown force, every grasp an unknown offset and every measured point an "
         "unknown bias, free to change in time; the fewest groups of them that explain the residual were kept.",
         side,
-        f"A gap would have shown at {noticed}." if noticed else "",
-        f"It would not have shown at {silent}: these motions and sensors cannot tell." if silent else "",
-        f"What the effects leave lies in {', '.join(left)}." if finding.accepted_effects and left else "",
+        f"A gap at {noticed} would have been detected." if noticed else "",
+        f"A gap at {silent} would not have been detected by these motions and sensors." if silent else "",
+        f"The residual gap lies in {', '.join(left)}." if finding.accepted_effects and left else "",
     ]
     maps = []
     for i, trace in enumerate(smoothed.smoothed_unknowns[:_MAX_MAPS]):
@@ -184,9 +184,9 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     if not events:
         return None
     sentences = [
-        "The force beside what the model and the recording have, point by point. Between the grey lines is what a good "
-        "model may be wrong by; windows of events are shaded, and the line is their shape. They are taken out of what "
-        "is judged below, as far as that can be done."
+        "Points: the force in addition to model and recording. Grey lines: the error that a correct model may have. "
+        "Shaded: windows of events, with their shape as a line. Events are excluded from the results below "
+        "where possible."
         if events.force_estimates
         else "",
         *ignored_after_overspeed_messages(events),
@@ -202,7 +202,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         plot = TimePlotData(title, lines, force.t, force.max_likelihood_forces, marked_intervals=spans)
         by_recording.setdefault(force.recording, []).append(plot)
     shown = _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
-    return "What happened beside it", sentences, shown
+    return "Brief disturbances", sentences, shown
 
 
 def _recording_figures(
@@ -261,8 +261,8 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
     rival = law.runner_up
     sentences = [
         law.sentence,
-        "The band is two standard deviations. Between the dotted lines the recordings visit; beyond, the torque is "
-        "taken to stay what it is. Dashed is the nearest law of the library.",
+        "Band: two standard deviations. Dotted lines: range that the recordings cover; beyond it the torque is held "
+        "constant. Dashed: the nearest law of the library.",
         "" if rival is None else f"Next best: {rival[1]} at {rival[0]}, which closes {100 * rival[2]:.3g} %.",
         "law.csv holds the table; an effect {kind: law, location, depends_on, table} puts it into a model.",
     ]
@@ -305,9 +305,9 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     sentences = [
-        "Per cent of the row's trace in the recordings that the column could make as well, beyond what the stiffnesses "
-        "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
-        f"Alike: {listed}." if close else f"No two of them are alike; the closest are {said[0][1]}.",
+        "Percentage of the row's signature that the column can reproduce, beyond the stiffnesses. These motions and "
+        "sensors cannot distinguish a pair with 100 %, for any residual.",
+        f"Similar signatures: {listed}." if close else f"No two signatures are similar; the closest are {said[0][1]}.",
     ]
     figure = figures.confusability_matrix_figure(names, values)
     return "What could be mistaken for what", sentences, [("", figure)]
@@ -365,8 +365,8 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     shown = _before_after_figures(rows, "value", ("fitted without the effects", _EXTENDED_LABEL, ""))
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
-        "A missing effect hides in the parameters that are free: this is how they move when it is added. Bars are two "
-        "standard deviations, cut where they leave the picture.",
-        f"{said}." if said else "None of them moves by more than a tenth.",
+        "Free parameters absorb a missing effect: this is their change when it is added. Bars: two standard "
+        "deviations, cut at the edge of the figure.",
+        f"{said}." if said else "No parameter changes by more than 10 %.",
     ]
     return "What the stiffnesses had absorbed", sentences, shown

@@ -1,4 +1,4 @@
-"""Sections on what a result says and found, on what moved and what was measured, whatever the command."""
+"""Report sections common to all commands: conclusions, estimates, motion and measurements."""
 
 from __future__ import annotations
 
@@ -148,13 +148,16 @@ def _blind_validation(findings: ReportData) -> Iterator[tuple[str, Any]]:
     said = result["confusion"]
     counts = np.array(said["counts"], float).reshape(len(said["true"]), len(said["said"]))
     if counts.size:
-        yield "What was said of what", figures.confusion_matrix_figure(said["true"], said["said"], counts)
+        yield (
+            "Confusion matrix: true and reported effect",
+            figures.confusion_matrix_figure(said["true"], said["said"], counts),
+        )
     kept = interval_and_p_value_calibration_rates(result)
     if any(kept.values()):
-        yield "What is promised, and what is kept", figures.rate_intervals_figure(kept, "promised", "kept", True)
+        yield "Calibration: nominal and observed rates", figures.rate_intervals_figure(kept, "promised", "kept", True)
 
 
-@register_report_section("identifiability", 10, "What can be told")
+@register_report_section("identifiability", 10, "Identifiable parameters")
 def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
     result = findings.result
     if result.get("format") != "yid-identifiability/1":
@@ -178,7 +181,7 @@ def _friction_torque(findings: ReportData) -> Iterator[tuple[str, Any]]:
             yield cloud.joint, figures.scatter_figure(points, words, "friction [N m]")
 
 
-@register_report_section("information", 10, "The motion that tells most")
+@register_report_section("information", 10, "The most informative motion")
 def _informative_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     return _motion_figures(findings, "information")
 
