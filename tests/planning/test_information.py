@@ -266,7 +266,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
     ("more", "words"),
     [
         ({"identify": ("elbow.stifness",)}, ("no parameter 'elbow.stifness'", "did you mean 'elbow.stiffness'?")),
-        ({"identify": ()}, ("no parameter is to be told", "elbow.stiffness")),
+        ({"identify": ()}, ("no parameter to identify is given", "elbow.stiffness")),
         ({"identify": FREE, "discriminate": ("joint_viscous@elbow",)}, ("one of the two",)),
         ({"discriminate": ("joint_viscous@elbow",)}, ("1 effect is to be separated", "two effects or more")),
         ({"discriminate": ("joint_viscous", "joint_coulomb@elbow")}, ("nothing of where", "kind@location")),

@@ -91,7 +91,7 @@ def test_strict_stops_a_run_in_doubt(cli, damaged, tmp_path, left_nothing, comma
 def test_check_lists_what_is_in_doubt(carried_out, damaged):
     done = carried_out("check", damaged(noisy))
     assert "more noise than stated" in done.out
-    assert done.out.splitlines()[-2] == "a run is possible; see what is in doubt"
+    assert done.out.splitlines()[-2] == "a run is possible; see the issues"
 
 
 def test_times_that_are_not_seconds_stop_a_run_at_once(cli, damaged, tmp_path, left_nothing):

@@ -410,8 +410,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
     yield (
-        f"start {result['best'] + 1} of {len(starts)} is the most informative: {best['value'] - best['first']:.3g} nat more than "
-        f"the random motion from which it came{others}"
+        f"start {result['best'] + 1} of {len(starts)} is the most informative: "
+        f"{best['value'] - best['first']:.3g} nat more than the random motion from which it came{others}"
     )
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     yield f"what limits it: {'; '.join(reached)}" if reached else "it reaches no limit"
