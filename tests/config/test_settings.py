@@ -17,6 +17,8 @@ from yid_ocp.model.objects.cable import Cable, CableOptions
 from yid_ocp.problem import ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton
 
+STEP_WORDS = "of the integrator; auto halves 20 ms until half of it hardly changes the first prediction"
+
 
 @pytest.fixture(scope="module")
 def maker(repository):
@@ -34,7 +36,7 @@ def test_the_page_in_the_docs_is_current(repository, maker):
     told = "run  python docs/settings_page.py"
     assert (repository / "docs" / "settings.md").read_text(encoding="utf-8") == page, told
     for line in (
-        "| `time_step` | of the integrator | a number above 0 up to 0.1 [s] | `0.01` |",
+        f"| `time_step` | {STEP_WORDS} | a number above 0 up to 0.1 or auto [s] | `0.01` |",
         "## solver, name: multiple_shooting",
         "## model.object.segments.NAME",
         "| `mass` | mass of the whole segment | a number above 0 [kg] | needed |",
@@ -63,7 +65,8 @@ def test_the_schema_accepts_every_configuration(repository, rules):
     for file in files:
         rules.validate(YAML(typ="safe", pure=True).load(file.read_text()))
     described = rules.schema["properties"]["problem"]["properties"]["time_step"]
-    assert (described["description"], described["default"]) == ("of the integrator [s]", 0.01)
+    assert (described["description"], described["default"]) == (f"{STEP_WORDS} [s]", 0.01)
+    assert described["anyOf"][1]["const"] == "auto"
 
 
 @pytest.mark.parametrize(
