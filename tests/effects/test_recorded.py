@@ -354,6 +354,9 @@ def test_the_clock_of_any_group_of_points_may_be_late_or_early(driven):
     assert [place for kind, place in found if kind == "camera_latency"] == ["points_mocap"]
     late = make_effect("camera_latency", "points_mocap", driven.system)
     assert late.parameters["camera_latency@points_mocap.delay"].lower < 0
+    # points of the arm's own frames need none of `System.point_frames`
+    bare = replace(driven.system, point_frames=())
+    assert make_effect("camera_latency", "points_mocap", bare).label == "camera_latency@points_mocap"
     assert float(ca.DM(late.added_channel_delay("points_arm.w_T2", False))) == 0
     symbol = late.added_channel_delay("points_mocap.w_T2", False)
     assert ca.is_equal(symbol, late["delay"])

@@ -33,8 +33,8 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     `ModelError` where the system has no such place for it.
     """
     places = EFFECTS[kind].possible_locations(system)
-    of_points = location.partition("_")[0] == "points"
-    if location not in places and not (EFFECTS[kind].is_at_point_groups and of_points and system.point_frames):
+    # points may be of any frame, those of the arm included, which are not among `system.point_frames`
+    if location not in places and not (EFFECTS[kind].is_at_point_groups and location.partition("_")[0] == "points"):
         said = {"allowed": "nothing in this system", "hint": "leave it out"}
         said = unknown_name_error_arguments(location, places) if places else said
         raise ModelError(f"{kind} does not fit '{location}'", where=f"{kind}@{location}", **said)
