@@ -349,6 +349,19 @@ def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulu
     assert "warning: double_pendulum.urdf cannot be compared, Pinocchio does not read it: no such joint" in done.out
 
 
+def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(cli, tmp_path):
+    pytest.importorskip("mujoco")
+    body = (
+        "<body><joint name='j' axis='0 1 0'/><geom type='capsule' fromto='0 0 0 0 0 -0.3' size='0.02' mass='1'/></body>"
+    )
+    (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    (tmp_path / "arm.yaml").write_text("model: {robot: arm.xml, arms: {joints: [j], mode: driven}}\n")
+    done = cli("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
+    assert done.code == 0, done.err
+    assert "cannot be compared" not in done.out
+    assert "the built model: mass matrix, weight and inverse dynamics are Pinocchio's" in done.out
+
+
 def test_what_is_simulated_is_exported_and_imported(cli, pendulum_data, tmp_path):
     recording = read_recording(pendulum_data.folder / "estimate.h5")
     assert recording.joint_names == ("shoulder", "elbow")

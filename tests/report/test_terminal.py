@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.inference.uncertainty import VERDICT_SENTENCE_TEXTS, VERDICT_TABLE_TEXTS, parameter_verdict
 from yid_ocp.report import diagnosis_summaries, summaries, terminal  # noqa: F401, they register
-from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
+from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable, names_by_pattern_text
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
 BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True, "worse_than_guess": []}
@@ -248,3 +248,18 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     section = {"goal": "information", "discriminate": ["density@T3", "point_mass@w_T3"], "parameter_run": "runs/mine"}
     command = next(line for line in told("yid-diagnosis/2", result | {"next_plan": section}) if "yid-ocp plan" in line)
     assert "'plan.discriminate=[density@T3, point_mass@w_T3]'" in command
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ([f"joint_coulomb@joint{i}.tau_c" for i in range(1, 8)], "joint_coulomb@joint1..7.tau_c"),
+        (["T1.bend", "T2.bend"], "T1.bend, T2.bend"),
+        (["j1.damping", "tip.mass", "j3.damping", "j2.damping", "j5.damping"], "j1..3.damping, tip.mass, j5.damping"),
+        ([f"w{i}.x{j}" for i in range(2) for j in range(9, 12)], "w0.x9..11, w1.x9..11"),
+        (["j01.c", "j02.c", "j03.c", ""], "j01.c, j02.c, j03.c, "),
+        ([], ""),
+    ],
+)
+def test_names_with_consecutive_numbers_are_told_by_their_pattern(names, said):
+    assert names_by_pattern_text(names) == said

@@ -26,6 +26,7 @@ from yid_ocp.report.terminal import (
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
+    names_by_pattern_text,
     parameter_bounds_text,
     register_summary,
     scale_and_unit_with_metres_as_mm,
@@ -196,16 +197,16 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     if found:
         yield (
             f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value or, near zero, of "
-            f"their usual size: {', '.join(found)}"
+            f"their usual size: {names_by_pattern_text(found)}"
         )
     if lost:
-        yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {', '.join(lost)}"
+        yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {names_by_pattern_text(lost)}"
     if weak:
-        yield f"only {VERDICT_TABLE_TEXTS['weak']}: {', '.join(weak)}"
+        yield f"only {VERDICT_TABLE_TEXTS['weak']}: {names_by_pattern_text(weak)}"
         if any(free[name]["interval"] is None for name in weak):
             yield "`yid-ocp identifiability` gives intervals that need not be symmetric"
     if bound:
-        yield f"the search ended at a bound of {', '.join(bound)}: what is beyond it was not tried"
+        yield f"the search ended at a bound of {names_by_pattern_text(bound)}: what is beyond it was not tried"
 
 
 @register_summary("yid-compare/1")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -251,3 +252,27 @@ def aligned_table_lines(rows: TableRows) -> list[str]:
     widths = [max(map(len, column)) for column in columns]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]
     return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
+
+
+def names_by_pattern_text(names: Sequence[str]) -> str:
+    """Names in one line; three or more that differ by one consecutive number are one, as `joint_coulomb@joint1..7`."""
+    parts = [re.split(r"(\d+)", name) for name in names]
+    taken: set[int] = set()
+    said = []
+    for i, own in enumerate(parts):
+        if i in taken:
+            continue
+        longest, text = [i], names[i]
+        for at in range(1, len(own), 2):
+            run = [i]
+            for number in range(int(own[at]) + 1, int(own[at]) + len(names)):
+                following = [*own[:at], str(number), *own[at + 1 :]]
+                if following not in parts:
+                    break
+                run.append(parts.index(following))
+            if len(run) > max(2, len(longest)) and not taken.intersection(run):
+                end = parts[run[-1]][at]
+                longest, text = run, "".join([*own[: at + 1], "..", end, *own[at + 1 :]])
+        taken.update(longest)
+        said.append(text)
+    return ", ".join(said)

@@ -14,6 +14,7 @@ from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio,
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, SensorChannelGroup
 from yid_ocp.display import Progress
+from yid_ocp.files import check_input_file
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
@@ -89,10 +90,10 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
         known = [*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]
         posture[known] = first.initial_known_coordinates
     found = {"built": compare_system_with_pinocchio(system, theta, posture)}
-    if run.model.robot is not None:
-        # the file's own numbers, not those that settings or effects put in their place
-        read = urdf_reader_options(run)
-        path, gravity = input_files_by_name(run)[run.model.robot], np.array(run.model.gravity, float)
+    path = input_files_by_name(run)[run.model.robot] if run.model.robot is not None else None
+    if path is not None and b"<mujoco" not in check_input_file(path).read_bytes():
+        # of a URDF file, which Pinocchio reads: its own numbers, not those that settings or effects put in their place
+        read, gravity = urdf_reader_options(run), np.array(run.model.gravity, float)
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
