@@ -226,7 +226,7 @@ def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(ben
     assert (told["location"], told["recording"]) == ("elbow", "run_1")
     assert told["impulse"] == pytest.approx(0.1, rel=0.15)
     assert finding.to_dict()["not_judged"] == []
-    assert "One event stands beside all this" in finding.summary
+    assert "One brief local disturbance was found and excluded" in finding.summary
 
 
 def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_everywhere(bench, monkeypatch):
