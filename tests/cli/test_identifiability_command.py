@@ -10,10 +10,10 @@ from yid_ocp.errors import SolverError, WorkerError
 from yid_ocp.parallel import InlineExecutor
 from yid_ocp.workflow import identifiability as identifiability_command
 from yid_ocp.workflow.build import build_system, system_with_second_arm_holding_object
-from yid_ocp.workflow.identifiability import _IdentifiabilityOptions, run_identifiability
+from yid_ocp.workflow.identifiability import IdentifiabilityOptions, run_identifiability
 
 VERDICTS = {"identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"}
-EVERY = _IdentifiabilityOptions(interval_parameters="all")
+EVERY = IdentifiabilityOptions(interval_parameters="all")
 COMMANDS, NO_REPORT = ("solve", "identifiability", "compare"), ("output.write_report=false",)
 PARTS = {
     "": {"format", "status", "parameters", "directions", "what_if", "inputs", "versions", "correlations"},
@@ -153,7 +153,7 @@ def run(repository):
 
 def test_workers_find_what_one_process_does(run, tmp_path):
     known = {"start_knowledge": "unknown", "grasp_offset_std": 0.01}
-    asked = _IdentifiabilityOptions(interval_parameters="all", rank_changes=True, **known)
+    asked = IdentifiabilityOptions(interval_parameters="all", rank_changes=True, **known)
     alone = run_identifiability(run, tmp_path / "alone", options=asked)
     shared = run_identifiability(run, tmp_path / "shared", options=asked, workers=InlineExecutor())
     assert read(shared) == read(alone)

@@ -15,7 +15,7 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.report.diagnosis_summaries import _planning_command
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.plan import (
-    compile_step_for_planning,
+    _compile_step_for_planning,
     discrimination_plan_settings,
     identified_parameters_with_covariance,
     run_plan,
@@ -110,7 +110,7 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
 def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_path):
     folder = solved(tmp_path / "solved", 4.0, 0.25)
     run = load_config(config, [f"plan.parameter_run={folder}"])
-    step = compile_step_for_planning(run)
+    step = _compile_step_for_planning(run)
     theta, known, source = identified_parameters_with_covariance(run, step)
     assert theta[step.system.parameters.index("elbow.stiffness")] == 4.0
     assert known.parameter_names == ("elbow.stiffness",)

@@ -39,7 +39,7 @@ from yid_ocp.workflow.solve import solve_and_decide_cable_memory
 
 
 @dataclass(frozen=True)
-class _IdentifiabilityOptions:
+class IdentifiabilityOptions:
     """Options of an identifiability analysis beyond the run's settings.
 
     It judges where the solver ends or at the initial values, without solving. Initial states are as the settings have
@@ -70,7 +70,7 @@ class _IdentifiabilityOptions:
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `identifiability` and return its exit code."""
     names = [name for name in arguments.intervals.split(",") if name]
-    asked = _IdentifiabilityOptions(
+    asked = IdentifiabilityOptions(
         evaluation_point="initial" if arguments.initial else "solution",
         start_knowledge="unknown" if arguments.unknown_start else "assumed",
         grasp_offset_std=GRASP_OFFSET_PRIOR_STD if arguments.unknown_grasp else None,
@@ -85,7 +85,7 @@ def run_identifiability(
     run: RunSettings,
     out: str | Path | None = None,
     progress: Progress = NULL_PROGRESS,
-    options: _IdentifiabilityOptions | None = None,
+    options: IdentifiabilityOptions | None = None,
     workers: WorkerConfig | Executor | None = None,
 ) -> CommandOutcome[IdentifiabilityResult | None]:
     """Solve, analyse identifiability and write the run folder.
@@ -93,7 +93,7 @@ def run_identifiability(
     Where the solver failed there is no analysis, and the run folder holds the reason. `workers` work out intervals, one
     parameter a task, and the experiments of `what_if`; this process when absent.
     """
-    asked = options or _IdentifiabilityOptions()
+    asked = options or IdentifiabilityOptions()
     with atomic_run_folder(run, out, "identifiability") as folder:
         folder.record_run_start(run, "identifiability", asked._command_line_flags())
         progress.begin_stage("building the model and its compiled step")
@@ -155,7 +155,7 @@ def _identifiability_result(
     information: IdentifiabilityResult | None,
     unknown: IdentifiabilityResult | None,
     ranking: what_if.ExperimentRanking | None,
-    asked: _IdentifiabilityOptions,
+    asked: IdentifiabilityOptions,
 ) -> dict[str, Any]:
     result: dict[str, Any] = {
         "format": "yid-identifiability/1",

@@ -52,7 +52,7 @@ def run_plan(
         if run.plan.goal == "information":
             found, source = _plan_from_settings(run, progress)
         else:
-            step = compile_step_for_planning(run)
+            step = _compile_step_for_planning(run)
             theta, known, source = identified_parameters_with_covariance(run, step)
             options = replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))
             with add_setting_location_to_errors(run, "plan"):
@@ -78,7 +78,7 @@ def run_plan(
 run_from_arguments = command_with_settings(run_plan)
 
 
-def compile_step_for_planning(run: RunSettings) -> Step:
+def _compile_step_for_planning(run: RunSettings) -> Step:
     """The compiled step of a run with prescribed arms, for planning."""
     model = replace(run.model, arms=replace(run.model.arms, mode="prescribed"))
     recordings = run.recordings if run.model.robot is None else replace(run.recordings, estimate=(), held_out=())
