@@ -48,8 +48,8 @@ _NEXT_EXPERIMENT_TEXTS = {
     "vary": "Vary {aspects} over a wider range.",
     "other": "Record other motions, faster and larger.",
     "unknown": "Move {place} alone, slowly and fast, and hold it still in several configurations.",
-    "unseen": "None needed: no gap was found. These motions cannot reveal {unseen}.",
-    "no_gap": "None needed: no gap was found.",
+    "unseen": "None needed: no relevant gap was found. These motions cannot reveal {unseen}.",
+    "no_gap": "None needed: no relevant gap was found.",
     "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
 }
 """Texts of the recommended next experiment, by situation."""
@@ -157,7 +157,7 @@ def _gap(finding: DiagnosisResult) -> str:
     if finding.verdict == "insufficient_data":
         return f"The data are insufficient: {finding.message}"
     if finding.verdict == "no_gap":
-        return f"There is no significant gap ({sizes}; p = {p:.2g})."
+        return f"There is no relevant gap ({sizes}; p = {p:.2g})."
     best = min(finding.candidate_scores, key=lambda score: score.p_value, default=None)
     if residuals_exceed_noise((first, held), limits.null_test_limits) or best is None:
         return f"The gap is real ({sizes}; p {_p_value_relation(p)})."
