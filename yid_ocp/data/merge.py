@@ -112,10 +112,10 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:
         spans = f"{first.name} has {begin:.10g} to {end:.10g} s, {other.name} {start:.10g} to {stop:.10g} s"
-        what = f"the clocks of {first.name} and {other.name} have nothing in common"
+        what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
         hint = f"--clock-offset {other.name}=SECONDS adds to its times; {begin - start:.10g} lets both begin at once"
         raise DataError(what, where=spans, allowed="clocks that overlap, or motion that both saw", hint=hint)
-    why = "the clocks have nothing in common, and there its points follow the angles best "
+    why = "the recording times do not overlap; with this offset the points follow the joint angles best "
     why += f"({best.explained:.1%} of the motion), to some hundredths of a second, which are left to `check`"
     return begin - start - best.lag, why
 

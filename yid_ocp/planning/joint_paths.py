@@ -351,7 +351,7 @@ def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, gues
     """
     rest = EquilibriumSolver(step).solve(configuration, theta, guess=guess)
     if not rest.is_converged:
-        allowed, where = "a posture at which every grasp holds the object at rest", "plan.start_joint_positions"
+        allowed, where = "joint positions at which every grasp holds the object at rest", "plan.start_joint_positions"
         hint = f"give {where} or a recording, which begins where the object is held; or correct model.grasp"
         raise ModelError(f"the motion cannot begin: {rest.message}", where=where, allowed=allowed, hint=hint)
     return rest

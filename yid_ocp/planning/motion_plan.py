@@ -138,8 +138,8 @@ def _place(options: PlanOptions, begin: Array) -> Array:
         allowed, where = "one of place and shift", "plan.target_position"
         raise ConfigError(f"{said} where the point is to arrive", where=where, allowed=allowed, hint=hint)
     if options.goal == "path" and not options.waypoint_offsets_from_start:
-        what, where = "the path has no places on the way", "plan.waypoint_offsets_from_start"
-        raise ConfigError(what, where=where, allowed="one or more shifts [m]")
+        what, where = "the path has no waypoints", "plan.waypoint_offsets_from_start"
+        raise ConfigError(what, where=where, allowed="one or more offsets from the start [m]")
     if options.target_position is not None:
         return np.array(options.target_position, float)
     return begin + np.array(options.target_offset_from_start, float)

@@ -277,10 +277,14 @@ def check_free_parameters(system: System, free: Sequence[str], options: ProblemO
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)
     if len(set(free)) != len(free):
-        raise ConfigError("a free parameter is named twice", where=", ".join(free))
+        raise ConfigError("a free parameter is listed twice", where=", ".join(free))
     for name in (*options.local_parameters, *options.prior_stds):
         if name not in free:
-            raise ConfigError(f"'{name}' is not free", hint=nearest_name_hint(name, free), where="local or priors")
+            raise ConfigError(
+                f"the parameter '{name}' has a prior or is local, but is not free",
+                hint=nearest_name_hint(name, free),
+                where="local or priors",
+            )
 
 
 def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:

@@ -61,7 +61,7 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     lines = {
         "gap": ("gap seen", 0.95),
         "first": ("kind and place first", 1.0),
-        "right": ("alone or in a set of three", 1.05),
+        "right": ("named first, or in a set of at most three", 1.05),
     }
     sizes = {
         label: {shift * float(size): own[key] for size, own in result["detection_intervals"].items()}

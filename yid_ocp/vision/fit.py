@@ -72,7 +72,10 @@ class ShapeFitOptions:
         PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
     ] = 0.006
     correlated_points: Annotated[
-        PositiveFloat, OptionInfo("of how many points the errors are alike; divides the weight of all points together")
+        PositiveFloat,
+        OptionInfo(
+            "number of neighbouring points whose errors are correlated; the total weight of the points is divided by it"
+        ),
     ] = 8.0
     grasp_position_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation between a gripper, by its joint angles, and what it holds", "m")

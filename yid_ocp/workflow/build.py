@@ -389,7 +389,7 @@ def _with_extra_frames(
         if owner is not None:
             tree = made[owner].mechanism
         elif said.marker_reference_pose:
-            what = f"'{name}' is placed by `marker_reference_pose`, but sits on nothing of the object"
+            what = f"'{name}' is placed by `marker_reference_pose`, but is attached to no frame of the object"
             allowed = "a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%"
             raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame")
         else:

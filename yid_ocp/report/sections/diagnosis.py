@@ -228,7 +228,11 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         entries[name] = (closed, promised.get(name, 0.0))
     if not entries:
         return None
-    unit = "as a part of the excess over noise" if percent else "as a fall of the sum of squares; 7 is chance at 1 %"
+    unit = (
+        "as a part of the excess over noise"
+        if percent
+        else "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
+    )
     promise = f"hat each promises to first order where the model was fitted, {unit}."
     sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
