@@ -222,7 +222,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"start_joint_positions": {"sholder": 0.5}}, ("'sholder' is no joint that moves", "did you mean 'shoulder'?")),
         ({"start_joint_positions": {}}, ("says nothing of shoulder",)),
         ({"start_joint_positions": None}, ("nothing says where the motion begins",)),
-        ({"goal": "path"}, ("no places on the way",)),
+        ({"goal": "path"}, ("no waypoints",)),
         ({"goal": "box"}, ("there is no box",)),
         ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "from 1 up to 0 m")),
         ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, ("mm outside the box along z", "plan.frames_in_box")),

@@ -381,10 +381,10 @@ def test_a_problem_cannot_be_changed_through_its_parameters(make):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"free": ("elbow.stiffness", "elbow.stiffness")}, "named twice"),
+        ({"free": ("elbow.stiffness", "elbow.stiffness")}, "listed twice"),
         ({"free": ("elbow.stiff",)}, "elbow.stiffness"),
-        ({"local_parameters": ("elbow.damping",)}, "'elbow.damping' is not free"),
-        ({"prior_stds": {"elbow.damping": 0.1}}, "'elbow.damping' is not free"),
+        ({"local_parameters": ("elbow.damping",)}, "'elbow.damping' has a prior or is local, but is not free"),
+        ({"prior_stds": {"elbow.damping": 0.1}}, "'elbow.damping' has a prior or is local, but is not free"),
         ({"values": {"elbow.stiffness": -1.0}}, "elbow.stiffness"),
     ],
 )

@@ -76,7 +76,7 @@ def test_every_recording_has_its_own_places_of_markers_in_the_frame_that_carries
     [
         ((), blank(None), DataError, "where its markers were"),
         ((), blank(name="elsewhere"), ConfigError, "'mark' is no point"),
-        (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "sits on nothing of the object"),
+        (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "attached to no frame of the object"),
         (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),
         ((JAW.replace("z_axis_point_name: b", "z_axis_point_name: a"),), None, ConfigError, "one point for both ends"),
         ((JAW, "model.object.mount.parent_frame=jaw"), None, ConfigError, "moves"),
