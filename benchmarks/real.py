@@ -30,7 +30,7 @@ _SERVO = RECORDINGS / "servo_pendulum"
 
 @dataclass(frozen=True)
 class Question:
-    """A diagnosis of a configuration with settings, the quantity that is asked and its true value or range."""
+    """A diagnosis of a configuration with settings, the quantity of interest, and its true value or range."""
 
     configuration: str
     needs: str  # folder of the recordings

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
@@ -274,8 +275,7 @@ def _composed_with_laws(
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
-    for margin in KEPT_HELD_OUT_DURATION_FRACTIONS[:1]:
-        composed, _ = composed.truncate_failing_held_out_recordings(start, margin)
+    composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_HELD_OUT_DURATION_FRACTIONS[0])
     return composed.whitened_at(last.values) if composed.problem.has_process_noise else composed
 
 
@@ -340,12 +340,7 @@ def _prior_precision(law: Law, roughness_weight: float) -> Array:
             even = (np.eye(count) + np.eye(count)[::-1]) / (_EVEN_STD_RATIO * width)
             block += even.T @ even
         blocks.append(block)
-    size, made, at = sum(map(len, blocks)), np.zeros((sum(map(len, blocks)),) * 2), 0
-    for block in blocks:
-        made[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    assert at == size
-    return made
+    return np.asarray(scipy.linalg.block_diag(*blocks), float)
 
 
 def _refitted(
@@ -354,10 +349,7 @@ def _refitted(
     """The model with a law, its values at the knots under their prior."""
     known = composed.problem.options.multivariate_prior
     names = (*known.parameter_names, *family.law.parameters.names)
-    covariance = np.zeros((len(names),) * 2)
-    count = len(known.parameter_names)
-    covariance[:count, :count] = known.covariance
-    covariance[count:, count:] = np.linalg.inv(family.precision)
+    covariance = scipy.linalg.block_diag(known.covariance, np.linalg.inv(family.precision))
     prior = MultivariateGaussianPrior(names, covariance)
     with_prior = replace(composed, problem=composed.problem.with_multivariate_prior(prior))
     effects: tuple[EffectBase, ...] = (*before.effects, family.law)

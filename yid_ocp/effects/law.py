@@ -226,7 +226,9 @@ def make_law(location: str, system: System, tables: Sequence[LawTable], torque_s
     label, possible = f"law@{location}", law_quantities_at_location(system, location)
     if not possible:
         places = (*segment_names(system), *arm_joint_names(system))
-        raise ConfigError(f"there is no place '{location}' for a law", where=label, **_allowed(location, places))
+        raise ConfigError(
+            f"there is no place '{location}' for a law", where=label, **unknown_name_error_arguments(location, places)
+        )
     definitions, entries = [], []
     for table in tables:
         if table.quantity not in possible:
@@ -240,10 +242,6 @@ def make_law(location: str, system: System, tables: Sequence[LawTable], torque_s
     inner = {f"{label}.time": ca.SX.sym(f"{label}.time")} if any(t.quantity == "time" for t in tables) else {}
     knots = {table.quantity: np.asarray(table.knots, float) for table in tables}
     return Law("law", location, Parameters(entries), inner, tuple(definitions), (), knots)
-
-
-def _allowed(name: str, known: Sequence[str]) -> dict[str, str]:
-    return dict(unknown_name_error_arguments(name, known))
 
 
 def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ...]:
