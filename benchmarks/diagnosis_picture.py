@@ -1,6 +1,6 @@
 """Draw a diagnosis in one picture: the gap on a held-out motion, where it lies and when, which effect makes it.
 
-yid-ocp diagnose --out RUN && python benchmarks/diagnosis_picture.py RUN docs/diagnosis.png
+yid-ocp diagnose --out RUN && python benchmarks/diagnosis_picture.py RUN docs/pictures/diagnosis.png
 """
 
 from __future__ import annotations

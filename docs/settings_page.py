@@ -1,4 +1,4 @@
-"""Makes `settings.md`: every setting with meaning, allowed values and default, and an example of every section."""
+"""Makes `reference/settings.md`: every setting with meaning, allowed values, default, and an example a section."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HEAD = """\
 Every key of a configuration file. NAME stands for a name of yours or of the model. Units are SI and stand in brackets;
 `needed` keys have no default, and where none is shown it is nothing at all (`null`). Any key may be set on the command
 line as well, `--set problem.time_step=0.005`; a section merges with what stands there, key by key, and an empty one
-empties it. How to choose links, time step and split: [choosing.md](choosing.md); recordings and their units:
+empties it. How to choose links, time step and split: [choosing.md](../howto/choosing.md); recordings and their units:
 [recordings.md](recordings.md). This page is made from the code; CONTRIBUTING.md has the command.
 """
 
@@ -262,7 +262,7 @@ plan:
 output: {runs_folder: /data/runs, write_report: false}
 """,
 }
-"""YAML from the top of a file, by the title of its section in docs/settings.md."""
+"""YAML from the top of a file, by the title of its section in docs/reference/settings.md."""
 
 if __name__ == "__main__":
-    Path(__file__).with_name("settings.md").write_text(page(), encoding="utf-8")
+    (Path(__file__).parent / "reference" / "settings.md").write_text(page(), encoding="utf-8")

@@ -1,22 +1,25 @@
-"""What the site has beside the pages in this folder: a start page, and a page for every public object."""
+"""What the site has beside the pages of the four shelves: a start page, and a page for every public object."""
 
 from __future__ import annotations
 
+import posixpath
 import re
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 import yid_ocp
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SECTIONS = {
-    "Start": ("index.md", "tutorial.md", "choosing.md", "recordings.md", "settings.md", "real_data.md"),
-    "Questions": ("diagnosis.md", "identifiability.md", "comparison.md", "plan.md", "vision.md", "servo.md", "law.md"),
-    "Tools": ("export.md", "extending.md", "inspection.md", "program.md", "reports.md", "workers.md"),
-    "Inside": ("theory.md", "architecture.md", "glossary.md"),
-}
+SHELVES = {"Start": "start", "How-to": "howto", "Explain": "explain", "Reference": "reference"}
+
+
+def pages(shelf: str) -> list[str]:
+    """Pages of one shelf, in the order of the index `docs/README.md`."""
+    index = (REPOSITORY / "docs" / "README.md").read_text(encoding="utf-8")
+    return re.findall(rf"^\| \[\w+\.md\]\(({shelf}/\w+\.md)\)", index, re.MULTILINE)
 
 
 def chapters() -> list[str]:
@@ -33,7 +36,7 @@ def public() -> list[str]:
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Fill the navigation."""
-    config.nav = [{title: list(pages)} for title, pages in SECTIONS.items()]
+    config.nav = ["index.md", *({title: pages(shelf)} for title, shelf in SHELVES.items())]
     config.nav.append({"Design": chapters()})
     config.nav.append({"Python": [{name: f"api/{name}.md"} for name in public()]})
     return config
@@ -53,7 +56,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: object) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Files of the repository that are no pages are named, not linked."""
-    outside = r"\[([^\]]*)\]\((?!https?:|#|[\w/-]+\.(?:md|png)(?:#[\w-]+)?\))[^)]*\)"
-    return re.sub(outside, r"\1", markdown)
+
+    def kept(link: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(page.file.src_uri), link[2].split("#")[0]))
+        known = re.fullmatch(r"(?!\.\./)[\w/-]+\.(md|png|gif|svg|webp)", target) and target != "README.md"
+        return link[0] if known or link[2].startswith(("https:", "http:", "#")) else link[1]
+
+    return re.sub(r"\[([^\]]*)\]\(([^)]*)\)", kept, markdown)

@@ -42,20 +42,20 @@ class YidError(Exception):
 class ConfigError(YidError):
     """The configuration file, or a value set on top of it, is invalid."""
 
-    _usual_allowed = "keys and values as docs/settings.md lists them"
+    _usual_allowed = "keys and values as docs/reference/settings.md lists them"
 
 
 class DataError(YidError):
     """A recording or another input file is missing, malformed or does not fit the model."""
 
-    _usual_allowed = "a whole file as docs/recordings.md describes it"
+    _usual_allowed = "a whole file as docs/reference/recordings.md describes it"
     _usual_hint = "correct the file, or record it again"
 
 
 class ModelError(YidError):
     """The mechanical model cannot be built as described."""
 
-    _usual_allowed = "a model as docs/choosing.md describes it"
+    _usual_allowed = "a model as docs/howto/choosing.md describes it"
     _usual_hint = "correct the robot's file, or the section `model`"
 
 

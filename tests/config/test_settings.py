@@ -22,7 +22,7 @@ STEP_WORDS = "of the integrator; auto halves 20 ms until half of it hardly chang
 
 @pytest.fixture(scope="module")
 def maker(repository):
-    """The script that makes `docs/settings.md`."""
+    """The script that makes `docs/reference/settings.md`."""
     return SimpleNamespace(**runpy.run_path(str(repository / "docs" / "settings_page.py")))
 
 
@@ -34,7 +34,7 @@ def rules():
 def test_the_page_in_the_docs_is_current(repository, maker):
     page = maker.page()
     told = "run  python docs/settings_page.py"
-    assert (repository / "docs" / "settings.md").read_text(encoding="utf-8") == page, told
+    assert (repository / "docs" / "reference" / "settings.md").read_text(encoding="utf-8") == page, told
     for line in (
         f"| `time_step` | {STEP_WORDS} | a number above 0 up to 0.1 or auto [s] | `0.01` |",
         "## solver, name: multiple_shooting",

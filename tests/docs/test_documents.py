@@ -30,7 +30,13 @@ from yid_ocp.workflow.build import build_system
 
 @pytest.fixture
 def page(repository):
-    return lambda name: (repository / "docs" / f"{name}.md").read_text(encoding="utf-8")
+    """Text of a page by its name alone."""
+
+    def text(name: str) -> str:
+        [file] = repository.glob(f"docs/*/{name}.md")
+        return file.read_text(encoding="utf-8")
+
+    return text
 
 
 @pytest.fixture
@@ -64,7 +70,7 @@ def test_commands_exist(page, repository, name):
 def test_names_in_the_pages_exist(repository):
     """What stands in backticks with an underscore is a name of the code, of a setting or of a file."""
     # attributes of a group are its quantity and an ending, and one page makes an effect of its own
-    known = {"current_bias_std", "joint_churning", *(file.stem for file in repository.glob("docs/*"))}
+    known = {"current_bias_std", "joint_churning", *(file.stem for file in repository.glob("docs/**/*"))}
     for pattern in ("yid_ocp/**/*.py", "yid_ocp/**/*.html", "configs/*.yaml", "benchmarks/**/*.py", "tests/**/*.py"):
         for file in repository.glob(pattern):
             known |= {file.stem, *re.findall(r"\w+", file.read_text(encoding="utf-8"))}
@@ -196,7 +202,7 @@ def test_the_notebook_runs_and_shows_what_it_was_made_with(repository, monkeypat
     pytest.importorskip("mujoco")
     path = [str(repository), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, path)))
-    kept = nbformat.read(repository / "docs" / f"{name}.ipynb", as_version=4)
+    kept = nbformat.read(repository / "docs" / "start" / f"{name}.ipynb", as_version=4)
     nbformat.validate(kept)
     made = nbformat.from_dict(kept)
     nbclient.NotebookClient(made, timeout=600, kernel_name="python3").execute(cwd=str(repository))
@@ -211,6 +217,35 @@ def test_the_notebook_runs_and_shows_what_it_was_made_with(repository, monkeypat
         assert all("<table" in text for text in shown)
 
 
+# -- links and the site -----------------------------------------------------------------------------------------------
+
+
+def anchors(text: str) -> set[str]:
+    """Anchors of the headings of a page."""
+    heads = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
+
+
+def test_every_relative_link_leads_somewhere(repository):
+    """Links of all pages and notebooks, with their anchors, and pages that code and settings name."""
+    lost = []
+    for file in [*repository.glob("*.md"), *repository.glob("docs/**/*.md"), *repository.glob("docs/**/*.ipynb")]:
+        text = re.sub(r"```.*?```", "", file.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for link in re.findall(r"\]\((?!https?:|mailto:)([^)\s]+)\)", text):
+            path, _, anchor = link.partition("#")
+            target = file.parent / path if path else file
+            if not target.exists() or (anchor and anchor not in anchors(target.read_text(encoding="utf-8"))):
+                lost.append((file.name, link))
+    files = [path for path in repository.glob("*.*") if path.is_file()]
+    for folder in ("docs", "yid_ocp", "tests", "benchmarks", "configs"):
+        files += repository.glob(f"{folder}/**/*.*")
+    for file in files:
+        if file.suffix in (".py", ".c", ".md", ".yaml", ".yml", ".toml", ".cff"):
+            named = re.findall(r"(?<![\w/])docs/[\w/]+\.(?:md|py|ipynb|png|gif)\b", file.read_text(encoding="utf-8"))
+            lost += [(file.name, name) for name in named if not (repository / name).exists()]
+    assert not lost
+
+
 @pytest.fixture
 def site(repository):
     """The hooks of the site."""
@@ -220,15 +255,19 @@ def site(repository):
 
 
 def test_every_page_and_every_public_object_has_its_place(repository, site) -> None:
-    listed = {page for pages in site.SECTIONS.values() for page in pages}
-    assert listed == {path.name for path in (repository / "docs").glob("*.md")} | {"index.md"}
+    for folder in site.SHELVES.values():
+        there = (repository / "docs" / folder).glob("*.md")
+        assert set(site.pages(folder)) == {f"{folder}/{path.name}" for path in there}
+    shelves = {path.name for path in (repository / "docs").iterdir() if path.is_dir()}
+    assert shelves == {*site.SHELVES.values(), "design", "pictures"}
     assert set(site.public()) == set(yid_ocp.__all__) - {"__version__"}
 
 
 def test_links_out_of_the_folder_become_words(site) -> None:
-    text = "[a](../configs/x.yaml), [b](theory.md#start), [c](https://a.org), [d](#here), [e](LICENSE), ![f](f.png)"
-    said = "a, [b](theory.md#start), [c](https://a.org), [d](#here), e, ![f](f.png)"
-    assert site.on_page_markdown(text) == said
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="howto/plan.md"))
+    kept = "[b](../explain/theory.md#start), [c](https://a.org), [d](#here), ![f](../pictures/f.gif)"
+    text = f"[a](../../configs/x.yaml), [e](../../SECURITY.md), [g](../README.md), [h](../start/day.ipynb), {kept}"
+    assert site.on_page_markdown(text, page) == f"a, e, g, h, {kept}"
 
 
 @pytest.mark.slow

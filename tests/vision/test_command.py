@@ -162,13 +162,13 @@ def test_a_flag_keeps_the_told_pose(repository):
 
 @pytest.fixture(scope="module")
 def text(repository):
-    return (repository / "docs" / "vision.md").read_text(encoding="utf-8")
+    return (repository / "docs" / "howto" / "vision.md").read_text(encoding="utf-8")
 
 
 def test_the_example_runs(text, repository, tmp_path, monkeypatch, capsys):
     [block] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(repository)
-    exec(compile(block.replace('"tracked.h5"', repr(str(tmp_path / "tracked.h5"))), "docs/vision.md", "exec"), {})
+    exec(compile(block.replace('"tracked.h5"', repr(str(tmp_path / "tracked.h5"))), "docs/howto/vision.md", "exec"), {})
     assert read_recording(tmp_path / "tracked.h5").points[-1].names == ("w_T1", "w_T3")
     assert "clock offset" in capsys.readouterr().out
 

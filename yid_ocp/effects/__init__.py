@@ -1,6 +1,6 @@
 """The library of unmodelled effects: kinds, their possible locations, and `make_effect`; a new kind is one file.
 
-A kind's equation, quantities, units, bounds and ranges stand at its class; `docs/extending.md` shows a new one.
+A kind's equation, quantities, units, bounds and ranges stand at its class; `docs/howto/extending.md` shows a new one.
 """
 
 from __future__ import annotations

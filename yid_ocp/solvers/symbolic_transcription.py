@@ -71,7 +71,7 @@ def transcribe(
     NonlinearProgram
         With the variables `theta`, and of every recording `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]`
         and `lam[NAME]`; with the parameters `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`,
-        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]` and others where there are such, see docs/program.md.
+        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md.
 
     Raises
     ------

@@ -231,7 +231,7 @@ def _config_lines(
 ) -> Iterator[str]:
     """Commented YAML lines: every setting has a comment beside it or in the line above."""
     yield f"# yaml-language-server: $schema={_SCHEMA_FILE}"
-    yield f"# Written by `yid-ocp init` {package_version()}. Everything may be changed; docs/settings.md has all keys."
+    yield f"# Written by `yid-ocp init` {package_version()}. All may be changed; keys: docs/reference/settings.md."
     yield "# Each line ends with its evidence. Next: `yid-ocp check` on this file, then `yid-ocp solve`."
     yield _line("", "description", _text(about), "one sentence for the report")
     yield ""
