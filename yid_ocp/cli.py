@@ -234,8 +234,9 @@ def _export(parser: argparse.ArgumentParser) -> None:
 
 
 def _report(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("runs", metavar="RUN", nargs="+", help="run folders of solve or diagnose, in the order of time")
-    parser.add_argument("--out", metavar="DIR", help="folder to make (default: runs/history-report-DATE-TIME)")
+    text = "run folders of solve or diagnose, in the order of time; two of the same recordings are overlaid"
+    parser.add_argument("runs", metavar="RUN", nargs="+", help=text)
+    parser.add_argument("--out", metavar="DIR", help="folder to make (default: one of this time in runs)")
     _printing(parser, "folder's path")
 
 
@@ -311,6 +312,7 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 
 _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and experiments that would determine more"
 _SAID_BLIND = "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted"
+_SAID_REPORT = "compare runs of one model: what drifted, which run to distrust; overlay two of the same recordings"
 _SAID_COMPLETION = "print what makes a shell complete commands, options, files and settings"
 _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"
 COMMANDS = tuple(
@@ -324,7 +326,7 @@ COMMANDS = tuple(
         ("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
         ("blind", _SAID_BLIND, "blind", _blind),
         ("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
-        ("report", "compare runs of one model: what drifted, which run to distrust", "run_history", _report),
+        ("report", _SAID_REPORT, "run_history", _report),
         ("plan", "plan a motion of the arms with the identified model", "plan", _configured),
         ("simulate", "write what the model says would be recorded", "simulate", _simulate),
         ("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),

@@ -158,6 +158,10 @@ class ChannelPrediction(ReprMixin):
         """Root mean square error in the channel's unit; for a point, that of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
+    def predicted_at(self, t: Array) -> Array:
+        """Prediction (K, w) at other times t (K,) [s], on straight lines between the samples."""
+        return np.stack([np.interp(t, self.t, column) for column in self.predicted.T], axis=1)
+
     def _summary(self) -> ReprLineAndTableRows:
         samples = f"{len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"
         return ReprLineAndTableRows(f"{self.channel} of '{self.recording}', {samples}")

@@ -19,6 +19,7 @@ from yid_ocp.report.terminal import (
     TableRows,
     format_error_value_and_unit,
     issue_summary_blocks,
+    names_by_pattern_text,
     p_value_text,
     register_summary,
     torque_offset_table_rows,
@@ -29,6 +30,7 @@ _MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
 _MAX_TERMINAL_PARAMETERS = 6  # parameters that have a column of their own on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak", None)
 """Verdicts of parameters whose values count; a diagnosis gives its parameters none."""
+_MAX_RUN_DIFFERENCE = 2  # between two runs, from which on a parameter is named [std]
 
 
 @register_summary("yid-diagnosis/2")
@@ -313,3 +315,44 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
 def _relation(p_value: float) -> str:
     text = p_value_text(p_value)
     return text if text.startswith("<") else f"= {text}"
+
+
+@register_summary("yid-overlay/1")
+def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    """Summary of two runs of the same recordings: errors of both, how far they are apart, and their parameters."""
+    first, second = result["runs"]
+    rows: TableRows = [("parameter", first, second, "difference", "in std", "unit")]
+    differing = []
+    for name, entry in result["parameters"].items():
+        apart, over = entry["difference"], entry["difference_in_std"]
+        cells = [_overlaid_value(entry["values"].get(run)) for run in (first, second)]
+        cells += ["" if size is None else f"{size:+.{digits}g}" for size, digits in ((apart, 3), (over, 2))]
+        rows.append((name, *cells, entry["unit"]))
+        differing += [name] if over is not None and abs(over) > _MAX_RUN_DIFFERENCE else []
+    yield SummaryTable(rows, "Parameters", is_key_table=True)
+    judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]
+    where = "held out" if judged[0]["held_out"] else "where they were fitted"
+    for group in dict.fromkeys(entry["channel"].rpartition(".")[0] for entry in judged):
+        alike = [entry for entry in judged if entry["channel"].rpartition(".")[0] == group]
+        sizes = zip(*((*entry["rmse"].values(), entry["difference"]) for entry in alike), strict=True)
+        means = [statistics.fmean(size**2 for size in own) ** 0.5 for own in sizes]
+        texts = [" ".join(format_error_value_and_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
+        text = f"{group}, {where}: error {texts[0]} by {first}, {texts[1]} by {second} (rms)"
+        yield SummaryStatement(f"{text}; their predictions differ by {texts[2]}", "conclusion")
+    none, names = f"no parameter differs by more than {_MAX_RUN_DIFFERENCE} std", names_by_pattern_text(differing)
+    text = f"different by more than {_MAX_RUN_DIFFERENCE} std: {names}"
+    yield SummaryStatement(text if differing else none, "verdict")
+    yield "std is the larger of the two; both runs have the same data, so this is no test of significance"
+    rows = [("recording", "channel", first, second, "difference", "unit")]
+    for entry in result["channels"]:
+        three = (*entry["rmse"].values(), entry["difference"])
+        errors = [format_error_value_and_unit(size, entry["unit"]) for size in three]
+        rows.append((entry["recording"], entry["channel"], *(text for text, _ in errors), errors[0][1]))
+    yield SummaryTable(rows, "Errors of both runs, and the difference of their predictions (rms)")
+
+
+def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
+    if entry is None:
+        return ""
+    text = value_and_uncertainty_text(entry["value"], entry["std"], None)
+    return text if entry["free"] else f"{entry['value']:.4g} (fixed)"

@@ -1,13 +1,15 @@
-"""Earlier runs: their estimates, as baseline of a diagnosis and in the command `report`."""
+"""Earlier runs: their estimates, as baseline of a diagnosis and in the command `report`; two runs overlaid."""
 
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from yid_ocp.analysis.estimate_history import (
@@ -19,15 +21,21 @@ from yid_ocp.analysis.estimate_history import (
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
-from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recording
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.files import file_sha256, is_file, named_attributes, read_input_json
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.predictions import ChannelPrediction
+from yid_ocp.report.animation import Animation, ConfigurationTrajectory, animation_of_trajectories
+from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
+from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import resolve_recording_path
+from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_recording_path
+
+log = logging.getLogger(__name__)
 
 ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
@@ -159,7 +167,8 @@ def require_same_model(folders: Sequence[Path]) -> None:
         if differing := _difference(known[0][1], settings):
             what = f"the runs are of different models: model.{differing} differs"
             allowed = f"{_SAME_MODEL} as in {known[0][0]}"
-            raise ConfigError(what, where=str(folder / "config.yaml"), allowed=allowed)
+            hint = "to compare two models, give two runs of the same recordings, which are overlaid"
+            raise ConfigError(what, where=str(folder / "config.yaml"), allowed=allowed, hint=hint)
 
 
 def _difference(run: RunSettings, there: RunSettings | None) -> str:
@@ -242,13 +251,15 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 
 
 def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
-    """Compare runs of one model, given in the order of time, and write `history.json` and report.html."""
+    """Compare runs of one model, given in the order of time, or two of the same recordings; writes JSON and a page."""
     if len(paths) < 2:
         hint = "add the runs of other days"
         raise ConfigError("one run has no history", where="report", allowed="two or more run folders", hint=hint)
     twice = [str(path) for i, path in enumerate(paths) if path.resolve() in [p.resolve() for p in paths[:i]]]
     if twice:
         raise ConfigError("a run is given twice, and would count twice", where=twice[0], hint="list every run once")
+    if len(paths) == 2 and _have_same_recordings(paths):
+        return _overlay_runs(paths, out, progress)
     estimates = [read_estimates(path) for path in paths]
     require_same_model(paths)
     progress.begin_stage(f"comparing {len(paths)} runs")
@@ -279,3 +290,133 @@ def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
         ],
         "parameters": parameters,
     }
+
+
+# -- two runs of the same recordings ----------------------------------------------------------------------------------
+
+
+def _have_same_recordings(folders: Sequence[Path]) -> bool:
+    """Whether two runs are of the same recordings; `ConfigError` where they share some but not all."""
+    known = []
+    for folder in folders:
+        there, inputs = _settings(folder), read_result_file(folder / "result.json").get("inputs", {})
+        paths = () if there is None else (*there.recordings.estimate, *there.recordings.held_out)
+        known.append({inputs[path]: path for path in paths if path in inputs})
+    if not known[0].keys() & known[1].keys():
+        return False
+    lacking = [
+        f"{Path(path).name} only in {folder}"
+        for folder, own, other in zip(folders, known, reversed(known), strict=True)
+        for digest, path in own.items()
+        if digest not in other
+    ]
+    if lacking:
+        what = f"the runs share some recordings but not all: {', '.join(lacking)}"
+        allowed = (
+            "two runs of the same recordings, to overlay them; or of recordings that do not overlap, for a history"
+        )
+        hint = "run one of them again with the other's `recordings`; a file that changed counts as another one"
+        raise ConfigError(what, where="report", allowed=allowed, hint=hint)
+    return True
+
+
+def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
+    """Overlay two runs of the same recordings and write `overlay.json` and report.html."""
+    progress.begin_stage("overlaying what both runs predict")
+    labels = [folder.name if folders[0].name != folders[1].name else str(folder) for folder in folders]
+    results, roles = [read_estimation_result(folder) for folder in folders], dict[str, list[str]]()
+    known = [_stored_predictions(folder, roles) for folder in folders]
+    pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
+    if not pairs:
+        hint = "compare runs that use the same sensors"
+        raise DataError("the runs have no predicted channel in common", where=str(folders[1]), hint=hint)
+    pairs.sort(key=lambda pair: "estimate" in roles[pair[0].recording])
+    channels = [
+        {
+            **named_attributes(own, "recording channel unit"),
+            "held_out": "estimate" not in roles[own.recording],
+            "rmse": {labels[0]: own.rmse, labels[1]: other.rmse},
+            "difference": replace(other, t=own.t, predicted=other.predicted_at(own.t), measured=own.predicted).rmse,
+        }
+        for own, other in pairs
+    ]
+    found = [result.get("model", result)["parameters"] for result in results]
+    runs = dict(zip(labels, map(str, folders), strict=True))
+    told: dict[str, Any] = {"format": "yid-overlay/1", "runs": runs, "parameters": _overlaid_parameters(labels, found)}
+    settings = RunSettings(name="overlay", description="Two runs of the same recordings, one over the other.")
+    with atomic_run_folder(settings, out, "report") as folder:
+        folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in folders}
+        folder.log_command_start(["report", *map(str, folders)])
+        more: dict[str, Any] = {
+            "animations": _overlaid_motions(folders, labels, found),
+            "section_data": {"overlay": pairs},
+        }
+        told |= {"channels": channels}
+        written = folder.write_result_and_report(settings, progress, told, "overlay.json", **more)
+    return CommandOutcome(folder.path, written, None)
+
+
+def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Values of every parameter that is free in one of two runs, and their difference over the larger std."""
+    parameters: dict[str, Any] = {}
+    for name in dict.fromkeys(name for own in found for name, entry in own.items() if entry.get("free", True)):
+        values = {
+            label: {
+                key: own[name].get(key, default) for key, default in (("value", None), ("std", None), ("free", True))
+            }
+            for label, own in zip(labels, found, strict=True)
+            if name in own
+        }
+        both = [entry["value"] for entry in values.values()]
+        apart = both[1] - both[0] if len(both) == 2 else None
+        largest = max((entry["std"] or 0.0 for entry in values.values()), default=0.0)
+        parameters[name] = {
+            "unit": next(own[name]["unit"] for own in found if name in own),
+            "values": values,
+            "difference": apart,
+            "difference_in_std": None if apart is None or largest == 0 else apart / largest,
+        }
+    return parameters
+
+
+def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple[str, str], ChannelPrediction]:
+    """Predictions in a run's trajectories.h5, by recording and channel; adds what each recording was used for."""
+    found: dict[tuple[str, str], ChannelPrediction] = {}
+    with open_hdf5_after_read_check(folder / "trajectories.h5") as file:
+        is_solve = file.attrs["format"] == SOLVE_TRAJECTORIES_FORMAT
+        parent = file["recordings"] if is_solve else file
+        for name in (name for name in parent if is_solve or name not in ("where", "events")):
+            roles.setdefault(name, []).append(str(parent[name].attrs.get("role", "held_out")))
+            for group in (own for own in parent[name].values() if isinstance(own, h5py.Group)):
+                arrays = [np.array(group[key]) for key in ("measured", "predicted" if is_solve else "after", "std")]
+                t, names = np.array(group["t"]), list(map(str, group.attrs["channels"]))
+                width = arrays[0].shape[1] // len(names)
+                for i, channel in enumerate(names):
+                    own = (values[:, width * i : width * (i + 1)] for values in arrays)
+                    times = t if t.ndim == 1 else t[:, width * i]
+                    unit = str(group.attrs["unit"])
+                    found[name, channel] = ChannelPrediction(name, channel, unit, times, *own)
+    return found
+
+
+def _overlaid_motions(
+    folders: Sequence[Path], labels: Sequence[str], found: Sequence[Mapping[str, Any]]
+) -> list[Animation]:
+    """Motions of both runs' models beside what was measured; none where a model or recording can no longer be read."""
+    told: dict[str, list[ConfigurationTrajectory]] = {}
+    try:
+        runs = [load_config(folder / "config.yaml") for folder in folders]
+        recordings = [own for which in ("held_out", "estimate") for own in read_recordings_of_role(runs[0], which)]
+        for folder, label, run, values in zip(folders, labels, runs, found, strict=True):
+            system = build_system(run)
+            known = {name: entry["value"] for name, entry in values.items() if name in system.parameters}
+            model = label, system, system.parameters.vector(known)
+            with open_hdf5_after_read_check(folder / "trajectories.h5") as file:
+                for name, group in file.get("recordings", {}).items():
+                    if "q" in group:
+                        path = ConfigurationTrajectory(*model, np.array(group["t"]), np.array(group["q"]))
+                        told.setdefault(name, []).insert(0, path)  # the last one is drawn in the first color
+    except YidError as error:
+        log.warning("the page shows no motion: %s", error)
+        return []
+    return [animation_of_trajectories(r.name, told[r.name], r) for r in recordings if len(told.get(r.name, ())) == 2]

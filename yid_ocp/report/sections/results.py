@@ -17,12 +17,19 @@ from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.predictions import ChannelPrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import interval_and_p_value_calibration_rates
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, StatementTableOrCode, SummaryStatement, SummaryTable
+from yid_ocp.report.terminal import (
+    SUMMARY_BY_RESULT_FORMAT,
+    StatementTableOrCode,
+    SummaryStatement,
+    SummaryTable,
+    scale_and_unit_with_metres_as_mm,
+)
 
 _MAX_ANIMATIONS = 4  # a page with more is slow to open
 _MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
@@ -105,9 +112,10 @@ def _image_files(findings: ReportData) -> Mapping[str, Any] | None:
 @register_report_section("days", 10, "From run to run")
 def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
     """Parameter values ± 2 std per run, of a history or a batch of one model."""
-    result = findings.result if findings.result.get("format") == "yid-history/1" else findings.result.get("history")
+    formats, result = ("yid-history/1", "yid-overlay/1"), findings.result
+    result = result if result.get("format") in formats else result.get("history") or {}
     rows = []
-    if result and result.get("format") == "yid-history/1":
+    if result.get("format") in formats:
         for name, entry in result["parameters"].items():
             values = {run: (own["value"], own["std"]) for run, own in entry["values"].items()}
             rows.append((name, entry["unit"], values))
@@ -255,8 +263,11 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
             scenes.append(animation_of_trajectories(f"{own.episode.name} ({own.role})", [told], own.episode.recording))
     scenes = [entry for entry in scenes if len(entry.t) > 1]
     text = json.dumps([entry.to_dict() for entry in scenes[:_MAX_ANIMATIONS]], separators=(",", ":"))
-    names = [[motion.name for motion in entry.motions] for entry in scenes]
-    both = any("measured" in own and len(own) > 1 for own in names)
+    both = any(
+        motion.name == "measured" and motion.point_indices and len(entry.motions) > 1
+        for entry in scenes
+        for motion in entry.motions
+    )
     return {"scenes": text.replace("<", "\\u003c"), "both": both} if scenes else None
 
 
@@ -279,6 +290,22 @@ def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
         "left": max(len(found) - _MAX_FIT_FIGURES, 0),
         "histogram": figures.whitened_residual_histogram_figure(residuals) if residuals else None,
     }
+
+
+@register_report_section("overlay", 20, "Both predictions over the measurements")
+def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
+    pairs: Sequence[tuple[ChannelPrediction, ChannelPrediction]] = findings.section_data.get("overlay", ())
+    for first, second in pairs[:_MAX_FIT_FIGURES]:
+        own, other = findings.result["runs"]
+        factor, shown = scale_and_unit_with_metres_as_mm(first.unit)
+        apart, curves = second.predicted_at(first.t) - first.predicted, list[TimePlotData]()
+        for i, name in enumerate("xyz" if apart.shape[1] == 3 else [first.channel.rpartition(".")[2]]):
+            lines = {own: (first.t, first.predicted[:, i]), other: (second.t, second.predicted[:, i])}
+            curves.append(TimePlotData(f"{name} [{first.unit}]", lines, first.t, first.measured[:, i]))
+            band = 2 * factor * float(np.nanmedian(first.noise_std[:, i]))
+            difference = {f"{other} minus {own}": (first.t, factor * apart[:, i])}
+            curves.append(TimePlotData(f"difference [{shown}]", difference, band_half_height=band, is_low_row=True))
+        yield f"{first.channel} in {first.recording}", figures.time_plots_figure(curves, figures.MEASURED_COLOR)
 
 
 def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotData]]]:

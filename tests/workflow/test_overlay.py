@@ -1,0 +1,68 @@
+"""The command `report` with two runs of the same recordings: what it compares, and when it refuses to."""
+
+import json
+import re
+
+import h5py
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def two_runs(pendulum_data, tmp_path_factory):
+    """Run folders of two models of the same recordings: the second one keeps one parameter at its initial value."""
+    from yid_ocp.cli import main
+
+    folder = tmp_path_factory.mktemp("overlay")
+    (folder / "pendulum.yaml").write_text(pendulum_data.text + "output: {write_report: false}\n")
+    [fixed, *_] = pendulum_data.truth
+    for name, more in (("free", ()), ("fixed", ("--set", f"parameters.{fixed}.free=false"))):
+        assert main(["solve", str(folder / "pendulum.yaml"), "--out", str(folder / name), "--quiet", *more]) in (0, 1)
+    return folder / "free", folder / "fixed", fixed
+
+
+def test_two_runs_of_the_same_recordings_are_overlaid(two_runs, cli, tmp_path):
+    first, second, fixed = two_runs
+    done = cli("report", first, second, "--out", tmp_path / "both")
+    assert done.code == 0, done.err
+    made = json.loads((tmp_path / "both" / "overlay.json").read_text(), parse_constant=pytest.fail)
+    assert list(made["runs"]) == ["free", "fixed"]
+    own, other = (json.loads((run / "result.json").read_text()) for run in (first, second))
+    entry = made["parameters"][fixed]
+    assert entry["values"]["free"]["value"] == own["parameters"][fixed]["value"]
+    moved = other["parameters"][fixed]["value"] - own["parameters"][fixed]["value"]
+    assert entry["difference"] == pytest.approx(moved)
+    assert entry["difference_in_std"] == pytest.approx(moved / own["parameters"][fixed]["std"])
+    held_out = [e for e in made["channels"] if e["held_out"]]
+    assert {e["channel"]: e["rmse"]["free"] for e in held_out} == pytest.approx(
+        {c: size for c, size in own["held_out"][0]["rmse"].items() if c in {e["channel"] for e in held_out}}
+    )
+    for e in made["channels"]:
+        with h5py.File(first / "trajectories.h5") as a, h5py.File(second / "trajectories.h5") as b:
+            group, _, joint = e["channel"].rpartition(".")
+            paths = [file["recordings"][e["recording"]][group] for file in (a, b)]
+            at = list(paths[0].attrs["channels"]).index(e["channel"])
+            apart = np.array(paths[1]["predicted"])[:, at] - np.array(paths[0]["predicted"])[:, at]
+        assert e["difference"] == pytest.approx(np.sqrt(np.nanmean(apart**2))), joint
+    assert f"{other['parameters'][fixed]['value']:.4g} (fixed)" in done.out
+    assert f"different by more than 2 std: {fixed}" in done.out
+    page = (tmp_path / "both" / "report.html").read_text(encoding="utf-8")
+    names = ["verdict", "scene", "days", "overlay", "numbers"]
+    assert [name for name in re.findall(r'<section id="(\w+)">', page) if name != "inputs"] == names
+    assert "fixed minus free" in page
+
+
+def test_runs_that_share_only_some_recordings_are_refused_by_name(two_runs, cli, tmp_path):
+    first, *_ = two_runs
+    alone = tmp_path / "alone"
+    copied = json.loads((first / "result.json").read_text())
+    alone.mkdir()
+    (alone / "result.json").write_text(json.dumps(copied))
+    text = (first / "config.yaml").read_text()
+    held_out = next(name for name in copied["inputs"] if name.endswith("held_out.h5"))
+    (alone / "config.yaml").write_text(text.replace(f"held_out: [{held_out}]", "held_out: []"))
+    refused = cli("report", first, alone, "--out", tmp_path / "both")
+    assert refused.code == 2
+    assert f"held_out.h5 only in {first}" in refused.err
+    assert "the other's `recordings`" in refused.err
+    assert not (tmp_path / "both").exists()
