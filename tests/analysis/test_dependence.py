@@ -9,7 +9,6 @@ from small_problems import pendulum_step
 
 from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
-    ParameterDetectability,
     checked_step_linearisation,
     linearise_step_equations,
     parameter_detectabilities,
@@ -76,11 +75,9 @@ def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     assert twist.rows == rows
     assert twist.observable_rows == ()
     assert twist.most_sensitive_sensor == ""
-    said = f"T1.twist enters 6 rows ({', '.join(rows)}), none of which a sensor sees to first order."
-    assert twist.description.startswith(said)
-    assert "moves no reading by a millionth of its standard deviation within 0.6 s" in twist.description
+    assert (twist.max_change_from_rest < 1e-6, twist.seconds) == (True, pytest.approx(0.6))
     assert bend.observable_rows == bend.rows
-    assert "all of which sensors see to first order, points_camera best" in bend.description
+    assert bend.most_sensitive_sensor == "points_camera"
     # a rod that hangs straight does not bend: its stiffness moves nothing either
     assert bend.max_change_from_rest < 1e-6
 
@@ -90,11 +87,9 @@ def test_the_twist_of_a_bent_rod_is_seen_but_not_its_stiffness(hanging):
     found, _, _ = judged(hanging(gravity=(3.0, 0.0, -9.0)))
     twist, bend = found["T1.twist"], found["T1.bend"]
     assert twist.observable_rows == twist.rows
-    assert "all of which sensors see to first order, points_camera best" in twist.description
+    assert twist.most_sensitive_sensor == "points_camera"
     assert twist.max_change_from_rest < 1e-6
     assert bend.max_change_from_rest > 0.1
-    change = f"{bend.max_change_from_rest:.2g} standard deviations"
-    assert f"one N m/rad more of it moves readings by at most {change}" in bend.description
 
 
 def test_a_length_changes_readings_directly_and_this_counts(hanging):
@@ -102,7 +97,6 @@ def test_a_length_changes_readings_directly_and_this_counts(hanging):
     found, rest, _ = judged(problem)
     assert found["T1.length"].directly_dependent_sensors == ("points_camera",)
     assert found["T1.bend"].directly_dependent_sensors == ()
-    assert "the reading of points_camera depends on it directly" in found["T1.length"].description
     assert found["T1.length"].max_change_from_rest == pytest.approx(moved_by(problem, rest, "T1.length"), rel=1e-6)
     # the tip goes down by as much, of a standard deviation of 2 mm
     assert found["T1.length"].max_change_from_rest == pytest.approx(1.0 / STD, rel=1e-6)
@@ -185,43 +179,7 @@ def test_without_sensors_only_rows_are_said(hanging):
     found = {e.parameter: e for e in parameter_detectabilities(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].observable_rows is None
     assert (found["T1.twist"].max_change_from_rest, found["T1.twist"].seconds) == (None, 0.0)
-    assert found["T1.bend"].description == "T1.bend enters 12 rows (6 of del, 6 of p1)."
-
-
-ROWS = "k enters 2 rows (del[a], p1[a])"
-SEES, READ = "sensors see to first order", "the reading of tip"
-STILL = "From rest, one N more of it moves no reading by a millionth of its standard deviation"
-MOVED = "From rest, 1 more of it moves readings by at most 0.25 standard deviations"
-ALONG = "Along the recordings, one N more of it moves all readings together by 12 standard deviations"
-
-
-MANY = (*(f"del[{i}]" for i in range(5)), *(f"p1[{i}]" for i in range(4)))
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"rows": MANY, "observable_rows": None}, "k enters 9 rows (5 of del, 4 of p1)."),
-        ({"rows": MANY[:8], "observable_rows": None}, f"k enters 8 rows ({', '.join(MANY[:8])})."),
-        ({}, f"{ROWS}, all of which {SEES}, tip best."),
-        ({"rows": ("del[a]",), "observable_rows": ()}, "k enters 1 row (del[a]), which no sensor sees to first order."),
-        ({"rows": ("del[a]",), "observable_rows": ("del[a]",)}, f"k enters 1 row (del[a]), which {SEES}, tip best."),
-        ({"observable_rows": ("p1[a]",)}, f"{ROWS}, 1 of which {SEES} (p1[a]), tip best."),
-        (
-            {"rows": (), "observable_rows": (), "directly_dependent_sensors": ("tip",)},
-            f"k enters no row of a step; {READ} depends on it directly.",
-        ),
-        (
-            {"observable_rows": (), "max_change_from_rest": 0.0},
-            f"{ROWS}, none of which a sensor sees to first order. {STILL} within 0.5 s.",
-        ),
-        ({"change_along_recordings": 12.345}, f"{ROWS}, all of which {SEES}, tip best. {ALONG}, to first order."),
-        ({"unit": "1", "max_change_from_rest": 0.25}, f"{ROWS}, all of which {SEES}, tip best. {MOVED} within 0.5 s."),
-    ],
-)
-def test_words(changes, words):
-    made = ParameterDetectability("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
-    assert replace(made, **changes).description == words
+    assert len(found["T1.bend"].rows) == 12
 
 
 @pytest.fixture(scope="module")

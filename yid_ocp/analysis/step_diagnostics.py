@@ -120,8 +120,6 @@ def _error(exact: Array, difference: Array) -> float:
 _MIN_RELATIVE_RESPONSE = 1e-7
 # Steps over which readings are looked at; what is not seen within them takes longer than most motions.
 _RESPONSE_STEPS = 100
-_NEGLIGIBLE_STDS = 1e-6  # standard deviations: beneath are the tolerance of a rest and what hundred steps make of it
-_MAX_LISTED_ROWS = 8  # rows that are named one by one
 
 
 @dataclass(frozen=True)
@@ -137,38 +135,6 @@ class ParameterDetectability:
     max_change_from_rest: float | None  # largest of a reading for one unit of the parameter [standard deviations]
     seconds: float  # time within which that change is reached
     change_along_recordings: float | None = None  # root sum of squares over all readings, likewise
-
-    @property
-    def description(self) -> str:
-        """Sentences on the rows that contain the parameter, and on the readings' change with the parameter."""
-        said = f"{self.parameter} enters {self._rows}"
-        if self.directly_dependent_sensors:
-            said += f"; the reading of {', '.join(self.directly_dependent_sensors)} depends on it directly"
-        more = "1 more of it" if self.unit == "1" else f"one {self.unit} more of it"
-        within, change = f"within {self.seconds:.2g} s", self.max_change_from_rest
-        if change is not None and change > _NEGLIGIBLE_STDS:
-            said += f". From rest, {more} moves readings by at most {change:.2g} standard deviations {within}"
-        elif change is not None:
-            said += f". From rest, {more} moves no reading by a millionth of its standard deviation {within}"
-        if self.change_along_recordings is not None:
-            moves = f"moves all readings together by {self.change_along_recordings:.2g} standard deviations"
-            said += f". Along the recordings, {more} {moves}, to first order"
-        return said + "."
-
-    @property
-    def _rows(self) -> str:
-        if not self.rows:
-            return "no row of a step"
-        one, listed, seen = len(self.rows) == 1, _summarize_rows(self.rows), self.observable_rows
-        said = f"{len(self.rows)} row{'' if one else 's'} ({listed})"
-        if seen is None:
-            return said
-        best = f", {self.most_sensitive_sensor} best" if self.most_sensitive_sensor else ""
-        if not seen:
-            return f"{said}, {'which no sensor' if one else 'none of which a sensor'} sees to first order"
-        if len(seen) == len(self.rows):
-            return f"{said}, {'which' if one else 'all of which'} sensors see to first order{best}"
-        return f"{said}, {len(seen)} of which sensors see to first order ({_summarize_rows(seen)}){best}"
 
 
 def parameter_detectabilities(
@@ -210,14 +176,6 @@ def parameter_detectabilities(
         moved = float(np.max(by_theta[:, i], initial=0.0))
         found.append(ParameterDetectability(*entry, seen, best, read, moved, span))
     return tuple(found)
-
-
-def _summarize_rows(names: Sequence[str]) -> str:
-    """Row names joined to a text; more than eight are counted by kind."""
-    if len(names) <= _MAX_LISTED_ROWS:
-        return ", ".join(names)
-    kinds = [name.partition("[")[0] for name in names]
-    return ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
 
 
 class _WhitenedSensor(NamedTuple):

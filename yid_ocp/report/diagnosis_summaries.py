@@ -1,4 +1,4 @@
-"""Summaries of a diagnosis, of its blind validation, and of several runs side by side."""
+"""Summaries of a diagnosis, of its blind validation, and of several methods or runs side by side."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
@@ -19,9 +20,11 @@ from yid_ocp.report.terminal import (
     TableRows,
     format_error_value_and_unit,
     issue_summary_blocks,
+    misfit_summary_blocks,
     names_by_pattern_text,
     p_value_text,
     register_summary,
+    scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
 )
 
@@ -253,6 +256,89 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> 
         fit = "" if entry["chi2_per_dof"] is None else f"{entry['chi2_per_dof']:.3g}"
         time = "" if entry["seconds"] is None else f"{entry['seconds']:.1f} s"
         yield entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time
+
+
+@register_summary("yid-compare/1")
+def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    """Summary of several methods on one problem."""
+    methods: dict[str, Any] = result["methods"]
+    judged, disturbed = result["judged"], result["disturbed"]
+    runs = methods | {"solve": judged}
+    beside = [key for key in ("published", "truth") if result[key]]
+    rows: TableRows = [("parameter", *runs, *beside, "verdict")]
+    for name, own in judged["parameters"].items():
+        if own["free"]:
+            cells = []
+            for method, entry in runs.items():
+                found = entry["parameters"][name]
+                # elsewhere a curvature tells nothing of how sure it is, nor where noise is left out
+                ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
+                known = (found["std"], found["interval"]) if ended else (None, None)
+                lost = own["verdict"] == "not_identifiable"
+                cells.append("–" if lost else value_and_uncertainty_text(found["value"], *known))
+            others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
+            rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
+    yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})
+    yield from (SummaryStatement(text, "conclusion") for text in _objections_to_agreement(result))
+    yield from issue_summary_blocks(result)
+    yield SummaryTable(rows, "Parameters by method", is_key_table=True)
+    yield SummaryTable([*_effort_rows(methods)], "What it took")
+    yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
+    yield from (f"{n} differs: {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
+    yield from result["explained"]
+    yield from result["published_explained"]
+    if not [*_objections_to_agreement(result)]:
+        agree = "all methods agree within their uncertainty on the parameters that are found"
+        yield SummaryStatement(agree, "conclusion")
+
+
+def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with the methods' answers; nothing where they agree and that means something."""
+    methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
+    free = {name: entry for name, entry in own.items() if entry["free"]}
+    found = {name: entry for name, entry in free.items() if entry["verdict"] == "identifiable"}
+    if result["disturbed"]:
+        words = f"the noise that drives the motion is ignored by {', '.join(methods)}: no value of theirs is trusted"
+        yield f"{words}; `solve` counts it, and verdict and ± are those of its column"
+        for name, entry in found.items():
+            values = {method: one["parameters"][name]["value"] for method, one in methods.items()}
+            off = {m: v for m, v in values.items() if abs(v - entry["value"]) > 2 * (entry["std"] or 0.0)}
+            if off:
+                said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
+                yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
+    if not fit["explains"]:
+        yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
+    elif not fit["believed"]:
+        yield "the recordings have issues, so agreement of methods does not confirm the values"
+    elif not found:
+        yield "no parameter can be found from these recordings, so there is nothing to agree on"
+        yield "`yid-ocp identifiability CONFIG --what-if` says what would have to be measured"
+    elif not result["agree"]:
+        yield "the methods do not agree on the parameters that are found"
+
+
+def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
+    entries = methods.values()
+    costs = (entry["whitened_cost"] for entry in entries)
+    ratios = (entry["fit"]["chi2_per_dof"] for entry in entries)
+    yield "", *methods
+    yield "status", *(entry["status"] for entry in entries)
+    yield "cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs)
+    yield "chi2 per degree of freedom", *("unknown" if r is None else f"{r:.3g}" for r in ratios)
+    units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
+    for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
+        unit = channel_or_group_unit(units, channel)
+        errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
+        cells = (format_error_value_and_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
+        yield f"held out: {channel}" + (f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""), *cells
+    for words, key, form in (
+        ("iterations", "iterations", "d"),
+        ("evaluations", "evaluations", "d"),
+        ("wall time [s]", "wall_seconds", ".2f"),
+        ("CPU time [s]", "cpu_seconds", ".2f"),
+        ("peak memory [MiB]", "peak_memory_mib", ".0f"),
+    ):
+        yield words, *(f"{entry[key]:{form}}" for entry in entries)
 
 
 @register_summary("yid-history/1")

@@ -41,7 +41,9 @@ _BASELINE_DESCRIPTIONS = {
 }
 _MAX_DIRECTIONS = 8
 _MAX_NOISE_RATIO = 2.0  # of an error over what noise makes, or over that of the fit, from which on a sentence says why
-_MAX_INSPECTED_PARAMETERS = 12  # free parameters of which `inspect` speaks; result.json has all
+_MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
+_MAX_ROW_NAMES_LENGTH = 40  # characters of a cell
+_NEGLIGIBLE_STDS = 1e-6  # standard deviations: beneath are the tolerance of a rest and what hundred steps make of it
 
 
 @register_summary("yid-solve/1")
@@ -207,89 +209,6 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             yield "`yid-ocp identifiability` gives intervals that need not be symmetric"
     if bound:
         yield f"the search ended at a bound of {names_by_pattern_text(bound)}: what is beyond it was not tried"
-
-
-@register_summary("yid-compare/1")
-def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of several methods on one problem."""
-    methods: dict[str, Any] = result["methods"]
-    judged, disturbed = result["judged"], result["disturbed"]
-    runs = methods | {"solve": judged}
-    beside = [key for key in ("published", "truth") if result[key]]
-    rows: TableRows = [("parameter", *runs, *beside, "verdict")]
-    for name, own in judged["parameters"].items():
-        if own["free"]:
-            cells = []
-            for method, entry in runs.items():
-                found = entry["parameters"][name]
-                # elsewhere a curvature tells nothing of how sure it is, nor where noise is left out
-                ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
-                known = (found["std"], found["interval"]) if ended else (None, None)
-                lost = own["verdict"] == "not_identifiable"
-                cells.append("–" if lost else value_and_uncertainty_text(found["value"], *known))
-            others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-            rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
-    yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})
-    yield from (SummaryStatement(text, "conclusion") for text in _objections_to_agreement(result))
-    yield from issue_summary_blocks(result)
-    yield SummaryTable(rows, "Parameters by method", is_key_table=True)
-    yield SummaryTable([*_effort_rows(methods)], "What it took")
-    yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
-    yield from (f"{n} differs: {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
-    yield from result["explained"]
-    yield from result["published_explained"]
-    if not [*_objections_to_agreement(result)]:
-        agree = "all methods agree within their uncertainty on the parameters that are found"
-        yield SummaryStatement(agree, "conclusion")
-
-
-def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with the methods' answers; nothing where they agree and that means something."""
-    methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
-    free = {name: entry for name, entry in own.items() if entry["free"]}
-    found = {name: entry for name, entry in free.items() if entry["verdict"] == "identifiable"}
-    if result["disturbed"]:
-        words = f"the noise that drives the motion is ignored by {', '.join(methods)}: no value of theirs is trusted"
-        yield f"{words}; `solve` counts it, and verdict and ± are those of its column"
-        for name, entry in found.items():
-            values = {method: one["parameters"][name]["value"] for method, one in methods.items()}
-            off = {m: v for m, v in values.items() if abs(v - entry["value"]) > 2 * (entry["std"] or 0.0)}
-            if off:
-                said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
-                yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
-    if not fit["explains"]:
-        yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
-    elif not fit["believed"]:
-        yield "the recordings have issues, so agreement of methods does not confirm the values"
-    elif not found:
-        yield "no parameter can be found from these recordings, so there is nothing to agree on"
-        yield "`yid-ocp identifiability CONFIG --what-if` says what would have to be measured"
-    elif not result["agree"]:
-        yield "the methods do not agree on the parameters that are found"
-
-
-def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
-    entries = methods.values()
-    costs = (entry["whitened_cost"] for entry in entries)
-    ratios = (entry["fit"]["chi2_per_dof"] for entry in entries)
-    yield "", *methods
-    yield "status", *(entry["status"] for entry in entries)
-    yield "cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs)
-    yield "chi2 per degree of freedom", *("unknown" if r is None else f"{r:.3g}" for r in ratios)
-    units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
-    for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
-        unit = channel_or_group_unit(units, channel)
-        errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
-        cells = (format_error_value_and_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
-        yield f"held out: {channel}" + (f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""), *cells
-    for words, key, form in (
-        ("iterations", "iterations", "d"),
-        ("evaluations", "evaluations", "d"),
-        ("wall time [s]", "wall_seconds", ".2f"),
-        ("CPU time [s]", "cpu_seconds", ".2f"),
-        ("peak memory [MiB]", "peak_memory_mib", ".0f"),
-    ):
-        yield words, *(f"{entry[key]:{form}}" for entry in entries)
 
 
 @register_summary("yid-identifiability/1")
@@ -487,54 +406,90 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     equations, linear = result["equations"], result["linearisation"]
     size = f"coordinates: {len(roles)} ({', '.join(counts)}), constraints: {equations['sizes']['m']}"
     yield SummaryStatement(size, "verdict")
-    rows: TableRows = [("parameter", "value", "unit", "bounds", "")]
+    yield SummaryTable([*_dependence_rows(result)], "Where parameters enter, and who sees it", is_key_table=True)
+    seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
+    yield (
+        "rows of a step that contain the parameter, and those of them that sensors see to first order; what one unit "
+        f"more moves: a reading at most (from rest, within {seconds:.2g} s), all readings together (recordings)"
+    )
+    left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
+    yield f"and {left} more free parameters, in result.json" if left > 0 else ""
+    if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
+        yield "what sensors see to first order is looked for about a rest, which this is not"
+    said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
+    yield SummaryStatement(said, "verdict")
+    rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
-        bounds, free = parameter_bounds_text(entry, 6), "free" if entry["free"] else ""
-        rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, free))
-    yield SummaryTable(rows, "Parameters", is_key_table=True)
+        bounds, use = parameter_bounds_text(entry, 6), "free" if entry["free"] else ""
+        rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
+    yield SummaryTable(rows, "Parameters")
     sizes = [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
     yield SummaryTable([("function", "operations", "nonzeros"), *sizes], "Functions")
     for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
         parts = [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
-        yield SummaryTable([(head, "", "first", ""), *parts], head.capitalize())
+        yield SummaryTable([(head, "number", "first", "meaning"), *parts], head.capitalize())
     yield from _patterns(result)
-    said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
-    yield SummaryStatement(said, "verdict")
     errors = linear["finite_difference_errors"]
     norms = [(name, f"{norm:.4g}", f"{errors[name]:.1e}") for name, norm in linear["norms"].items()]
     yield SummaryTable([("matrix", "norm", "largest difference from finite differences"), *norms], "Linearised step")
-    yield "matrices: linearisation.h5"
-    of_free = [entry for name, entry in result["dependence"].items() if result["parameters"][name]["free"]]
-    shown, left = of_free[:_MAX_INSPECTED_PARAMETERS], len(of_free) - _MAX_INSPECTED_PARAMETERS
-    asked = (result["dependence"][name] for name in result["asked"])
-    yield from (entry["words"] for entry in [*shown, *(entry for entry in asked if entry not in shown)])
-    if left > 0:
-        yield f"and {left} more free parameters, in result.json"
-    if any(entry["seen"] is None for entry in of_free):
-        yield "what sensors see to first order is looked for about a rest, which this is not"
-    yield "where every parameter enters: result.json; all equations and names: equations.txt"
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
         yield CodeBlock("" if entry["zero"] else f"which is {value} at {linear['at']}")
-    yield f"exported: {', '.join(result['exported'])}" if result["exported"] else ""
+    yield SummaryTable([*_INSPECTION_FILES, *((path, "") for path in result["exported"])], "Files")
+
+
+_INSPECTION_FILES = (
+    ("file", "holds"),
+    ("linearisation.h5", "the matrices"),
+    ("result.json", "where every parameter enters"),
+    ("equations.txt", "all equations and names"),
+)
+
+
+def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    """Free parameters and those asked for: rows of a step that contain them, and changes of readings by one unit."""
+    known: Mapping[str, Mapping[str, Any]] = result["dependence"]
+    shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
+    yield "parameter", "unit", "rows", "which", "seen", "best sensor", "read by", "from rest [std]", "recordings [std]"
+    for name in dict.fromkeys([*shown, *result["asked"]]):
+        own = known[name]
+        rows, seen = own["rows"], own["seen"]
+        sight = _row_names_text(seen or ()) or "none"
+        sight = "" if seen is None or not rows else "all" if len(seen) == len(rows) else sight
+        changes = ("" if own[key] is None else _change_in_std_text(own[key]) for key in ("moved", "along"))
+        sensors = own["best"], ", ".join(own["read"])
+        yield name, own["unit"], str(len(rows)), _row_names_text(rows), sight, *sensors, *changes
+
+
+def _change_in_std_text(change: float) -> str:
+    return f"{change:.2g}" if change > _NEGLIGIBLE_STDS else f"< {_NEGLIGIBLE_STDS:g}"
+
+
+def _row_names_text(names: Sequence[str]) -> str:
+    """Names of rows in one line; counted by kind where that would be too long."""
+    text, kinds = names_by_pattern_text(names), [name.partition("[")[0] for name in names]
+    counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
+    return text if len(text) <= _MAX_ROW_NAMES_LENGTH else counts
 
 
 def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    rows: TableRows = [("matrix (sparsity.png)", "size", "can differ from zero", "do at this point")]
+    rows: TableRows = [("matrix", "size", "can differ from zero", "do at this point", "picture")]
     for name, entry in result["patterns"].items():
         height, width = entry["shape"]
         if height and width:
-            rows.append((name, f"{height} x {width}", str(entry["nonzeros"]), str(entry["at_point"])))
-    yield SummaryTable(rows, "Patterns")
+            counts = (str(entry["nonzeros"]), str(entry["at_point"]))
+            rows.append((name, f"{height} x {width}", *counts, "sparsity.png"))
     nlp = result["nlp"]
     if nlp is not None:
-        size = nlp["variables"] + nlp["constraints"]
-        yield (
-            f"KKT matrix of the NLP with a node at every step (kkt.png): {size} x {size}, {nlp['variables']} "
-            f"variables, {nlp['constraints']} constraints; {nlp['jacobian_nonzeros']} entries of the constraints' "
-            f"Jacobian and {nlp['hessian_nonzeros']} of their Hessian can differ from zero"
-        ) + (f"; without {', '.join(nlp['left_out'])}" if nlp["left_out"] else "")
+        n, m = nlp["variables"], nlp["constraints"]
+        rows.append(("constraints' Jacobian of the NLP", f"{m} x {n}", str(nlp["jacobian_nonzeros"]), "", ""))
+        rows.append(("Hessian of the NLP", f"{n} x {n}", str(nlp["hessian_nonzeros"]), "", ""))
+        rows.append(("KKT matrix of the NLP", f"{n + m} x {n + m}", "", "", "kkt.png"))
+    yield SummaryTable(rows, "Patterns")
+    if nlp is not None:
+        left = f"; left out: {', '.join(nlp['left_out'])}" if nlp["left_out"] else ""
+        yield f"the NLP has a node at every step{left}"
 
 
 @register_summary("yid-simulate/1")

@@ -37,7 +37,7 @@ _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
 _PARAMETER_KEYS = ("value", "unit", "lower", "upper", "description")
 _DEPENDENCE_KEYS = (
     "parameter unit rows seen=observable_rows best=most_sensitive_sensor read=directly_dependent_sensors "
-    "moved=max_change_from_rest seconds along=change_along_recordings words=description"
+    "moved=max_change_from_rest seconds along=change_along_recordings"
 )
 
 
