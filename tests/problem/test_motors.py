@@ -31,8 +31,8 @@ VALUES = {
     "elbow.servo_torque_limit": 3.0, "elbow.servo_gain_factor": 100.0,
 }  # fmt: skip
 DC = PositionServoOptions(motor=MotorOptions("dc"))
-FIRMWARE = PositionServoOptions(motor=MotorOptions("dc", "mx64"), firmware_terms=("derivative", "dead_band"))
-INTEGRATING = replace(FIRMWARE, firmware_terms=("integral", "derivative", "dead_band"))
+FIRMWARE = PositionServoOptions(motor=MotorOptions("dc", "mx64"), extra_controller_terms=("derivative", "dead_band"))
+INTEGRATING = replace(FIRMWARE, extra_controller_terms=("integral", "derivative", "dead_band"))
 TERMS = {"integral": 3.0, "derivative": 0.7, "dead_band": 0.02}
 FIRMWARE_VALUES = VALUES | {f"{joint}.servo_{term}": value for joint in PENDULUM for term, value in TERMS.items()}
 
@@ -59,11 +59,11 @@ def test_a_firmware_damps_within_its_duty_and_ignores_small_errors(urdf_folder) 
     assert torque([-0.1, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == pytest.approx(-60 * 0.08, abs=1e-3)
     assert torque([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == 0.0
     with pytest.raises(ConfigError, match="has a derivative term already"):
-        PositionServoOptions(firmware_terms=("derivative",))
+        PositionServoOptions(extra_controller_terms=("derivative",))
 
 
 def test_an_integral_takes_the_sag_away_and_stands_still_while_the_motor_is_off(urdf_folder) -> None:
-    step = pendulum_step(urdf_folder, driven=PENDULUM, servos=replace(DC, firmware_terms=("integral",)))
+    step = pendulum_step(urdf_folder, driven=PENDULUM, servos=replace(DC, extra_controller_terms=("integral",)))
     command = np.tile([0.4, -0.3], (901, 1))
     enabled = np.ones((901, 2))
     enabled[600:] = 0.0

@@ -259,7 +259,7 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
 
 def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_limit_are_not() -> None:
     system = moved_by(
-        PositionServoOptions(motor=MotorOptions("dc", "sts3215"), firmware_terms=("derivative", "dead_band"))
+        PositionServoOptions(motor=MotorOptions("dc", "sts3215"), extra_controller_terms=("derivative", "dead_band"))
     )
     values = VALUES | {"pan.servo_derivative": 0.3}
     pan = mujoco.MjModel.from_xml_string(mujoco_xml(system, values)).actuator("pan")

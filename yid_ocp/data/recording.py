@@ -31,7 +31,7 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 """Channels of a joint group and their units."""
 
 _STD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
-PER_JOINT_ATTRIBUTE_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
+JOINT_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
 """Constants that a joint group may have, not negative, of all joints or one for each."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
@@ -96,7 +96,7 @@ class JointGroup(ReprMixin):
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t", *JOINT_CHANNEL_UNITS))
-        for name in PER_JOINT_ATTRIBUTE_NAMES:
+        for name in JOINT_CONSTANT_NAMES:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _constant(getattr(self, name), f"joints, attribute {name}"))
 
@@ -417,7 +417,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
     require_data(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
-    for name in PER_JOINT_ATTRIBUTE_NAMES:
+    for name in JOINT_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")

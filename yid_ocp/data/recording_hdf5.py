@@ -25,7 +25,7 @@ from yid_ocp import files
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
-    PER_JOINT_ATTRIBUTE_NAMES,
+    JOINT_CONSTANT_NAMES,
     POINT_GROUP_NAME_PATTERN,
     JointGroup,
     PointGroup,
@@ -45,7 +45,7 @@ _STRAIGHT = "straight"
 _GAIN = "proportional_gain"
 _JOINT_UNITS = {"t": "s", **JOINT_CHANNEL_UNITS}
 _POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
-_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *PER_JOINT_ATTRIBUTE_NAMES)
+_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_CONSTANT_NAMES)
 _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 

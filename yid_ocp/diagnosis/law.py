@@ -24,7 +24,7 @@ from yid_ocp.effects.law import (
     LAW_QUANTITY_UNITS,
     Law,
     LawTable,
-    law_quantities_at_location,
+    allowed_law_quantity_names,
     make_law,
     quantity_values_along,
 )
@@ -133,7 +133,7 @@ def find_gap_law(
     places : sequence of str
         Locations of the gap, the likeliest first.
     """
-    places = [p for p in dict.fromkeys(places) if law_quantities_at_location(problem.system, p)][:_MAX_PLACES]
+    places = [p for p in dict.fromkeys(places) if allowed_law_quantity_names(problem.system, p)][:_MAX_PLACES]
     if not places or search.note_skip_past_deadline("a law"):
         return None
     search.progress.begin_stage(f"estimating a law at {' or '.join(places)}", 3.0, 2.5)
@@ -141,7 +141,7 @@ def find_gap_law(
     left_out = ("time",) if search.problem.is_split_in_blocks else ()
     laws = []
     for place in places:
-        quantities = [q for q in law_quantities_at_location(problem.system, place) if q not in left_out]
+        quantities = [q for q in allowed_law_quantity_names(problem.system, place) if q not in left_out]
         laws.append(_neutral_law(last, place, quantities))
     before, found = _refitted_families(search, problem, last, laws, events)
     if before is None or not found:

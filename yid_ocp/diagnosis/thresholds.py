@@ -54,7 +54,11 @@ class Thresholds(SmootherThresholds):
     signature_overlap: Annotated[
         float, Gt(0), Le(1), OptionInfo("part of a signature from which two candidates are alike")
     ] = 0.9
-    restart_chi2: Annotated[float, Gt(0), OptionInfo("chi2/n above which a refit may be tried again")] = 1.1
+    restart_chi2: Annotated[
+        float,
+        Gt(0),
+        OptionInfo("chi2/n above which refits, below which a nominal fit with a gap, are repeated from other starts"),
+    ] = 1.1
     restart_gain: Annotated[float, Gt(0), Lt(1), OptionInfo("part of the excess explained by a refit tried again")] = (
         0.2
     )

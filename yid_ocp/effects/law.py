@@ -159,7 +159,7 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
     )
 
 
-def law_quantities_at_location(system: System, location: str) -> tuple[str, ...]:
+def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
     """Quantities that a law may depend on at a location: no load where nothing drives, commands of servos only.
 
     Empty where no law is possible.
@@ -223,7 +223,7 @@ def make_law(location: str, system: System, tables: Sequence[LawTable], torque_s
 
     `ConfigError` where no law is possible at the location, or not of the quantities.
     """
-    label, possible = f"law@{location}", law_quantities_at_location(system, location)
+    label, possible = f"law@{location}", allowed_law_quantity_names(system, location)
     if not possible:
         places = (*segment_names(system), *arm_joint_names(system))
         raise ConfigError(

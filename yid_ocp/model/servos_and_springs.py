@@ -143,7 +143,7 @@ class PositionServoOptions:
         bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
     ] = False
     motor: Annotated[MotorOptions, OptionInfo("of every servo")] = MotorOptions()
-    firmware_terms: Annotated[
+    extra_controller_terms: Annotated[
         tuple[_FirmwareTerm, ...],
         OptionInfo(
             "further terms of the firmware, parameters that begin at zero: integral (JOINT.servo_integral: the error's "
@@ -154,11 +154,11 @@ class PositionServoOptions:
     ] = ()
 
     def __post_init__(self) -> None:
-        if "derivative" in self.firmware_terms and self.motor.kind == "ideal":
+        if "derivative" in self.extra_controller_terms and self.motor.kind == "ideal":
             what = "an ideal motor has a derivative term already, JOINT.servo_damping"
             hint = "leave it out, or set model.arms.servo.motor.kind: dc"
             raise ConfigError(
-                what, where="model.arms.servo.firmware_terms", allowed="derivative with kind: dc", hint=hint
+                what, where="model.arms.servo.extra_controller_terms", allowed="derivative with kind: dc", hint=hint
             )
 
 
@@ -243,7 +243,7 @@ def build_joint_servos(
             own.append(Parameter(f"{joint}.{SERVO_GAIN_FACTOR_PARAMETER}", 1.0, "1", 0.0, math.inf, words))
             gain = gain * own[-1].symbol
         tightness = limit**-TORQUE_SATURATION_EXPONENT
-        further = _firmware_parameters(at, options.firmware_terms)
+        further = _firmware_parameters(at, options.extra_controller_terms)
         preset = None if options.motor.preset is None else MOTOR_PRESETS[options.motor.preset]
         more: dict[str, Any] = {term: parameter.symbol for term, parameter in further.items()}
         more["torque_constant"] = None if preset is None else preset.plain.torque_constant

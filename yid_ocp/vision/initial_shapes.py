@@ -237,7 +237,7 @@ class _Link(NamedTuple):
     tip: int = -1
 
 
-class InitialShapeFinder:
+class ShapeFitInitialGuesses:
     """Finder of object shapes along a centerline, with some joints bent from rest (n,); `lengths` of links [m]."""
 
     def __init__(

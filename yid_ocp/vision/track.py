@@ -31,7 +31,7 @@ from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
-from yid_ocp.vision.initial_shapes import InitialShapeFinder, cloud_centerline_tree, system_with_free_root
+from yid_ocp.vision.initial_shapes import ShapeFitInitialGuesses, cloud_centerline_tree, system_with_free_root
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
@@ -125,7 +125,7 @@ class FrameTracker:
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
         self.shape_fitter = self._shape_of(values)
-        self.initial_shape_finder = self.shape_fitter.initial_shape_finder() if anywhere else None
+        self.shape_fit_initial_guesses = self.shape_fitter.shape_fit_initial_guesses() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
         self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
         # of a root that is sought nothing that was recorded is needed
@@ -298,7 +298,7 @@ class FrameTracker:
         fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
         fits.sort(key=lambda fit: fit.mean_distance)
         reason = frame_selection.frame_rejection_reason(fits[0], shape, self.options)
-        anywhere = self.initial_shape_finder is not None
+        anywhere = self.shape_fit_initial_guesses is not None
         if anywhere and not reason and frame_selection.is_shape_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
         other = (
@@ -418,10 +418,10 @@ class FrameTracker:
         begun = time.process_time()
         view = OcclusionMap(raw, state.pose, self.sequence.intrinsics, cloud.points)
         given = calibration.camera_position, view, self._removed(q, calibration, background)
-        if self.initial_shape_finder is None:
+        if self.shape_fit_initial_guesses is None:
             look = self._held(work, cloud, q, rng, given)
         else:
-            look = self._anywhere(self.initial_shape_finder, work, cloud, rng, given)
+            look = self._anywhere(self.shape_fit_initial_guesses, work, cloud, rng, given)
         work.say(cpu_seconds=time.process_time() - begun)
         return look
 
@@ -436,7 +436,7 @@ class FrameTracker:
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
     def _anywhere(
-        self, starts: InitialShapeFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
+        self, starts: ShapeFitInitialGuesses, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
     ) -> _Look:
         """What is seen of an object whose root is sought, with the ends that it may have where."""
         diameter, options = 2.0 * self._widest, self.options
