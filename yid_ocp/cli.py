@@ -202,7 +202,7 @@ def _init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", metavar="FILE", nargs="+", help=text)
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
     _switch(parser, "--replace", "write over files that are there")
-    text = "what is held, such as cable, beam, tree or foam_y, the paper's; an unknown word lists all; "
+    text = "what is held, such as cable, beam, tree or foam_y; an unknown word lists all; "
     text += "without it the arm alone, with a payload"
     parser.add_argument("--object", metavar="KIND", help=text)
     for name, unit in (("length", "m"), ("mass", "kg"), ("radius", "m")):

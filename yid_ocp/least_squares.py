@@ -92,7 +92,7 @@ def minimize_by_damped_newton(
 
     It has converged when no component would move by more than `step_tolerance`, or when the cost falls by less than the
     part `cost_tolerance`. No step is damped less than `min_damping`: some damping keeps a search on a robust cost from
-    leaping out of its valley.
+    leaving its local minimum.
     """
     x = np.array(initial_guess, float)
     model, damping = model_at(x), _FIRST_DAMPING

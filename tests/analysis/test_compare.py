@@ -99,7 +99,7 @@ def test_command(repository, clean, tmp_path, capsys):
     assert "published" in text
     assert "truth" in text
     assert "noise that drives" not in text
-    assert "\nT1.bend = 23.78 of the paper: " in text
+    assert "\nT1.bend = 23.78 of Caldwell et al.: " in text
     result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
     assert result["format"] == "yid-compare/1"
     assert set(result["methods"]) == {"gauss_newton", "single_shooting"}
@@ -363,7 +363,7 @@ def test_why_a_published_value_is_what_it_is(monkeypatch, expected, case):
     ensemble = {"made up": {"none": {"T1.bend": [stopped]}, "offsets": {"T1.bend": [6.0, 14.0]}}}
     monkeypatch.setattr(module, "_load_torque_ensemble", lambda: ensemble)
     [said] = explain_paper_estimates("made up", {"T1.bend": entry}, {} if truth is None else {"T1.bend": truth})
-    assert said.startswith(f"T1.bend = {published:.4g} of the paper: {expected}")
+    assert said.startswith(f"T1.bend = {published:.4g} of Caldwell et al.: {expected}")
 
 
 PAPER_TRUTH = dict(zip(_PAPER_PARAMETERS, (22.0, 13.6, 10.7, 8.2, 11.5, 9.7), strict=True))
@@ -394,7 +394,7 @@ def test_each_published_value_has_one_sentence():
         said = told(experiment, T2_twist=LOST, T3_twist=LOST)
         assert [text.split(" = ")[0] for text in said] == list(values) == names
         for text, value in zip(said, values.values(), strict=True):
-            assert f" = {value:.4g} of the paper: " in text
+            assert f" = {value:.4g} of Caldwell et al.: " in text
         assert all("not informed; in such an experiment it cannot be found" in said[i] for i in (3, 5))
 
 
@@ -403,7 +403,7 @@ def test_the_truth_was_chosen_from_one_answer_and_this_is_said():
     assert all(0 in values.values() for name, values in PAPER_ESTIMATES.items() if name != _TRUTH_EXPERIMENT)
     assert all("which was chosen from it" in text for text in told(_TRUTH_EXPERIMENT))
     other = told("single_arm_no_vision")
-    assert other[0] == "T1.bend = 23.78 of the paper: near the truth of these recordings, 22"
+    assert other[0] == "T1.bend = 23.78 of Caldwell et al.: near the truth of these recordings, 22"
     elsewhere = {name: 1.05 * value for name, value in PAPER_TRUTH.items()}
     assert not any("chosen" in text for text in explain_paper_estimates(_TRUTH_EXPERIMENT, judged(), elsewhere))
 

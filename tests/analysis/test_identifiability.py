@@ -154,7 +154,7 @@ def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuis
     wide = Formula(lambda x: [30 * (x["a"] / 2 - 1) + 5 * x[name] for name in nuisances], start, bounds=FREE)
     monkeypatch.setattr(module, "with_nuisance_unknowns", lambda *_: wide)
     [hidden] = identifiability(Formula(lambda x: [30 * (x["a"] / 2 - 1)], {"a": 2.0})).directions
-    assert (hidden.words, hidden.verdict) == (f"a cannot be told apart from {words}", "not_identifiable")
+    assert (hidden.words, hidden.verdict) == (f"a cannot be separated from {words}", "not_identifiable")
 
 
 def test_a_combination_that_a_nuisance_hides_is_said_so():
@@ -165,7 +165,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
     trade = "a +10 % with b +10 % changes nothing that is measured"
     assert said.startswith(f"this: a and b are seen only together: {trade}")
-    assert said.endswith("cannot be told apart from the unknown start")
+    assert said.endswith("cannot be separated from the unknown start")
 
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):

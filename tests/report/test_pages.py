@@ -212,7 +212,7 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     assert "would have been detected" in text
     assert "By evidence the gap lies in the mechanics or what the effort sensors read" in text
     assert "Closed by joint_coulomb@elbow" in text
-    assert "the surest value is that of elbow" in text
+    assert "The most significant value is that of elbow" in text
     assert f"{moved.name} goes from" in text
 
 
@@ -224,7 +224,7 @@ def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tm
     vague = replace(trace, posterior_std=np.broadcast_to(0.9 * prior, trace.posterior_std.shape))
     page = page_of(replace(finding, smoother_result=replace(smoothed, smoothed_unknowns=(vague,))), tmp_path)
     assert "value in standard deviations expected beforehand" in page
-    assert "take the picture for a hint only" in text_of(page)
+    assert "The picture is only a hint." in text_of(page)
 
 
 def test_a_result_alone_gives_words_and_tables(found, tmp_path):

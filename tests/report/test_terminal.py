@@ -98,7 +98,7 @@ def test_a_solve_says_what_is_not_found():
     assert "±" not in "".join(lines[1:-4])
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
-    assert "the values are the best point that was reached; nothing can be said about how sure they are" in lines
+    assert "the values are the best point that was reached; their uncertainty is unknown" in lines
 
 
 def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_but_for_a_better_guess():
@@ -169,14 +169,14 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
 def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on():
     weak = solved(parameters={"a": parameter("weak")})
     methods = {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}}
-    beside = {"published": {"a": 1.0}, "published_explained": ["a = 1 of the paper: unexplained"]}
+    beside = {"published": {"a": 1.0}, "published_explained": ["a = 1 of Caldwell et al.: unexplained"]}
     lines = told("yid-compare/1", compared(methods=methods, judged=weak, **beside))
     assert "no parameter can be found from these recordings, so there is nothing to agree on" in lines
     assert line_of(lines, "cost (whitened)").split()[-2:] == ["5", "failed"]
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
-    assert "a = 1 of the paper: unexplained" in lines
+    assert "a = 1 of Caldwell et al.: unexplained" in lines
     said = "all methods agree within their uncertainty on the parameters that are found"
     assert said in told("yid-compare/1", compared())
 

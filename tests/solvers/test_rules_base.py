@@ -128,7 +128,7 @@ def test_a_fit_that_cannot_be_evaluated_has_failed():
     paper = MadeUp(misfit({1.0: 2.0, 4.0: 2.0}.get), weighting="paper")
     solver = Steps([[9.0]])
     assert solve(paper, solver).status == Status.CONVERGED
-    assert len(solver.runs) == 2, "the paper's cost is started again as well where it failed"
+    assert len(solver.runs) == 2, "the published cost is started again as well where it failed"
 
 
 def test_the_end_is_evaluated_where_the_solver_found_its_equilibria_and_has_deviations():
@@ -356,7 +356,7 @@ def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypat
     assert alone.x[0] == pytest.approx(ALIAS, rel=0.15), "by itself it stays with the alias"
     found = solve(problem, GaussNewton(max_iterations=40))
     assert found.x[0] == pytest.approx(TRUE, rel=1e-3)
-    assert any(step.note.endswith(": another valley") for step in found.history)
+    assert any(step.note.endswith(": another local minimum") for step in found.history)
 
 
 def with_weak_prior(target, std=0.1, start=3.0):

@@ -98,7 +98,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
     for left_out in (False, True):  # what is done already is no advice
         [thing] = group_foreign_clusters(still, 0.006, box_, links.__getitem__, False, left_out)
         assert ("background_estimation: frames" in thing.text) != left_out
-        assert "film the scene without object and robot" in thing.text
+        assert "record the scene without object and robot" in thing.text
 
 
 def test_extra_meshes_hang_on_links(system):

@@ -158,7 +158,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
         ({"format": "yid-plan/1"}, "another command"),
         ({"format": "yid-diagnosis/1"}, "CHANGELOG.md has the table"),
         ({"status": "failed", "message": "no"}, "the run failed"),
-        ({"covariance": {}}, "how sure its parameters are"),
+        ({"covariance": {}}, "has no covariance of its parameters"),
         ({"covariance": {"names": [], "matrix": []}}, "found no parameter"),
     ],
 )

@@ -80,11 +80,11 @@ def compare_methods(
 ) -> MethodComparison:
     """Run several methods from the same initial values and compare their estimates.
 
-    Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's,
-    without process noise, whose covariance not every method can carry. With process noise their estimates are not
+    Steepest descent gets the published cost (points in metres, no noise levels, no weak prior), the others that of the
+    problem without process noise, which not every method can carry. With process noise their estimates are not
     trusted, and the verdicts come from one more run of a method that can. `truth` are known parameter values;
     `callback` is called with the method's name and every `Iterate`; `limits` say when a residual is more than noise.
-    Of the `time_budget` [s] each method has what is left over the number of those to come; then it is stopped.
+    Each method has the rest of `time_budget` [s] over the number of methods still to run; then it is stopped.
     """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
     deadline = time.perf_counter() + time_budget
@@ -155,7 +155,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
 def _explanations(
     runs: Sequence[_MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> list[str]:
-    """Where methods sent the parameters that are not found, and where the paper's method went wrong."""
+    """Where methods sent the parameters that are not found, and where steepest descent as published went wrong."""
     sentences = []
     for name, reference in judged.items():
         if not reference.free or reference.verdict == "identifiable":
@@ -226,10 +226,10 @@ def _resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
-# -- the paper's estimates --------------------------------------------------------------------------------------------
-# Its recordings are not public. What is said of a value rests on twins of its experiments in MuJoCo, whose truth was
-# chosen: what their recordings inform, where steepest descent with the paper's cost and step lengths stands after 200
-# iterations, and where constant errors of the torques lead it (`benchmarks/torque_ensemble.py`).
+# -- estimates of Caldwell et al. (2014) ------------------------------------------------------------------------------
+# Their recordings are not public. Statements rest on synthetic recordings of the experiments in MuJoCo with a chosen
+# truth: what they inform, where steepest descent with the published cost and step lengths is after 200 iterations,
+# and where constant errors of the torques lead it (`benchmarks/torque_ensemble.py`).
 
 _PAPER_PARAMETERS = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 PAPER_ESTIMATES: dict[str, dict[str, float]] = {
@@ -238,7 +238,7 @@ PAPER_ESTIMATES: dict[str, dict[str, float]] = {
     "dual_arm_no_vision": dict(zip(_PAPER_PARAMETERS, (19.559, 4.965, 8.575, 10.374, 0.000, 11.287), strict=True)),
     "dual_arm_vision": dict(zip(_PAPER_PARAMETERS, (24.840, 0.000, 12.373, 30.775, 1.406, 24.900), strict=True)),
 }
-"""The source paper's answers for its four experiments [N m/rad]; its data are not public."""
+"""Answers of Caldwell et al. (2014) for their four experiments [N m/rad]; the data are not public."""
 _TRUTH_EXPERIMENT = "single_arm_vision"
 """The answer whose rounded values are the truth of the embedded recordings: the only one without a zero."""
 
@@ -266,10 +266,10 @@ def explain_paper_estimates(
     these that applies:
 
     not informed: such recordings do not find the parameter, or only so weakly that their interval holds the value;
-    near the truth: the value is within 10 % of the twin's truth;
-    slow: it lies between the start and where the paper's method stops without torque errors, far from the truth, or
+    near the truth: the value is within 10 % of the truth of the synthetic recordings;
+    slow: it lies between the start and where the published method stops without torque errors, far from the truth, or
     within 10 % of the latter;
-    torque error: it lies within what constant errors of the torques lead the paper's method to;
+    torque error: it lies within the values to which constant torque errors lead the published method;
     unexplained: anything else.
     """
     judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}
@@ -277,7 +277,7 @@ def explain_paper_estimates(
         return ()
     words = {name: _discrepancy(experiment, name, entry, truth.get(name)) for name, entry in judged.items()}
     return tuple(
-        f"{name} = {PAPER_ESTIMATES[experiment][name]:.4g} of the paper: {said}" for name, said in words.items()
+        f"{name} = {PAPER_ESTIMATES[experiment][name]:.4g} of Caldwell et al.: {said}" for name, said in words.items()
     )
 
 
@@ -298,9 +298,9 @@ def _discrepancy(experiment: str, name: str, entry: ParameterEstimate, truth: fl
     low, high = sorted((_DESCENT_INITIAL_VALUE, stopped))
     if truth is not None and not _near(stopped, truth) and (low <= value <= high or _near(value, stopped)):
         goes = f"goes from {_DESCENT_INITIAL_VALUE:.3g} to {stopped:.3g} in {_DESCENT_ITERATIONS} iterations"
-        return f"slow; without torque errors the paper's method {goes}"
-    many = f"{min(offsets):.3g} to {max(offsets):.3g} in {len(offsets)} twins"
-    led = f"constant torque errors of {_TORQUE_BIAS_STD:g} N m lead the paper's method to {many}"
+        return f"slow; without torque errors the published method {goes}"
+    many = f"{min(offsets):.3g} to {max(offsets):.3g} in {len(offsets)} synthetic recordings"
+    led = f"constant torque errors of {_TORQUE_BIAS_STD:g} N m lead the published method to {many}"
     if is_within_ensemble_range(value, offsets):
         return f"torque error; {led}"
     open_interval = "" if interval is None else f"leave {interval_text(*interval)} open and not this"

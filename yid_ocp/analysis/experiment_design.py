@@ -287,7 +287,7 @@ class CandidateExperimentSensitivityBuilder:
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
-        # what is assumed of the parameters themselves stays out: what is asked is what sensors say
+        # priors of the parameters themselves stay out: the question is what sensors inform
         stated[:, [problem.unknown_names.index(name) for name in names]] = 0.0
         return CandidateExperimentSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
 

@@ -412,7 +412,7 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * MAX_WEAK_RELATIVE_STD >= 1.0:
         what = parts[0].name if len(parts) == 1 else "this: " + _combination_words(parts)
-        return f"{what} cannot be told apart from {_hiding_nuisances(view, vector)}"
+        return f"{what} cannot be separated from {_hiding_nuisances(view, vector)}"
     form = _combination(view, *parts) if len(parts) == 2 else None
     if form is None:
         return _combination_words(parts)

@@ -295,7 +295,7 @@ _OFFSET_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.0
 # Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m].
 _GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
 _WRONG_GAIN_FACTOR = 3.0  # usual size of 1/g, and the factor from which a gain counts as wrong
-_MAX_EXPLAINED_RMS = 1.5  # of what is left, in sizes of the model's error, up to which a joint's effort is explained
+_MAX_EXPLAINED_RMS = 1.5  # residual over the model's error, up to which a joint's effort is explained
 _WELL_EXPLAINED_RMS = 0.5  # the same up to which nothing is left to be explained by a lag
 _WRONG_ROBOT_RMS = 3.0  # the same from which on it is not this robot's
 _MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # where numbers end that a fit can be made of

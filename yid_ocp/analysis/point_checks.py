@@ -101,7 +101,7 @@ def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choi
 
 
 def _explained(changes: Sequence[_Change], error: float, allowed: float, recording: str, group: str) -> Issue:
-    """The issue that the change which explains most stands for; the first of those that do equally well."""
+    """The issue of the change that explains most; the first of equally good ones."""
     best = min((change.error for change in changes), default=math.inf)
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
     words, depth = f"points are {error:.3g} m (rms) from where the model has them", error / allowed

@@ -225,7 +225,7 @@ class EquationOrDerivativeFormula:
 class NamedStepEquations(ReprMixin):
     """Symbolic equations of one time step, with named rows (equations) and columns (variables).
 
-    Rows are in the blocks `del` (DEL equations; at a prescribed coordinate what is left is -h times its effort),
+    Rows are in the blocks `del` (DEL equations; at a prescribed coordinate the residual is -h times its effort),
     `internal`, `constraint`, and `p1`, the momentum after the step; columns in `q0`, `p0`, `z0`, `u`, `theta`,
     `time_step`, and the unknowns `q1`, `z1`, `lam`.
     """

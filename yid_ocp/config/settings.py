@@ -292,8 +292,8 @@ class ProblemSettings(ProblemOptions):
         Annotated[float, Gt(0), Le(0.1)] | Literal["auto"],
         OptionInfo("of the integrator; auto halves 20 ms until half of it hardly changes the first prediction", "s"),
     ] = 0.01
-    force_split: Annotated[ForceSplit, OptionInfo("rule for forces; left is the paper's")] = "symmetric"
-    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node is the paper's")] = (
+    force_split: Annotated[ForceSplit, OptionInfo("rule for forces; left: Caldwell et al. (2014)")] = "symmetric"
+    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node: Caldwell et al.")] = (
         "midpoint"
     )
     use_compiler: Annotated[bool, OptionInfo("whether to compile the step where a C compiler is found")] = True
@@ -406,7 +406,7 @@ class _TrackSettings:
             "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
         ),
     ] = None
-    virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("what is filmed without frames")] = (
+    virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("virtual frames of a motion, instead of recorded ones")] = (
         _VirtualFramesSettings()
     )
     write_virtual_frames: Annotated[

@@ -163,7 +163,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
 def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
     """Issues for channels whose noise is far below the stated noise; channels of equal stated noise are pooled.
 
-    What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
+    Noise in settings may represent model error; only a fit shows whether it is too large. Noise need not
     be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so
     do steps. What has no noise at all was computed, as commands are.
     """

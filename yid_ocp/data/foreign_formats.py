@@ -174,7 +174,7 @@ def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
 
 
 def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
-    """Markers; three zeros stand for one that was not seen."""
+    """Markers; three zeros mean that one was not seen."""
     said: dict[str, list[str]] = {}
     body: list[list[str]] = []
     head: list[str] = []

@@ -332,7 +332,7 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     DataError
         If there is no group, or one is empty; names are repeated or do not match the arrays; a clock is not finite and
         strictly increasing; a joint channel has a value that is not finite; a point is infinite or seen in part; a
-        standard deviation is negative; the kind of effort is none that is known; a pose is not a rigid transform; joint
+        standard deviation is negative; the kind of effort is unknown; a pose is not a rigid transform; joint
         positions exceed 50 rad or points 50 m, which are degrees or millimetres; speeds or efforts are beyond any
         machine; `straight` does not match the first group of points.
     """

@@ -109,7 +109,7 @@ def diagnose(
     progress : Progress, optional
         The package's log when absent.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline, optional
-        What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
+        Estimates of earlier runs of the same model (`read_estimates`): priors, so that the question is
         what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is.
         An `EarlierRunsBaseline` may have reference recordings too, made without what is
         looked for; the effects found are taken out for them.
@@ -470,7 +470,7 @@ def _after(
     held: NullTestResult,
     limits: Thresholds,
 ) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
-    """The held-out null test with the effects, the places of the gap, and those of what is left of it."""
+    """The held-out null test with the effects, the places of the gap, and those of the residual gap."""
     if not accepted:
         return held, where, where
     last = accepted[-1].refitted_model

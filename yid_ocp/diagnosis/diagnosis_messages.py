@@ -214,7 +214,7 @@ def _nameless(finding: DiagnosisResult) -> str:
 
 
 def _effects(finding: DiagnosisResult) -> list[str]:
-    """What was added, what it closes, what it cannot be told from, and what remains."""
+    """Sentences on the added effects, what they close, what they cannot be separated from, and what remains."""
     last, total, rest = finding.final_model, finding.gap_closure, finding.remaining_test
     names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.accepted_effects)
     verb = "closes" if len(finding.accepted_effects) == 1 else "together close"

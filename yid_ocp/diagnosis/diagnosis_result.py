@@ -269,7 +269,7 @@ def _state(fit: RefittedModel, test: NullTestResult) -> dict[str, Any]:
 
 
 def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
-    """Effects that imitate the gap and are not its cause, each with the closure that it reaches and why it is none."""
+    """Effects that imitate the gap and are not its cause, each with its closure and the reason of its rejection."""
     failed, listed = failed_transfer_checks(finding.transfer_checks), []
     for entry in finding.selected_effects if finding.unknown_reason == "stand_in" else ():
         own = [check for check in failed if check.effect_label == entry.effect.label] or failed

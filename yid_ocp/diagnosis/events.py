@@ -271,7 +271,7 @@ def _driving_forces(
 
 
 def _short(smoothed: SmoothedUnknownsResult, recording: int, limits: Thresholds) -> list[str]:
-    """Unknown forces that are surely there, but for a small part of the time only."""
+    """Unknown forces that are significant, but for a small part of the time only."""
     trace, names = smoothed.smoothed_unknowns[recording], []
     for i, source in enumerate(trace.unknown_groups):
         sure = smoothed_unknown_significance_mask(trace, [i], limits.location_z)

@@ -43,7 +43,7 @@ _RIDGE_STD_RATIO = 3.0  # standard deviation of a value at a knot, beside its cu
 _MIN_KNOT_RANGE = 1e-3  # over which knots are spread where hardly anything is visited [unit of the quantity]
 _EVEN_STD_RATIO = 1 / 300  # of a drive's even part, f(x) + f(-x), over the prior's width: it has no favourite direction
 _MIN_VISITED_PART = 0.7  # of the knots' range that a fitted law must visit for its knots to stay
-_MIN_LEFTOVER_CLOSURE = 0.2  # part of what effects leave that a law beside them must close to be told
+_MIN_LEFTOVER_CLOSURE = 0.2  # part of the residual gap that a law beside effects must close to be reported
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def _refitted_families(
 def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw], slack: float) -> bool:
     """Whether a refit is as good as the best, the first, and has no more quantities than any other such refit.
 
-    It is where its held-out chi2/n is not surely higher, or by no more than `slack`.
+    It is where its held-out chi2/n is not significantly higher, or by no more than `slack`.
     """
 
     def is_as_good(own: _RefittedLaw) -> bool:
@@ -221,7 +221,7 @@ def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
 
 
 def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, least: float) -> bool:
-    """Whether a law surely closes at least a part of the gap."""
+    """Whether a law closes at least a part of the gap (lower 95 % bound)."""
     gained, error = held_out_improvement(before, after)
     return gained > error and closure.ci_low > least
 

@@ -5,8 +5,8 @@ The data say log p(data | f) = g'f - f'L f / 2 of the force's values f. It is a 
     cov f(s), f(t) = e(s) e(t) (delta(s, t) + exp(-|s - t|/a))/2 + s^2 exp(-|s - t|/b),   e^2 = (c m)^2 + w^2 + h^2/3,
 
 m the error that a model of these torques is allowed anyway, h what friction may hold. c >= 1, w and s are those of the
-largest evidence, with a pulse as without it, so that a model that errs everywhere makes no events. Pulses are taken in
-one after the other, that which raises the evidence most first: the search for shocks by auxiliary residuals (de Jong
+largest evidence, with a pulse as without it, so that a dominant model error makes no events. Pulses are added one after
+the other, that which raises the evidence most first: the search for shocks by auxiliary residuals (de Jong
 and Penzer 1998, doi:10.1080/01621459.1998.10473717) with pulses in place of impulses.
 """
 
@@ -394,7 +394,7 @@ def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filte
 
 
 def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
-    """A step or a swing to both sides that explains as much as a pulse does, so that it is none; shape (M,)."""
+    """A step or a swing to both sides that explains as much as a pulse does, so that it is not a pulse; shape (M,)."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, gain = end - begin, float(rest.gains(seen(window, t))[0])
     steps = np.arange(begin - length / 2, end + length / 2, history.time_spacing)

@@ -202,7 +202,7 @@ def score_candidates(
     found = []
     for tries in scores.values():
         best = tries[0]
-        # shape values that make no difference are told apart by nothing but rounding: the first one stays
+        # shape values that make no difference differ by rounding alone: the first one stays
         for score in tries[1:]:
             if score.predicted_chi2_decrease > best.predicted_chi2_decrease * (1 + _DECREASE_RTOL):
                 best = score
@@ -235,7 +235,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Residu
     step, decrease = _promised(x.T @ x, slope, lower, upper)
     # the candidate's own share of the residual would hide it: what would be left is what its score scatters with
     covariance = _newey_west_covariance(x, residual + x @ step, series)
-    # a residual below the noise must not make a score look sure
+    # a residual below the noise must not make a score significant
     covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
     statistic = float(slope @ _pinv(covariance) @ slope)
     p_value = chi2_p_value(statistic, len(step))

@@ -316,7 +316,7 @@ def select_effects(
             added = _rebuilt(search, nominal, pair, chosen)
         else:
             beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
-            # what looks alike and was not tried cannot be told from it yet
+            # what looks alike and was not tried cannot be separated from it yet
             alike = screened.confusability.confusable_with(chosen.effects[-1].label, limits.signature_overlap)
             beside += [own[0] for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
             added = (*added, SelectedEffect(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
@@ -367,7 +367,7 @@ def _little_is_left(fit: RefittedModel, limits: Thresholds) -> bool:
 
 
 def _worth_adding(current: RefittedModel, chosen: RefittedModel, limits: Thresholds) -> bool:
-    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
+    """Whether the last effect of a fit closes a significant and relevant part of the gap, and is significant itself."""
     before, after = current.held_out_loss, chosen.held_out_loss
     gained, error = held_out_improvement(before, after)
     part = gained >= limits.min_gap_closed * before.excess_chi2_per_sample and before.excess_chi2_per_sample > 0
@@ -376,7 +376,7 @@ def _worth_adding(current: RefittedModel, chosen: RefittedModel, limits: Thresho
 
 
 def _is_there(without: RefittedModel, full: RefittedModel, effect: EffectBase, limits: Thresholds) -> bool:
-    """Whether an effect is surely not zero and takes away a relevant part of the held-out error."""
+    """Whether an effect is significant and removes a relevant part of the held-out error."""
     reduced = _is_rmse_reduced(without.held_out_loss, full.held_out_loss, limits)
     return reduced and _is_significant(effect, full, limits)
 
@@ -436,7 +436,7 @@ def _revised(
 
 
 def _needed(without: RefittedModel, full: RefittedModel, effect: EffectBase, limits: Thresholds) -> bool:
-    """Whether held-out recordings are surely predicted worse without an effect, and it is there at all."""
+    """Whether held-out recordings are predicted significantly worse without an effect that is significant."""
     gained, error = held_out_improvement(without.held_out_loss, full.held_out_loss)
     sure = gained > error or _lr_decisive(without.held_out_loss, full.held_out_loss, limits)
     return sure and _is_there(without, full, effect, limits)

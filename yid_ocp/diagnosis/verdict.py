@@ -129,9 +129,9 @@ def has_significant_gap(
 ) -> bool:
     """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
 
-    Along a candidate's signature some channel must be above noise too; the sum over all channels
-    does not notice what only a few samples show. A candidate alone has to be surer than that sum. An offset of a torque
-    beyond what was stated needs no such channel where `offsets` are stated: it is one number among thousands.
+    Along a candidate's signature some channel must be above noise too; the sum over all channels does not notice what
+    only a few samples show. A candidate alone needs a smaller p-value than the sum. An offset of a torque beyond the
+    stated one needs no such channel where `offsets` are stated: it is one number among thousands.
     """
     if residuals_exceed_noise((before, held_out), limits.null_test_limits):
         return True
@@ -164,7 +164,7 @@ def finer_step_that_explains_gap(
 ) -> RefitContext | None:
     """Return all hypotheses at half the time step if that explains more than half of what the best candidate promises.
 
-    It is asked by one prediction at the nominal `fit` and one Gauss-Newton step from there, on the recordings to
+    The test is one prediction at the nominal `fit` and one Gauss-Newton step from there, on the recordings to
     estimate on without their `events`; None where it explains less or cannot be predicted.
     """
     h = fit.problem.step.time_step / 2
@@ -191,7 +191,7 @@ def is_barely_significant_and_unexplained(
 ) -> bool:
     """Whether an excess counts as chance: barely significant, and explained by no unknown or candidate.
 
-    A sure excess without shape stays a gap: stated noise that is too small looks like that.
+    A significant excess without shape stays a gap: understated noise looks like that.
     """
     best = bonferroni_min_p_value(ranked)
     barely = min(before.p_value, held_out.p_value) > limits.unexplained_p_factor * limits.significance_level

@@ -199,7 +199,7 @@ def _rows(symbols: NamedStepEquations, block: SymbolBlock, values: dict[str, flo
         sign = "-" if block.name == "del" else "+"
         pull = "" if not e.lam.numel() else ", $G$ the pull of the grasps"
         lines.append(
-            rf"$B$ stands for $\tfrac{{h}}{{2}} \, \partial (T - V) / \partial q_m {sign} \partial T / \partial v_m$ "
+            rf"$B$ denotes $\tfrac{{h}}{{2}} \, \partial (T - V) / \partial q_m {sign} \partial T / \partial v_m$ "
             rf"of the bodies above{pull}."
         )
     for i, label in enumerate(block.labels):

@@ -387,7 +387,7 @@ def _recording(
 
 
 def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span: float, decay: float) -> Array:
-    """Variance of unknown forces that stand for the noise of recorded torques, in units of the squared reference."""
+    """Variance of unknown forces that represent the noise of recorded torques, in units of the squared reference."""
     errors, driven = course.episode.input_errors, course.system.driven
     known = np.zeros(len(unknowns.names))
     if errors is None:

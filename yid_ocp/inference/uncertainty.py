@@ -26,7 +26,7 @@ ConfidenceInterval = tuple[float | None, float | None]
 
 MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
 MAX_WEAK_RELATIVE_STD = 4.0
-# A standard deviation of so many times the value, or its typical size, stands for none at all.
+# A standard deviation of this many times the value, or its typical size, counts as infinite.
 MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6
 # A value so near its bound, in units of the unknown's typical size, lies at it.
 _AT_BOUND_FRACTION = 1e-4
@@ -183,7 +183,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     adjusted = []
     for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
         share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
-        # what no other cluster informs cannot be told from these
+        # what no other cluster informs cannot be separated from these
         kept = share < 1 - 1e-6
         grown = np.where(kept, 1.0 / np.sqrt(np.where(kept, 1.0 - np.maximum(share, 0.0), 1.0)), 0.0)
         adjusted.append(root @ (axes * grown) @ axes.T @ (back @ total))

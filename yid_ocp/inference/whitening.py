@@ -275,7 +275,7 @@ def _whitened_episode(
 def _about_smoothed(
     predictor: EpisodePredictor, episode: Episode, theta: Array, result: EpisodePrediction, before: WhiteningFilter
 ) -> Episode:
-    """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
+    """The episode about its torques and, with encoders, its motion as all measurements estimate them."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
     found = before._smooth_input_errors(_plain(episode, result), result.torque_correction_and_sensitivity)

@@ -168,7 +168,7 @@ class CompiledKernel:
         if known is None:
             return [self._rolled_out(self._library, [member])[0] for member in members]
         found = self._rolled_out(known[0], members)
-        # a batch knows simplified Newton only; what needs more, and what fails, is told by the kernel of one member
+        # a batch knows simplified Newton only; what needs more, and what fails, goes to the kernel of one member
         pairs = zip(found, members, strict=True)
         return [out if out.status.is_converged else self._rolled_out(self._library, [one])[0] for out, one in pairs]
 

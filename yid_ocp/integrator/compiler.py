@@ -124,7 +124,7 @@ def _version(path: str) -> str:
 
 
 def _flags(path: str) -> tuple[str, ...]:
-    """What a compiler is told wherever its code runs."""
+    """Flags of a compiler, independent of the machine."""
     return (*_COMMON_FLAGS, *_GCC_FLAGS) if "Free Software Foundation" in _version(path) else _COMMON_FLAGS
 
 

@@ -73,7 +73,7 @@ class _ConstraintImpulses:
 class DiscreteEquations:
     """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system, with their symbols.
 
-    Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters. 0 and 1 stand for the
+    Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters. 0 and 1 are the
     two nodes; coordinates q (n, 1), internal ones z (nz, 1), momenta p (n, 1) [N m s].
     """
 
@@ -204,7 +204,7 @@ def discrete_equations(
 
 @dataclass(frozen=True)
 class _Symbols:
-    """The symbols of a step, and those that stand for its midpoint until `placed` puts the nodes in their place."""
+    """The symbols of a step, and those of its midpoint until `placed` inserts the nodes."""
 
     q0: ca.SX
     q1: ca.SX

@@ -179,9 +179,9 @@ def compile_step(
     time_step : float
         h [s], positive.
     force_split : "symmetric" or "left"
-        Order two, or the rule of the paper's engine.
+        Order two, or the rule of Caldwell et al. (2014).
     constraint_force : "node" or "midpoint"
-        Where the constraints pull: as in the paper's engine, or so that no tension makes the motion grow (see
+        Where the constraints pull: as in that paper, or so that no tension makes the motion grow (see
         `discrete_equations`).
     use_compiler : bool
         Without it, and without a compiler on the machine (with one notice), the step is interpreted.

@@ -393,7 +393,7 @@ def _client(distributed: Any, where: dict[str, str]) -> Any:
 def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | None) -> None:
     """Refuse workers with other versions, with several threads, or without access to the same files.
 
-    What they are asked travels whole: a worker without this package that reads the name of a function of it is lost.
+    Tasks are sent whole: a worker without this package that reads the name of a function of it is lost.
     """
     for address, count in client.nthreads().items():
         if count > 1:

@@ -123,7 +123,7 @@ def plan_informative_motion(
 def _chosen(
     problem: EstimationProblem, options: PlanOptions, sizes: Mapping[str, Mapping[str, float]]
 ) -> tuple[tuple[str, ...], tuple[EffectBase, ...]]:
-    """Parameters that are to be told, or effects that are to be separated."""
+    """Parameters to identify, or effects to separate."""
     if options.identify is not None and options.discriminate is not None:
         what = "both parameters to identify and effects to discriminate are given"
         raise ConfigError(what, where="plan.discriminate", allowed="one of the two")

@@ -233,7 +233,7 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
 
 
 def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
-    """The measurements at nearest nodes with the source paper's weights: 0 at k = 0, double at the last node, else 1.
+    """Measurements at nearest nodes, weighted as in Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
     """

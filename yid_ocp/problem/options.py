@@ -108,7 +108,7 @@ class ProblemOptions:
         Len(1),
         OptionInfo("of the filter `proportional`, for one arm or for all driven joints", "N m/rad"),
     ] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
-    weighting: Annotated[ResidualWeightingName, OptionInfo("cost in standard deviations, or the paper's")] = "whitened"
+    weighting: Annotated[ResidualWeightingName, OptionInfo("of residuals; paper: Caldwell et al. (2014)")] = "whitened"
     huber_threshold: Annotated[
         float,
         Gt(0),
@@ -128,7 +128,7 @@ class ProblemOptions:
         Ge(0),
         OptionInfo(
             "factor up or down that is one standard deviation of the weak prior, which keeps positive parameters "
-            "without a prior near their start where nothing informs them; 0 for none; the paper's weighting has none"
+            "without a prior near their start where nothing informs them; 0 for none; weighting: paper has none"
         ),
     ] = 10.0
     initial_configuration_std: Annotated[

@@ -109,9 +109,9 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
 def _courses(
     joints: JointGroup, driven: tuple[str, ...], where: str, servos: Mapping[str, PositionServo]
 ) -> list[scipy.interpolate.PPoly]:
-    """What moves each joint over time, between the first sample and the end of what the last one stands for."""
+    """What moves each joint over time, between the first sample and the end of the last one's interval."""
     t = joints.t
-    # the last sample stands for as long as the one before it
+    # the last sample lasts as long as the one before it
     edges = np.append(t, 2 * t[-1] - t[-2])
     if servos:
         if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):

@@ -271,7 +271,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             cells = []
             for method, entry in runs.items():
                 found = entry["parameters"][name]
-                # elsewhere a curvature tells nothing of how sure it is, nor where noise is left out
+                # elsewhere the curvature is no measure of uncertainty, nor where noise is left out
                 ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
                 known = (found["std"], found["interval"]) if ended else (None, None)
                 lost = own["verdict"] == "not_identifiable"

@@ -343,7 +343,7 @@ def parameter_values_by_source_figure(
         figure.add_scatter(**points, mode="markers", marker={"color": color, "size": 8, "symbol": symbol})
     numbers = [0.0, *(value for row in rows.values() for value, _ in row.values())]
     low, high = min(numbers), max(numbers)
-    # bars of what cannot be told would squeeze all others
+    # bars of undetermined parameters would compress all others
     figure.update_xaxes(range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
     ends = [len(names) - 0.5, -0.5]
     return figure.update_yaxes(tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
@@ -418,7 +418,7 @@ def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, 
     if min(numbers) > 0 and max(numbers) > 30 * min(numbers):
         figure.update_xaxes(type="log", exponentformat="power", dtick="D2" if max(numbers) < 1e3 * min(numbers) else 1)
     else:
-        # bars of what cannot be told would squeeze all others
+        # bars of undetermined parameters would compress all others
         figure.update_xaxes(range=[min(0.0, 1.1 * min(numbers)), 1.15 * max([*numbers, 1e-12])])
     return figure
 

@@ -79,7 +79,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from discretisation_shift_sentences(result)
     yield from result.get("discretisation_notes", ())
     if failed:
-        said = "the values are the best point that was reached; nothing can be said about how sure they are"
+        said = "the values are the best point that was reached; their uncertainty is unknown"
         yield SummaryStatement(said, "verdict")
     else:
         yield from (SummaryStatement(text, "verdict") for text in _found_and_lost(free))

@@ -35,7 +35,7 @@ _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 class SummaryStatement:
     """One sentence of a summary, with its importance.
 
-    Verdicts are what the command was asked for, a conclusion is what they come to: a page begins with conclusions, then
+    Verdicts answer the command's question, a conclusion summarises them: a page begins with conclusions, then
     has the verdicts.
     """
 
@@ -110,7 +110,7 @@ def p_value_text(p_value: float) -> str:
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summary blocks on issues of the recordings: a table and advice."""
     doubts = result.get("doubts", ())
-    rows: TableRows = [("in doubt", "where", "how sure", "times its limit")]
+    rows: TableRows = [("in doubt", "where", "certainty", "times its limit")]
     advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in doubts):
         alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]

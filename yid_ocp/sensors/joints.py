@@ -146,7 +146,7 @@ def smoothed_effort_data(
     until the next. `DataError` of a recording too short for the filter.
     """
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
-    # what stands for an interval belongs to its middle
+    # the mean of an interval belongs to its middle
     late = 0.0 if is_sample else 0.5 * period
     kept, measured = nodes_and_decorrelated_values(around, t, values, "efforts", late)
     times = around.node_times[kept]

@@ -285,18 +285,18 @@ class AcceptedIterateRecorder:
 
 # A start from which the rollout fails is approached over shorter horizons, each the start of the next [fraction].
 _HORIZON_FRACTIONS = (0.06, 0.12, 0.25, 0.5)
-# A fit whose chi2 per degree of freedom exceeds this may be a wrong valley (a soft object has several shapes at rest):
+# A fit whose chi2 per degree of freedom exceeds this may be a wrong minimum (a soft object has several shapes at rest):
 # it is started again from these multiples of the initial values, and the best is kept.
 _POOR_CHI2_PER_DOF = 5.0
 INITIAL_VALUE_RESTART_FACTORS = (4.0, 2.0, 10.0)
-# Beside noise that drives the motion a wrong valley may hide in chi2 per degree of freedom of 1.03. Where anything is
-# known worse than this part of its value, or has fallen below that part of its start, another start is tried.
+# Beside noise that drives the motion a wrong minimum may have chi2 per degree of freedom of only 1.03. Where a
+# relative std exceeds the first, or a value falls below the second part of its start, another start is tried.
 _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
-# An arm that folds the object for a moment parts valleys that lie near each other: where the model does not explain the
-# recording, starts these factors off the best fit are tried, stiffer ones, with which less folds.
+# An arm that folds the object for a moment separates minima that lie near each other: where the model does not explain
+# the recording, starts these factors off the best fit are tried, stiffer ones, with which less folds.
 _NEARBY_START_FACTORS = (1.25, 1.6)
 # A branch that is seen a few times a second has the phase of several frequencies: what is known worse than this part of
-# its value may have other valleys. It is moved by these factors, the others as the fit's covariance says, and where the
+# its value may have other minima. It is moved by these factors, the others as the fit's covariance says, and where the
 # cost then rises by less than this part of what the fit predicts, the search goes on from there, twice at most.
 _MIN_SCANNED_RELATIVE_STD, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = 0.03, 0.2, 2
 _SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
@@ -399,10 +399,10 @@ class _MultiStartSearch:
             if not best.evaluation.ok or assess_goodness_of_fit(best.weighted, best.evaluation, limits).explains:
                 break
             self._try(self._multiple(best.result.x, factor), f"best fit x {factor:g}", most)
-        valleys = _other_valleys(self._best)
-        most = self._n_starts + len(valleys)
-        for near in valleys:
-            self._try(near, "another valley", most)
+        minima = _other_minima(self._best)
+        most = self._n_starts + len(minima)
+        for near in minima:
+            self._try(near, "another local minimum", most)
 
     def _multiple(self, x: Array, factor: float) -> Array:
         return np.where(self._problem.positive_unknowns_mask, np.clip(x * factor, *self._problem.bounds), x)
@@ -535,7 +535,7 @@ def _doubtful(fit: _Fit, first: Array) -> BoolArray:
     return fit.weighted.positive_unknowns_mask & (loose | (x < _COLLAPSED_FRACTION * first))
 
 
-def _other_valleys(fit: _Fit) -> list[Array]:
+def _other_minima(fit: _Fit) -> list[Array]:
     """Starts from which a loosely known unknown may go to another value than the one found, the likeliest first."""
     problem, finish, x = fit.weighted, fit.evaluation, fit.result.x
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
@@ -549,7 +549,7 @@ def _other_valleys(fit: _Fit) -> list[Array]:
         for factor in _SCAN_FACTORS:
             along = np.where(known, covariance[:, i] / covariance[i, i], 0.0)
             moved = np.clip(x + along * (factor - 1.0) * x[i], *problem.bounds)
-            # a stiffness counts by its logarithm where that says less: a slope that fades is no valley
+            # a stiffness counts by its logarithm where that says less: a slope that fades is no minimum
             expected = 0.5 * (min(abs(factor - 1.0), abs(math.log(factor))) * x[i] / std[i]) ** 2
             there = problem.evaluate(moved, derivatives=False, equilibrium_guesses=finish.equilibrium_guesses)
             rise = there.cost - finish.cost

@@ -1,4 +1,4 @@
-"""Methods that follow derivatives of a rollout: Gauss-Newton, L-BFGS-B, and the source paper's steepest descent."""
+"""Methods that follow derivatives of a rollout: Gauss-Newton, L-BFGS-B, steepest descent of Caldwell et al. (2014)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class GaussNewton(SolverWithCheckedSettings):
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised (Nocedal and Wright 2006, Numerical Optimization, chapter 10,
     doi:10.1007/978-0-387-40065-5). A short step, or one that damping keeps from promising anything, is no end
-    (`is_stationary_point`). Many steps that are worth nothing beside the noise are one: where the valley is rough
+    (`is_stationary_point`). Many steps that gain nothing beside the noise are an end: where the cost is rough
     (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
     """
 
@@ -205,7 +205,7 @@ class SingleShooting(SolverWithCheckedSettings):
 class SteepestDescent(SolverWithCheckedSettings):
     """Projected steepest descent: x <- P(x - s g), P the projection on the bounds, s by Armijo backtracking.
 
-    The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did. The first length tried in an
+    The gradient comes from the adjoint. Unscaled on purpose, as in the paper. The first length tried in an
     iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's from the change of the gradient
     (`spectral`), which needs far fewer iterations; most of these pay only a few steps later and want a
     `nonmonotone_memory` of about 10.
@@ -226,10 +226,10 @@ class SteepestDescent(SolverWithCheckedSettings):
     sufficient_decrease: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo's constant")] = 1e-4
     backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("backtracking factor")] = 0.5
     first_trial_step_rule: Annotated[
-        Literal["last", "spectral"], OptionInfo("first length tried in an iteration; last is the paper's")
+        Literal["last", "spectral"], OptionInfo("first length tried in an iteration; last: Caldwell et al. (2014)")
     ] = "last"
     nonmonotone_memory: Annotated[
-        int, Ge(1), OptionInfo("the cost must fall below the largest of so many last ones; 1 is the paper's")
+        int, Ge(1), OptionInfo("the cost must fall below the largest of this many last ones; 1 is monotone descent")
     ] = 1
     name: ClassVar[str] = "steepest_descent"
 

@@ -259,7 +259,7 @@ class _AdaptiveRidge(ca.Callback):
 
 
 class _Watch(ca.Callback):
-    """Told by CasADi of every iterate; enters it in the history."""
+    """Callback of CasADi that records every iterate in the history."""
 
     def __init__(
         self,

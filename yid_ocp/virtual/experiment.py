@@ -43,7 +43,7 @@ _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
 def baxter_foam_y_system(arms: int) -> System:
-    """The paper's system: Baxter with one or two arms that hold the foam Y by point grasps.
+    """The system of Caldwell et al. (2014): Baxter with one or two arms that hold the foam Y by point grasps.
 
     The left arm holds the tip of T2 (43 coordinates), the right one that of T3 (50); every arm joint is driven, viscous
     damping is 0.05 N m s/rad on every coordinate. `ConfigError` of another number of arms.

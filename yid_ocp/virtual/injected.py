@@ -333,7 +333,7 @@ def _cord(size: float, way: Array) -> Array:
 
 
 def _one_way_damping(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    # MuJoCo is told of it as its own damping, which it integrates implicitly: a light branch under so much explicit
+    # MuJoCo gets it as its own damping, which it integrates implicitly: a light branch under so much explicit
     # damping bursts
     both = scene.bend_joint_ids(model, segment)
     usual = model.dof_damping[both].copy()

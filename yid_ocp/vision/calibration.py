@@ -347,7 +347,7 @@ class _Calibrator:
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
     def _about_the_arm(self, glimpse: CalibrationFrame) -> CalibrationFrame | None:
-        """The points in the directions where the arm is, as far as told; None where it is out of view."""
+        """The points in the directions of the arm by the stated camera; None where it is out of view."""
         own = self.told.world_to_measured_points(self.arm.visible_surface_points(self.told, glimpse.stamp)[0])
         points = glimpse.points[glimpse.points[:, 2] > 0]
         if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):

@@ -6,8 +6,8 @@ A point p that the camera measured at its time s should lie on the robot's surfa
 
 with the camera's pose (R, t), a factor g and an offset o on its depth z along the ray, and its clock, ahead by tau0 and
 by beta in every second. The surface's point is where the camera's ray through P meets the robot, or the nearest one,
-which leads from further away. Steps are those of Gauss and Newton on a robust sum (Geman and McClure) of e, with what
-is told as the mean of a normal prior.
+which leads from further away. Steps are those of Gauss and Newton on a robust sum (Geman and McClure) of e, with the
+stated values as the mean of a normal prior.
 
 Errors are alike from pixel to pixel of a frame, and from frame to frame at one place of a link. The covariance is the
 sandwich H^-1 B H^-1 with B summed over frames and over patches of the links as wholes, less what each patch has in each
@@ -292,7 +292,7 @@ def initial_camera_states(
     """Candidate camera states at which the arm's visible surface lies on the clouds, best first.
 
     So many at most, at least `_MIN_START_SEPARATION` from one another, with clock offsets up to `search` [s] from the
-    told one.
+    stated one.
     """
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)

@@ -269,7 +269,7 @@ class ShapeFitter:
     def _attempt(
         self, sight: ProcessedFrameCloud, starts: Sequence[Array], left: _Left
     ) -> tuple[_Minimum, ShapeFitQualityAndPointClasses]:
-        """The best shape through some of the nodes and points, then through those that are surely its own."""
+        """The best shape through some of the nodes and points, then through those that belong to it."""
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
         tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
@@ -413,7 +413,7 @@ class ShapeFitter:
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
     ) -> FrameTubeDimensionCost:
-        """What a frame's points say of lengths and radii at its shape."""
+        """Cost of lengths and radii by a frame's points at its shape."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
         corners, jacobian = self._links_at(q), self._corners(q)[1]

@@ -241,14 +241,14 @@ _FILM_HINT = "write its depth images as 16-bit PNG into a folder with camera.jso
 
 
 class _Film:
-    """An Azure Kinect's film, whose frames are found by going through it: the last one that was read is kept."""
+    """Video file of an Azure Kinect, read frame by frame; the last frame is kept."""
 
     reader: Any = None
     _kind: Any
 
     def __init__(self, path: Path) -> None:
         self.path, self._kind = path, getattr(import_open3d().io, "AzureKinectMKVReader", None)
-        what = "this build of Open3D cannot read the films of Azure Kinects"
+        what = "this build of Open3D cannot read the videos of Azure Kinects"
         if self._kind is None:
             raise DataError(what, where=str(path), hint=_FILM_HINT)
         try:
@@ -257,7 +257,7 @@ class _Film:
             raise DataError(f"{what} here ({error})", where=str(path), hint=_FILM_HINT) from error
         if not self.reader.is_opened():
             allowed = "an Azure Kinect's .mkv"
-            raise DataError("the film cannot be read", where=str(path), allowed=allowed, hint=_FILM_HINT)
+            raise DataError("the video cannot be read", where=str(path), allowed=allowed, hint=_FILM_HINT)
 
     def _rewind(self) -> None:
         if self.reader is not None:
@@ -282,10 +282,10 @@ class _Film:
         while self._index < index:
             self._last = self.reader.next_frame()
             if self.reader.is_eof():
-                raise DataError("the film ends before this frame", where=str(self.path))
+                raise DataError("the video ends before this frame", where=str(self.path))
             self._index += 1
         if self._last is None:
-            raise DataError("the film has no picture there", where=f"{self.path}, frame {index}")
+            raise DataError("the video has no image there", where=f"{self.path}, frame {index}")
         return self._last
 
 
@@ -298,7 +298,7 @@ def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
     lens = CameraIntrinsics(int(inner.width), int(inner.height), matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     count = film.count()
     if not count:
-        raise DataError("the film holds no frame", where=str(path))
+        raise DataError("the video has no frame", where=str(path))
     times = 1e-6 * float(metadata.stream_length_usec) * np.arange(count) / count
 
     def depth(index: int) -> Array:

@@ -34,7 +34,7 @@ class WeightedCloud:
     """Point cloud whose weights are the numbers of camera points that each point represents."""
 
     points: Array  # (N, 3), in the world [m]
-    point_weights: Array  # (N,), how many of the camera's points each one stands for
+    point_weights: Array  # (N,), how many of the camera's points each one represents
 
     def __len__(self) -> int:
         return len(self.points)

@@ -138,7 +138,7 @@ def group_foreign_clusters(
             text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
         else:
             text += "" if background else "set track.options.background_estimation: frames, or "
-            text += "film the scene without object and robot for track.background_frames_path"
+            text += "record the scene without object and robot for track.background_frames_path"
             text += f"; or {boxed}" if beside else ""
             text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if poses[0] else ""
         found.append(ForeignObject(centre, size, len(group), moving, link, text))
@@ -316,5 +316,5 @@ class SequenceCalibration:
     """Camera calibration, object dimensions and background of a sequence."""
 
     camera_calibration: CameraCalibration  # the camera's pose, how it scales depth, and its clock
-    dimensions: TubeDimensionEstimates  # what the frames say of the object's lengths and radii
+    dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them
     background: BackgroundPoints  # what stands there in all frames

@@ -523,8 +523,8 @@ def render_virtual_frames(
     """Frames that a virtual camera takes of a motion; each is rendered on loading, the same every time.
 
     Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
-    Where there is a robot, the paper's Y stands on a floor, and a wall stands behind Baxter. `DataError` or
-    `ModelError` for no Open3D, no object, a mesh that cannot be read, or a pose that is none.
+    Where there is a robot, the foam Y stands on a floor, and a wall stands behind Baxter. `DataError` or
+    `ModelError` for no Open3D, no object, an unreadable mesh, or an invalid pose.
     """
     lens, pose = camera.sensor_model.intrinsics, validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)

@@ -74,9 +74,9 @@ class TrackResult:
     shared_std: Array  # the part that all frames have in common, from the camera's pose, depth and clock
     frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
     camera_calibration: CameraCalibration
-    dimensions: TubeDimensionEstimates  # what the frames say of the object's lengths and radii
+    dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them
     foreign_objects: tuple[ForeignObject, ...]  # what stood about the object
-    root_note: str  # how the root was told from other ends; empty where the model says where it is
+    root_note: str  # how the root was distinguished from other ends; empty where the model places it
     _place: Callable[[Array], Array]  # from a configuration to the points
 
     def configuration_at_time(self, t: float) -> Array:

@@ -150,7 +150,7 @@ def run_blind(
 
 @dataclass(frozen=True)
 class _Proof:
-    """What a blind validation was asked for, and where and by whom it is done."""
+    """Settings of a blind validation, its folder and its workers."""
 
     folder: Path
     runs: Sequence[RunSettings]

@@ -290,7 +290,7 @@ def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[s
 
 
 def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
-    """What sections of the model say of parameters: ordinary friction is free, a known motor has values and priors."""
+    """Settings of parameters that sections of the model imply: friction free, motors with values and priors."""
     found: dict[str, ParameterSettings] = {}
     friction, motor = run.model.friction, run.model.arms.servo.motor
     values: dict[str, float] = {}

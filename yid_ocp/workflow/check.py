@@ -196,7 +196,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
     warnings += notes
-    # how poorly initial values fit says nothing of how sure the data will be of what fits
+    # how poorly initial values fit does not predict the uncertainty after a fit
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
     return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})

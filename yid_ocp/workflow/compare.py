@@ -25,7 +25,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
     if not solvers:
         raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
     if experiment is not None and experiment not in PAPER_ESTIMATES:
-        what = f"the paper has no experiment '{experiment}'"
+        what = f"Caldwell et al. (2014) have no experiment '{experiment}'"
         raise run.config_error(what, "compare", "reference_paper_experiment_name", allowed=", ".join(PAPER_ESTIMATES))
     with atomic_run_folder(run, out, "compare") as folder:
         folder.record_run_start(run, "compare")

@@ -35,7 +35,7 @@ _MIN_FRICTION_TRAVEL = 0.02  # A joint that turns less than this says nothing of
 _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
 _TORQUE_BIAS_FRACTION = 0.01  # of a joint's effort limit, as the constant error of its torque where none is stated
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
-_POSITION_STEP_PERCENT = 5  # places along a segment are told apart in so many percent
+_POSITION_STEP_PERCENT = 5  # resolution of places along a segment [%]
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
 _LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
 """Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""

@@ -79,7 +79,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-# -- what was asked ---------------------------------------------------------------------------------------------------
+# -- arguments --------------------------------------------------------------------------------------------------------
 
 
 def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject | None:

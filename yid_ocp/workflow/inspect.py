@@ -56,7 +56,7 @@ class _LinearisationPoint:
 def _run_inspect(
     run: RunSettings, out: str | Path | None, progress: Progress, entries: Sequence[str], export: str | None
 ) -> CommandOutcome[None]:
-    """Write result.json, equations.txt, sparsity.png, kkt.png and linearisation.h5, and what is asked for beside."""
+    """Write result.json, equations.txt, sparsity.png, kkt.png and linearisation.h5, and further files on request."""
     with atomic_run_folder(run, out, "inspect") as folder:
         folder.record_run_start(run, "inspect", [part for name in entries for part in ("--entry", name)])
         progress.begin_stage("building the model and its compiled step")
@@ -64,7 +64,7 @@ def _run_inspect(
         step = build_step(run)
         seconds = time.perf_counter() - begun
         symbols, parameters = NamedStepEquations.from_equations(step.equations), step.system.parameters
-        # a wrong name is told before anything takes time; parameters are single names without brackets
+        # a wrong name is refused before anything takes time; parameters are single names without brackets
         asked = [text.strip() for text in entries]
         named = [text for text in asked if text and not set(text) & set("[,")]
         for name in named:

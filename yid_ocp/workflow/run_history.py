@@ -64,7 +64,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
         effects = parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
-        what = "the result does not say how sure its parameters are together"
+        what = "the result has no covariance of its parameters"
         allowed = "keys parameters and covariance, as this version writes them"
         raise DataError(what, where=str(file), allowed=allowed, hint="run it again") from error
     if not names:

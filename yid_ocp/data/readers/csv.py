@@ -50,7 +50,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     """Options of `read_csv`: meaning of the table's columns, columns to keep, delimiter, header and clock.
 
     `columns` say what a column means where its name does not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
-    column's name stands for any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
+    column's name matches any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
     """
 
     columns: Mapping[str, str] | None = None
@@ -100,7 +100,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
 
 
 def _mocap_table(path: Path) -> tuple[PointGroup, str, tuple[str, ...]] | None:
-    """Contents of an export of a motion capture program; None where the table is none."""
+    """Contents of an export of a motion capture program; None for another table."""
     delimiter = _delimiter(path)
     read = mocap_table_reader(next(_rows(path, delimiter), (1, []))[1])
     return None if read is None else read(_rows(path, delimiter), str(path))

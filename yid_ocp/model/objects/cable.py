@@ -47,9 +47,9 @@ _Vector3 = tuple[float, float, float]
 MEMORY_HALVING_SPEED_PARAMETER_NAME = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
-# Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
+# Parameters of a joint whose rest angle follows from the start: its angle there [rad] and the torque it bears [N m].
 START_ANGLE_AND_LOAD_SUFFIXES = ("start", "load")
-# Parameter that is told the root mean square speed of the measured points at the start [m/s].
+# Parameter set to the root mean square speed of the measured points at the start [m/s].
 START_SPEED_PARAMETER_NAME = "start.speed"
 
 

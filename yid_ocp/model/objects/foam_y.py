@@ -1,4 +1,4 @@
-"""The source paper's foam letter Y: three tubes of four links each, standing on the ground."""
+"""The foam letter Y of Caldwell et al. (ISER 2014): three tubes of four links each, standing on the ground."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
 class FoamY(MountedObjectKind):
-    """The source paper's foam letter Y; without a mount its foot is placed as in the paper."""
+    """The foam letter Y of Caldwell et al. (2014); without a mount its foot is at the default place."""
 
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
         "foam_y": InitCommandObjectFactory(4, _init_object)

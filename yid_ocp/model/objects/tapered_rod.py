@@ -84,7 +84,7 @@ def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
         ends, sizes = (radius_at(i / n), radius_at((i + 1) / n), taper.symbol), (layout.link_lengths[i], layout.radius)
         return replace(joint, bodies=tuple(_frustum(body, *ends, *sizes) for body in joint.bodies))
 
-    # a joint stands for the half links on both sides of it, the first one for its own half link
+    # a joint represents the half links on both sides of it, the first one its own half link
     factors = {name: radius_at(i / n if i else 0.25 / n) ** 4 for i, names in enumerate(links) for name in names}
     springs = tuple(
         replace(s, stiffness=s.stiffness * factors[s.joint_name], damping=s.damping * factors[s.joint_name])

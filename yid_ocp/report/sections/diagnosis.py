@@ -143,7 +143,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
 
 
 def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int, kept: list[int]) -> tuple[Any, str]:
-    """Map of the unknowns `kept` over recording i, and a sentence on the surest value."""
+    """Map of the unknowns `kept` over recording i, and a sentence on the most significant value."""
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
@@ -158,7 +158,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     if np.any(np.isfinite(values)):
         j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
         sentence = (
-            f"Grey is where the data do not say; the surest value is that of {names[k]} between {edges[j]:.2f} and "
+            f"Grey: not informed by the data. The most significant value is that of {names[k]}, {edges[j]:.2f} to "
             f"{edges[j + 1]:.2f} s, {said(j, k)}."
         )
     else:
@@ -166,8 +166,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
         values = trace.posterior_mean / np.where(prior > 0, prior, np.nan)
         axis = "value in standard deviations expected beforehand"
         sentence = (
-            "Nowhere do the data say more than half of what can be said of a single value, so that values are shown in "
-            "units of the standard deviation expected beforehand: take the picture for a hint only."
+            "The data inform no single value by more than half, so values are shown in units of the standard "
+            "deviation expected beforehand. The picture is only a hint."
         )
     rows = []
     for k in kept:
