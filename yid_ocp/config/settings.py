@@ -406,7 +406,7 @@ class _TrackSettings:
             "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
         ),
     ] = None
-    virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("virtual frames of a motion, instead of recorded ones")] = (
+    virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("virtual frames in place of recorded ones")] = (
         _VirtualFramesSettings()
     )
     write_virtual_frames: Annotated[
