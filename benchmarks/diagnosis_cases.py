@@ -1,11 +1,14 @@
 """Injected effects in data from MuJoCo: what the diagnosis says of each, failures included.
 
     python benchmarks/diagnosis_cases.py [CASE ...] [--seeds 1 7] [--json FILE] [--workers 2] [--keep DIR]
+    python benchmarks/diagnosis_cases.py [CASE ...] --record DIR
+    python benchmarks/diagnosis_cases.py [CASE ...] --rescore DIR [--set KEY=VALUE ...]
 
 Every case is one arm that moves the foam Y (43 variables, 5 s to estimate on, 5 s of another motion held out, arm and
 camera points), all candidates of the library in play. Effects are done in the simulator's own terms
 (`yid_ocp.virtual.injected`). With `--keep`, what a folder holds is not done again; it counts for one version of the
-package only, so take another folder after a change of the code.
+package only, so take another folder after a change of the code. `--record` writes the numbers that every rule needs;
+`--rescore` judges them again, without a refit, by the rules and thresholds of now.
 """
 
 from __future__ import annotations
@@ -17,8 +20,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import threadpoolctl
 from make_recordings import TRAVEL, TRUTH
@@ -27,9 +31,11 @@ from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_conf
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import scale_parameters_to_more_links
+from yid_ocp.diagnosis.blind_scores import evidence_to_json, judge_recorded_case
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.verdict import failed_transfer_checks
+from yid_ocp.files import make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import VirtualExperimentSettings
@@ -206,9 +212,35 @@ def right(case: Case, finding: DiagnosisResult) -> bool:
     return set(named[:1]) == true or (bool(true & rivals) and len(rivals) <= 3)
 
 
-def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
+def rescored(folder: Path, names: Sequence[str], overrides: Sequence[str]) -> int:
+    """Recorded cases judged again, beside what was said; how many differ."""
+    limits, differ = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis, 0
+    limits = replace(limits, max_effects=2)
+    print("| case | then | now | differs |\n|---|---|---|---|")
+    for name in names:
+        if not (file := folder / f"{name}.json").exists():
+            continue
+        data = read_input_json(file)
+        now = said(judge_recorded_case(data["evidence"], limits))
+        differ += data["said"] != now
+        print(f"| {name} | {data['said']} | {now} | {'yes' if data['said'] != now else '-'} |")
+    return differ
+
+
+def said(result: Mapping[str, Any]) -> str:
+    """Verdict, effects with those that cannot be told from them, and the first place."""
+    sets = [[f"{e['kind']}@{e['location']}" for e in own] for own in result["confusable"]]
+    names = [f"{e['kind']}@{e['location']}" for e in result["effects"]]
+    told = [" or ".join(next((own for own in sets if own[0] == name), [name])) for name in names]
+    return "; ".join([result["verdict"], *told, *(f"at {place['location']}" for place in result["where"][:1])])
+
+
+def run(name: str, seeds: Sequence[int], record: str = "") -> dict[str, str]:
     case = CASES[name]
     finding, seconds, best = found(name, seeds)
+    if record:
+        data = {"said": said(finding.to_dict()), "evidence": evidence_to_json(finding)}
+        write_strict_json(Path(record) / f"{name}.json", data)
     truth = " + ".join(effect.label for effect in case.withheld) or "-"
     rivals = "; ".join(
         ", ".join(r.label for r in a.equivalent_effects)
@@ -249,8 +281,17 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the table")
     parser.add_argument("--workers", type=int, default=1, help="cases at once; the times are then longer")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="folder of results, which are not worked out again")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="folder for what every rule needs of each case")
+    parser.add_argument("--rescore", type=Path, metavar="DIR", help="judge such a folder again instead")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="a setting for --rescore")
     arguments = parser.parse_args()
-    tasks = [Task(name, {"name": name, "seeds": list(arguments.seeds)}) for name in arguments.cases]
+    if arguments.rescore is not None:
+        print(f"{rescored(arguments.rescore, arguments.cases, arguments.set)} differ")
+        return 0
+    asked = {"seeds": list(arguments.seeds)}
+    if arguments.record is not None:
+        asked["record"] = str(make_folder(arguments.record).absolute())
+    tasks = [Task(name, {"name": name, **asked}) for name in arguments.cases]
     with tempfile.TemporaryDirectory() as folder:
         results = run_tasks(run, tasks, arguments.keep or Path(folder), WorkerConfig(arguments.workers), show)
     rows = [result.value for result in results if not result.error]

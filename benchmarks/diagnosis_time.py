@@ -49,7 +49,7 @@ def show(problem: EstimationProblem, runs: int) -> None:
             table.add_row(str(run + 1), stage, f"{seconds:.2f}", f"{seconds / reference:.1f}")
         named = ", ".join(effect.label for effect in finding.accepted_effects)
         table.add_section()
-        table.caption = f"{len(finding.detectability)} candidates; {finding.verdict}: {named}"
+        table.caption = f"{len(finding.screening.detectability)} candidates; {finding.verdict}: {named}"
     Console(width=None if sys.stdout.isatty() else 100).print(table)
 
 

@@ -133,7 +133,7 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         finding = run_diagnose(made, Path(folder) / "run").output
     detectable = {
         f"{entry.effect.label}.{name}": value
-        for entry in finding.detectability
+        for entry in finding.screening.detectability
         for name, value in entry.detectable_amplitudes.items()
     }
     told = {
@@ -143,8 +143,8 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         "p_value": finding.nominal_test.p_value,
         "held_out_p_value": finding.nominal_held_out_test.p_value,
         "channels": finding.nominal_held_out_test.channel_chi2,
-        "best": [[score.effect.label, score.p_value] for score in finding.candidate_scores[:3]],
-        "candidates": len(finding.candidate_scores),
+        "best": [[score.effect.label, score.p_value] for score in finding.screening.candidate_scores[:3]],
+        "candidates": len(finding.screening.candidate_scores),
         "named": [effect.label for effect in finding.accepted_effects],
         "rivals": [[rival.label for rival in added.equivalent_effects] for added in finding.selected_effects],
         "values": {

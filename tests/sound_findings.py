@@ -13,7 +13,7 @@ def assert_nothing_impossible_is_said(finding: DiagnosisResult, text: str) -> No
     """Numbers are finite, a gap is above noise, and closure has a gap to close."""
     assert not re.search(r"\b(nan|inf)\b", text), text
     tests = (finding.nominal_test, finding.nominal_held_out_test)
-    if "The gap is real" in text and finding.candidate_scores:
+    if "The gap is real" in text and finding.screening.candidate_scores:
         assert residuals_exceed_noise(tests, finding.thresholds.null_test_limits), text
     if finding.verdict in ("no_gap", "insufficient_data"):
         assert "The gap is real" not in text

@@ -118,6 +118,8 @@ def _blind(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
     text = "draw an ensemble to set thresholds by, other cases than those that are reported for the same seed"
     _switch(parser, "--calibration", text)
+    text = "judge the finished cases of a proof again, by the thresholds of --set, without a refit"
+    parser.add_argument("--rescore", metavar="DIR", help=text)
     _overrides(parser)
 
 

@@ -22,6 +22,7 @@ from yid_ocp.diagnosis.screening import (
     ConfusabilityMatrix,
     DetectableAmplitudes,
     GapLocation,
+    ScreeningResult,
     _EffectSignature,
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
@@ -108,6 +109,14 @@ def alike(labels: Sequence[str], matrix) -> ConfusabilityMatrix:
     return ConfusabilityMatrix(tuple(labels), np.asarray(matrix, float))
 
 
+def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
+    """Candidates that are seen and like no other, unless said."""
+    labels = [entry.effect.label for entry in scores]
+    seen = [visible(entry.effect) for entry in scores] if seen is None else seen
+    joint = SimpleNamespace(ranked_pairs=lambda among: iter(pairs))
+    return ScreeningResult(tuple(seen), tuple(scores), table or alike(labels, np.eye(len(labels))), joint)
+
+
 # -- refits -----------------------------------------------------------------------------------------------------------
 
 
@@ -134,7 +143,8 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
     values = neutral | dict(values or {})
     std = dict.fromkeys(values, 0.01) | dict(std or {})
     held = {name: std[name] for entry in effects for name in entry.amplitude_names} | dict(held or {})
-    rest = (tuple(effects), problem, cost, evaluation([1.0]), loss(1.0, 1.0) if lost is None else lost)
+    noisy = getattr(problem, "has_process_noise", False)
+    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, noisy, problem, evaluation([1.0]))
     return RefittedModel(values, std, held, "made up", *rest)
 
 
@@ -208,9 +218,10 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "noise_floor": (AssumedChannelNoiseLevel("points.tip", "m", 0.001, 100),),
         "nominal_test": outcome(p=1e-9, chi2=2.0),
         "nominal_held_out_test": outcome(p=1e-8, chi2=2.1),
-        "detectability": (visible(of),),
-        "confusability": alike([of.label], [[1.0]]),
-        "candidate_scores": (score(of, p=1e-9, decrease=100.0, statistic=40.0),),
+        "screening": screening([score(of, p=1e-9, decrease=100.0, statistic=40.0)]),
+        "are_offsets_stated": False,
+        "explained_fraction": 1.0,
+        "transfer_checks": (),
         "smoother_result": None,
         "gap_locations": (place(),),
         "nominal_model": fit(lost=loss(2.0, 2.2), problem=SimpleNamespace(has_process_noise=False)),

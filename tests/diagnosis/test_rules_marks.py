@@ -6,14 +6,25 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from factories import amplitude, cases, effect, fit, loss
+from factories import added, amplitude, cases, effect, finding, fit, loss, place, score, screening
 
+from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.settings import config_yaml_with_defaults
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, labels_json_and_sha256, open_sealed_labels
-from yid_ocp.diagnosis.blind_scores import detection_and_false_alarm_rates, score_blind_case
+from yid_ocp.diagnosis.blind_scores import (
+    detection_and_false_alarm_rates,
+    evidence_to_json,
+    judge_recorded_case,
+    score_blind_case,
+)
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
+from yid_ocp.diagnosis.refit import SearchRecord
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
+from yid_ocp.diagnosis.verdict import LocatedGap
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
+from yid_ocp.workflow.blind import rescore_blind
 
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
@@ -271,3 +282,95 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
     assert asked == [["held out"], ("settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
+
+
+# -- judged again -----------------------------------------------------------------------------------------------------
+
+WEAK, STRANGE = effect("joint_viscous@elbow", amplitude("b")), effect("joint_spring@elbow", amplitude("stiffness"))
+
+
+def diagnosed(decrease=80.0, there=0.5):
+    """A case in which one effect is true: what was refitted and screened for its diagnosis, and what that said."""
+
+    def model(effects, lost, cost, size=0.5):
+        return fit(effects, loss(lost, lost + 0.1), cost, {f"{e.label}.{e.definitions[0].name}": size for e in effects})
+
+    ranked = [score(FRICTION, p=1e-9, decrease=90.0), score(WEAK, p=1e-8, decrease=40.0), score(STRANGE, p=0.03)]
+    refits = {e.label: model([e], *of) for e, *of in ((FRICTION, 1.6, 60.0), (WEAK, 2.4, 90.0))}
+    refits[f"{FRICTION.label} on the held-out recordings"] = model([FRICTION], 1.0, 50.0, there)
+    beside = screening([score(WEAK, p=0.5), score(STRANGE, p=0.6)])
+    known = {"screening": screening(ranked), "nominal_model": fit((), loss(3.0, 3.2), 100.0, {"k": 2.0})}
+    record = SearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
+    named = {"single_effect_models": (refits[FRICTION.label],), "selected_effects": (added(FRICTION),)}
+    return finding(**named, record=record, located_gap=LocatedGap((place("elbow"),), "plant", decrease), **known)
+
+
+def again(finding, **limits):
+    """Verdict and effects of what was kept of a diagnosis, by other thresholds."""
+    data = json.loads(json.dumps(evidence_to_json(finding), allow_nan=False))
+    found = judge_recorded_case(data, replace(DEFAULT_THRESHOLDS, **limits))
+    return found["verdict"], [f"{e['kind']}@{e['location']}" for e in found["effects"]]
+
+
+@cases(
+    "made, limits, verdict",
+    {
+        "by the same": ({}, {}, "effect"),
+        "too little explained": ({"decrease": 120.0}, {}, "unknown"),
+        "less is asked": ({"decrease": 120.0}, {"min_explained_fraction": 0.6}, "effect"),
+        "another value elsewhere": ({"there": 0.9}, {}, "unknown"),
+        "which may differ": ({"there": 0.9}, {"transfer_rtol": 2.0}, "effect"),
+        "samples do not suffice": ({}, {"min_samples_per_unknown": 101.0}, "insufficient_data"),
+        "no gap is worth a name": (
+            {},
+            {"min_excess_chi2_per_dof": 9.0, "min_channel_excess_chi2_per_dof": 9.0},
+            "no_gap",
+        ),
+        "a refit that was not made": ({}, {"significance_level": 0.05}, "not_judged"),
+        "a second effect that was not tried": ({}, {"significance_level": 0.6}, "not_judged"),
+    },
+)
+def test_what_was_kept_of_a_case_is_judged_by_other_thresholds(made, limits, verdict):
+    assert again(diagnosed(**made), **limits) == (verdict, [FRICTION.label] if verdict == "effect" else [])
+
+
+def test_a_case_without_a_place_of_its_gap_is_not_judged_where_thresholds_see_one():
+    assert again(replace(diagnosed(), located_gap=None))[0] == "not_judged"
+
+
+def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
+    """Two cases of one experiment: the second asks for more refits where a smaller effect counts as significant."""
+    sealed = [
+        CaseGroundTruth(
+            f"case_{i}", "single", (InjectedEffect("joint_coulomb", "elbow", {"tau_c": 0.5}),), 3.0, {}, "of.it"
+        )
+        for i in range(2)
+    ]
+    text, digest = labels_json_and_sha256(sealed)
+    monkeypatch.setattr("yid_ocp.workflow.blind.draw_blind_results", lambda *_: None)
+    run = load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    for part in ("sealed", "configs", "answers", "best"):
+        (tmp_path / part).mkdir()
+    (tmp_path / "sealed/labels.json").write_text(text)
+    (tmp_path / "configs/of.yaml").write_text(config_yaml_with_defaults(run))
+    told = {"sha256": digest, "cases": 2, "seed": 3, "purpose": "report", "configs": {"of": ""}}
+    (tmp_path / "commitment.json").write_text(json.dumps(told))
+    first, second = diagnosed(), diagnosed()
+    second = replace(
+        second, screening=replace(second.screening, candidate_scores=second.screening.candidate_scores[:2])
+    )
+    for i, made in enumerate((first, second)):
+        value = {"seconds": 9.0, "result": made.to_dict(), "evidence": evidence_to_json(made)}
+        (tmp_path / f"answers/{i}.json").write_text(json.dumps({"name": f"case_{i}", "value": value}))
+    said = rescore_blind(tmp_path, tmp_path / "same").result
+    assert (said["not_judged"], said["rescored"]["changed"], said["detection"]["3"]["right"]) == (0, [], 1.0)
+    said = rescore_blind(tmp_path, tmp_path / "other", ["diagnosis.significance_level=0.05"]).result
+    assert (said["cases"], said["not_judged"], said["detection"]["3"]["cases"]) == (2, 1, 1)
+    assert said["confusion"]["said"] == ["joint_coulomb", "not_judged"]
+    [changed] = said["rescored"]["changed"]
+    assert (changed["case"], changed["then"], changed["now"]) == (
+        "case_0",
+        "effect joint_coulomb@elbow",
+        "not_judged -",
+    )
+    assert "| of.it | 2 | 1 |" in (tmp_path / "other/table.md").read_text()

@@ -37,7 +37,7 @@ class Problem:
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
         self.cost, self.rows, self.unknown_names, self.nominal_free_parameters = cost, rows, names, ("k",)
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
-        self.freed, self.whitening_filters = None, ()
+        self.freed, self.whitening_filters, self.has_process_noise = None, (), False
 
     @property
     def problem(self):

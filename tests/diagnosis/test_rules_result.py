@@ -19,6 +19,7 @@ from factories import (
     outcome,
     place,
     score,
+    screening,
     smoothed,
     visible,
 )
@@ -85,7 +86,7 @@ def test_the_result_holds_what_was_found():
         gap_locations=(place("T1", 0.7, True, ((0.0, 1.0),)),),
         remaining_gap_locations=(place("T2", 0.3, False),),
         remaining_test=outcome(p=0.4, chi2=1.02),
-        detectability=(visible(FRICTION), visible(OFFSET, seen=False)),
+        screening=screening([score(FRICTION)], seen=[visible(FRICTION), visible(OFFSET, seen=False)]),
         is_split_in_blocks=True,
     )
     result = made.to_dict()
@@ -120,13 +121,15 @@ def test_candidates_are_listed_with_what_was_added_first():
         nominal_model=fit(lost=loss(2.0, 2.0)),
         single_effect_models=(alone, best),
         selected_effects=(added(FRICTION, fitted=best),),
-        candidate_scores=(
-            score(third, p=0.2, statistic=7.0, step={"third@x.a": 0.7}),
-            score(OFFSET, p=0.1, statistic=8.0),
-            score(FRICTION, p=0.05, statistic=9.0),
+        screening=screening(
+            [
+                score(third, p=0.2, statistic=7.0, step={"third@x.a": 0.7}),
+                score(OFFSET, p=0.1, statistic=8.0),
+                score(FRICTION, p=0.05, statistic=9.0),
+            ]
         ),
     )
-    listed = _ranked_candidates(made)
+    listed = _ranked_candidates(made, made)
     assert [f"{e['kind']}@{e['location']}" for e in listed] == ["friction@elbow", "offset@wrist", "third@x"]
     assert [(entry["score"], entry["p_value"]) for entry in listed] == [(9.0, 0.05), (8.0, 0.1), (7.0, 0.2)]
     told = [tuple(entry["parameters"]["a"].values()) for entry in listed]
@@ -135,8 +138,10 @@ def test_candidates_are_listed_with_what_was_added_first():
     assert listed[1]["closure_ci"] == [pytest.approx(0.6), pytest.approx(0.7)]
     assert listed[2]["closure_ci"] is None
     # of an unknown gap, refits before scores
-    made = finding("unknown", single_effect_models=(fit([OFFSET]),), candidate_scores=(score(FRICTION), score(OFFSET)))
-    assert [entry["kind"] for entry in _ranked_candidates(made)] == ["offset", "friction"]
+    made = finding(
+        "unknown", single_effect_models=(fit([OFFSET]),), screening=screening([score(FRICTION), score(OFFSET)])
+    )
+    assert [entry["kind"] for entry in _ranked_candidates(made, made)] == ["offset", "friction"]
 
 
 def test_rejected_candidates_say_what_they_close_and_why_they_are_none():

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from factories import alike, amplitude, cases, effect, fit, loss, point, score, shape
+from factories import alike, amplitude, cases, effect, fit, loss, point, score, screening, shape
 from heard import Heard
 
 from yid_ocp.diagnosis import select
@@ -294,16 +294,19 @@ A, B, C = EFFECTS = [effect(f"{name}@x", amplitude()) for name in "abc"]
 
 
 class Rounds:
-    """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
+    """A search whose refits' held-out losses are given by the effects' kinds; remembers what was asked."""
 
     def __init__(self, monkeypatch, losses, p_values=(1e-9,) * 3, **how):
         self.losses, self.refits, self.screens, self.heard = losses, [], [], Heard()
         usual = {"fails": (), "absent": (), "before": None, "pairs": (), "left": None, "cost": 1.0, "noisy": False}
         vars(self).update(usual | how)
         self.scores = tuple(map(lambda of, p, best: score(of, p=p, decrease=best), EFFECTS, p_values, (9.0, 8.0, 7.0)))
+        self.progress, self.skipped, self.is_late = self.heard, [], False
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
-        monkeypatch.setattr(select, "refit_with_effects", self.refit)
-        monkeypatch.setattr(select, "screen_candidates", self.screen)
+
+    def note_skip_past_deadline(self, *what):
+        self.skipped += what if self.is_late else ()
+        return self.is_late
 
     def fit(self, effects):
         known = "".join(sorted(of.kind for of in effects))
@@ -315,18 +318,17 @@ class Rounds:
         left = tuple(s for s in self.scores if s.effect.label not in labels)
         if base and self.left is not None:
             left = tuple(replace(s, p_value=self.left) for s in left)
-        table = alike([s.effect.label for s in left], np.eye(len(left)))
-        return ScreeningResult((), left, table, SimpleNamespace(ranked_pairs=self.promised))
+        return screening(left)
 
-    def promised(self, among):
-        kinds = {of.kind: of for of in EFFECTS if of.label in among}
+    def ranked_pairs(self, screened, without=""):
+        kinds = {of.kind: of for of in EFFECTS if of.label != without}
         pairs = [(one, other) for one, other in self.pairs if {one, other} <= set(kinds)]
         return [((kinds[one], kinds[other]), {}, 7.0) for one, other in pairs]
 
-    def screen(self, problem, base, values, limits):
+    def screen(self, base, values, name):
         if not values and self.before is None:
             raise SolverError("it snaps", where="diagnosis")
-        self.screens.append(([of.kind for of in base], values.get("k"), problem, limits))
+        self.screens.append(([of.kind for of in base], values.get("k"), name))
         return self.screened(base)
 
     def refit_all(self, search, base, tried, values, where=""):
@@ -336,23 +338,23 @@ class Rounds:
             return [self.fit(pair) for pair, _ in tried]
         self.refits.append(([of.kind for of in base], [of.kind for (of,), _ in tried], values.get("k")))
         known = [(*base, of) for (of,), _ in tried]
-        if where:
+        if where.startswith("from"):
             lost = [
                 (of, self.before.get(of.kind, (9.0, 9.2)), 0.5 if of.kind in self.before else 2.0) for (of,) in known
             ]
             return [fit([of], loss(*own), cost, {"k": 7.0, f"{of.label}.a": 1.0}) for of, own, cost in lost]
         return [self.fit(effects) for effects in known if "".join(sorted(e.kind for e in effects)) in self.losses]
 
-    def refit(self, problem, effects, start, store, name, limits):
+    def refit(self, effects, start, name):
         self.refits.append((name, [of.kind for of in effects], start["k"]))
         kinds = "".join(sorted(of.kind for of in effects))
         return None if kinds in self.fails else self.fit(effects)
 
-    def compose(self, moved=False, deadline=math.inf, **limits):
-        search = self.search = RefitContext(SimpleNamespace(), Thresholds(**limits), self.heard, deadline=deadline)
+    def compose(self, moved=False, is_late=False, **limits):
+        self.thresholds, self.is_late = Thresholds(**limits), is_late
         problem = SimpleNamespace(has_process_noise=self.noisy)
         nominal = fit((), loss(*self.losses[""]), self.cost, {"k": 0.0}, problem=problem)
-        first, added = select_effects(search, nominal, self.screened(), moved=moved)
+        first, added = select_effects(self, nominal, self.screened(), moved=moved)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
 
 
@@ -373,9 +375,9 @@ def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
 def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypatch):
     losses = {"": (3.0, 3.2), "a": (2.0, 2.2), "b": (2.9, 3.1), "c": (2.9, 3.1)}
     rounds = Rounds(monkeypatch, losses, before={}, left=1e-3)
-    first, chosen, _ = rounds.compose(moved=True, deadline=0.0)
+    first, chosen, _ = rounds.compose(moved=True, is_late=True)
     assert (first, chosen) == (["a", "b", "c"], ["a"])
-    assert rounds.search.skipped == ["candidates from the earlier run's parameters", "the residual gap next to a@x"]
+    assert rounds.skipped == ["candidates from the earlier run's parameters", "the residual gap next to a@x"]
     assert rounds.screens == []
 
 
@@ -390,7 +392,7 @@ def test_what_looks_alike_and_was_not_tried_stays_beside_what_was_added(monkeypa
         return tried(search, base, *rest)
 
     monkeypatch.setattr(select, "refit_with_each_effect", first_alone)
-    [entry] = rounds.compose(deadline=0.0)[2]
+    [entry] = rounds.compose(is_late=True)[2]
     assert [of.kind for of in entry.equivalent_effects] == ["a", "b"]
 
 
@@ -437,7 +439,6 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     assert (first, chosen) == (["a", "b", "c"], ["a", "b", "c"])
     assert rounds.refits[:3] == [([], ["a", "b", "c"], 0.0), (["a"], ["b", "c"], 1.0), (["a", "b"], ["c"], 2.0)]
     assert [screened[:2] for screened in rounds.screens[:2]] == [(["a"], 1.0), (["a", "b"], 2.0)]
-    assert rounds.screens[0][3] == Thresholds()
     closed = [entry.cumulative_closure.fraction for entry in added]
     assert closed == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2, 3]
@@ -584,7 +585,7 @@ def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
     rounds.scores = rounds.scores[:2]
     # the third candidate shows only once two are in the model
-    usual, last = rounds.screened, ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), FEW)
+    usual, last = rounds.screened, ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), None)
     monkeypatch.setattr(rounds, "screened", lambda base=(): usual(base) if len(base) < 2 else last)
     first, chosen, added = rounds.compose()
     assert chosen == ["c"]
@@ -639,13 +640,18 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     promised = [((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
-    asked, labels = [], [of.label for of in kinds.values()]
-    joint = SimpleNamespace(ranked_pairs=lambda among: asked.append(among) or promised)
-    found = ScreeningResult((), tuple(score(of) for of in kinds.values()), alike(labels, table), joint)
-    chosen = _pairs_to_refit(found, Thresholds(n_refit_pairs=3), kinds["a"])
+    asked = []
+    found = screening([score(of) for of in kinds.values()], table=alike([of.label for of in kinds.values()], table))
+
+    def to_refit(count):
+        joint = SimpleNamespace(ranked_pairs=lambda among: asked.append(among) or iter(promised))
+        search = RefitContext(None, Thresholds(n_refit_pairs=count), Heard())
+        return _pairs_to_refit(search, replace(found, joint_score_model=joint), kinds["a"])
+
+    chosen = to_refit(3)
     assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]
     assert ["".join(of.kind for of in pair) for pair, _ in chosen] == ["bc", "ef", "bd"]
-    assert _pairs_to_refit(found, Thresholds(n_refit_pairs=0), kinds["a"]) == []
+    assert to_refit(0) == []
 
 
 PROMISED = ("bc", "cd", "dc", "ef", "bd", "be")

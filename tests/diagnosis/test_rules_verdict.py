@@ -17,16 +17,18 @@ from factories import (
     fit,
     outcome,
     score,
+    screening,
     shape,
     smoothed,
     visible,
 )
 
-from yid_ocp.diagnosis import verdict as module
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
+    LocatedGap,
+    NominalEvidence,
     _compare,
     check_effect_amplitude_transfer,
     decide_verdict,
@@ -130,8 +132,9 @@ SPEAKING = smoothed({FORCE: 9.0, BIAS: 0.0}, evidence={"plant": 9.0, "both": 9.0
     },
 )
 def test_a_barely_significant_excess_without_shape_is_chance(found, p_values, before, held_out, chance):
-    seen = found, scored(*p_values), outcome(p=before), outcome(p=held_out), LIMITS
-    assert is_barely_significant_and_unexplained(*seen) is chance
+    seen = NominalEvidence(fit(), outcome(p=before), outcome(p=held_out), screening(scored(*p_values)), False)
+    located = LocatedGap((), found.plant_or_sensor_origin, 10.0)
+    assert is_barely_significant_and_unexplained(located, seen, LIMITS) is chance
 
 
 # -- the verdict ------------------------------------------------------------------------------------------------------
@@ -203,20 +206,20 @@ def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
 
 
 @cases(
-    "costs, chi2, degrees, part",
+    "costs, decrease, part",
     {
-        "as much": ((100.0, 60.5), (200.0, 110.0), (90.0, 78.0), 1.0),
-        "half": ((100.0, 80.5), (200.0, 110.0), (90.0, 78.0), 38.0 / 78.0),
-        "smoother explains nothing": ((100.0, 60.5), (110.0, 100.0), (90.0, 80.0), 1.0),
-        "smoother is worse": ((100.0, 60.5), (100.0, 110.0), (90.0, 90.0), 1.0),
-        "explains less": ((100.0, 100.0), (200.0, 110.0), (90.0, 78.0), -1.0 / 78.0),
+        "as much": ((100.0, 60.5), 78.0, 1.0),
+        "half": ((100.0, 80.5), 78.0, 38.0 / 78.0),
+        "smoother explains nothing": ((100.0, 60.5), 0.0, 1.0),
+        "smoother is worse": ((100.0, 60.5), -10.0, 1.0),
+        "explains less": ((100.0, 100.0), 78.0, -1.0 / 78.0),
     },
 )
-def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, part):
+def test_what_effects_explain_of_what_can_be_explained(costs, decrease, part):
     """Fall of r'r less what one parameter takes, over the smoother's fall less the degrees of freedom that it takes."""
     nominal, last = fit(cost=costs[0]), added(ONE, fitted=fit([ONE], cost=costs[1]))
     first = added(OTHER, fitted=fit([OTHER], cost=1e3))
-    found = smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees)
+    found = LocatedGap((), "plant", decrease)
     assert fraction_of_smoother_chi2_decrease(nominal, (first, last), found) == pytest.approx(part)
     assert fraction_of_smoother_chi2_decrease(nominal, (first, last), None) == 1.0
 
@@ -345,7 +348,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
         asked.append((problem.problem.episodes, problem.problem.held_out, effects, dict(start), store, name, limits))
         return again
 
-    monkeypatch.setattr(module, "refit_with_effects", refitted)
+    monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", refitted)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
     [entry] = check_effect_amplitude_transfer(search, first)
     assert (entry.estimation_value, entry.held_out_value, entry.is_consistent) == (2.0, 7.0, False)
@@ -358,7 +361,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 @cases("blocks, effects", {"in blocks": (True, [SPRING]), "no effect": (False, ()), "no fit": (False, [SPRING])})
 def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks, effects):
     asked = []
-    monkeypatch.setattr(module, "refit_with_effects", lambda *_: asked.append(True))
+    monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", lambda *_: asked.append(True))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
     assert check_effect_amplitude_transfer(search, fit(effects)) == ()
     assert bool(asked) is (not blocks and bool(effects))

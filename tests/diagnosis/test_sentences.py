@@ -27,6 +27,7 @@ from factories import (
     loss,
     outcome,
     place,
+    screening,
     smoothed,
     visible,
 )
@@ -167,9 +168,8 @@ def said() -> dict[str, str]:
         ("no_gap", (), ("a@b",)), ("no_gap", (), tuple(f"{kind}@x" for kind in "abcde")), ("effect", (), ()),
     ]:  # fmt: skip
         case = f"next experiment: {verdict} {[p.location for p in where]} {len(unseen)} unseen"
-        found[case] = recommended_experiment_text(
-            verdict, (), where, [visible(effect(label), seen=False) for label in unseen]
-        )
+        hidden = [visible(effect(label), seen=False) for label in unseen]
+        found[case] = recommended_experiment_text(finding(verdict, selected_effects=()), where, hidden)
     for rivals in [
         {"joint_viscous@elbow": SPEED, "joint_coulomb@elbow": SPEED}, {"a@elbow": SPEED, "b@shoulder": SPEED},
         {"tilt@world": GRAVITY, "mass@elbow": ACCELERATION, "a@elbow": SPEED}, {"odd@T1": ""},
@@ -177,9 +177,11 @@ def said() -> dict[str, str]:
     ]:  # fmt: skip
         alike = [SimpleNamespace(location=k.partition("@")[2], required_excitation=v) for k, v in rivals.items()]
         found[f"next experiment: rivals {list(rivals)}"] = _separating_experiment(alike)
-    before, limits = outcome(degrees=11.6), Thresholds(min_samples_per_unknown=4.0)
+    few, limits = {"nominal_test": outcome(degrees=11.6)}, Thresholds(min_samples_per_unknown=4.0)
+    few["nominal_model"] = fit(values=dict.fromkeys("abcde", 1.0))
     for seen in (True, False):
-        text = insufficient_data_message("insufficient_data", before, 5, [visible(FRICTION, seen)], limits)
+        known = finding(screening=screening(seen=[visible(FRICTION, seen)]), **few)
+        text = insufficient_data_message("insufficient_data", known, limits)
         found[f"insufficient data: detectable {seen}"] = text
     force = ForceOrFaultEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
     odd = ForceOrFaultEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
@@ -214,11 +216,11 @@ def test_a_diagnosis_says_what_is_written_down():
 
 
 def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_suffice():
-    chosen = (added(FRICTION, rivals=[OFFSET]),)
-    assert recommended_experiment_text("effect", chosen, (), ()) == _separating_experiment([FRICTION, OFFSET])
-    sole = recommended_experiment_text("effect", (added(FRICTION),), (), ())
+    alike = finding("effect", selected_effects=(added(FRICTION, rivals=[OFFSET]),))
+    assert recommended_experiment_text(alike, (), ()) == _separating_experiment([FRICTION, OFFSET])
+    sole = recommended_experiment_text(finding("effect", selected_effects=(added(FRICTION),)), (), ())
     assert sole.startswith("Repeat with other motions")
-    few = recommended_experiment_text("insufficient_data", chosen, (), ())
+    few = recommended_experiment_text(replace(alike, verdict="insufficient_data"), (), ())
     assert few.startswith("Record longer and larger motions")
 
 

@@ -29,7 +29,11 @@ def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):
     longest = [max(round(w.end_time - w.start_time, 6) for w in f.nominal_test.windows) for f in (usual, other)]
     assert longest == [0.5, 1.0]
     sizes = [
-        {v.effect.label: v.detectable_amplitudes[f"{KIND}.tau_c"] for v in f.detectability if v.effect.label == KIND}
+        {
+            v.effect.label: v.detectable_amplitudes[f"{KIND}.tau_c"]
+            for v in f.screening.detectability
+            if v.effect.label == KIND
+        }
         for f in (usual, other)
     ]
     assert sizes[1][KIND] == pytest.approx(2 * sizes[0][KIND])

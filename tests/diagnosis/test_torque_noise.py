@@ -296,7 +296,9 @@ def test_offsets_are_named_where_they_leave_what_was_expected(step, within):
 def test_an_effect_is_found_beside_the_noise_of_torques(step, within):
     """A gear whose friction is ten times what could be noticed."""
     name = "joint_viscous@shoulder.b"
-    more = 10 * next(e.detectable_amplitudes[name] for e in within.detectability if name in e.detectable_amplitudes)
+    more = 10 * next(
+        e.detectable_amplitudes[name] for e in within.screening.detectability if name in e.detectable_amplitudes
+    )
     rubbing = [recorded(step, seed, friction=more) for seed in (5, 6)]
     finding = diagnose(problem_of(step, rubbing[:1], rubbing[1:]), LIBRARY)
     assert [effect.label for effect in finding.accepted_effects] == ["joint_viscous@shoulder"]

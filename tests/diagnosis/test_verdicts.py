@@ -134,7 +134,7 @@ def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
     recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed) for seed in (1, 2)]
     problem = bench.problem(recordings[:1])
     finding = diagnose(problem, FRICTION, recordings[1:], exclude=["joint_coulomb@elbow", "effort_offset"])
-    tried = {score.effect.label for score in finding.candidate_scores}
+    tried = {score.effect.label for score in finding.screening.candidate_scores}
     assert tried == {"joint_coulomb@shoulder", "link_mass@elbow"}
     assert "joint_coulomb@elbow.tau_c" in finding.nominal_model.problem.system.parameters.names
     assert "joint_coulomb@elbow" not in {effect.label for effect in finding.accepted_effects}

@@ -175,6 +175,9 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
     again = run_blind([driven], folder, 2, 3, workers=InlineExecutor())
     assert len(sealed_at) == 2
     assert again.result | {"date": ""} == outcome.result | {"date": ""}
+    judged = blind.rescore_blind(folder, tmp_path / "judged").result
+    told = ("verdict", "answer", "confusable", "right", "location_first")
+    assert [[own[key] for key in told] for own in judged["marks"]] == [[own[key] for key in told] for own in marks]
     with pytest.raises(OutputError, match=r"another ensemble \(2 cases, seed 3, for report\)"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor(), purpose="calibration")
     (folder / "sealed" / "labels.json").write_bytes(text.replace(b"case_001", b"case_002"))

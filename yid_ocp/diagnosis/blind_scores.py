@@ -8,23 +8,42 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Literal, cast
 
 import numpy as np
 import scipy.stats
 
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
+from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics, SearchRecord, UnrecordedRefitError
+from yid_ocp.diagnosis.screening import (
+    AllCandidatesScoreModel,
+    CandidateScore,
+    ConfusabilityMatrix,
+    DetectableAmplitudes,
+    GapLocation,
+    ScreeningResult,
+    gap_locations_from_effect_closures,
+)
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.effects import EFFECTS
-from yid_ocp.files import to_json_types
+from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalEvidence, judge
+from yid_ocp.display import NULL_PROGRESS
+from yid_ocp.effects import EFFECTS, EffectBase
+from yid_ocp.effects.base import ParameterDefinition
+from yid_ocp.files import dataclass_from_plain_data, to_json_types, to_lossless_plain_data
+from yid_ocp.inference.null_test import NullTestResult
+from yid_ocp.model.parameters import Parameter, Parameters
 
 _FORMAT = "yid-blind/1"
 _CATEGORIES = tuple(BLIND_CASE_CATEGORY_SHARES)
 _OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
 """Categories whose true effect is not among the candidates."""
 _MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
-_VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
+NOT_JUDGED = "not_judged"
+"""Verdict of a recorded case where other thresholds ask for a refit that was not made."""
+_VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", NOT_JUDGED)
 
 
 @dataclass(frozen=True)
@@ -150,11 +169,15 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 
 
 def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Rates of false alarms, detections, correct answers and more over an ensemble; a rate without cases is None."""
+    """Rates of false alarms, detections, correct answers and more over an ensemble; a rate without cases is None.
+
+    Cases that are not judged count in no rate; `not_judged` says how many they are.
+    """
 
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
 
+    every, marks = marks, [m for m in marks if m.verdict != NOT_JUDGED]
     by = {sort: [m for m in marks if m.category == sort] for sort in _CATEGORIES}
     singles, pairs = by["single"], by["pair"]
     strange = [m for m in marks if m.category in _OUT_OF_LIBRARY_CATEGORIES]
@@ -175,7 +198,7 @@ def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str
         "interval_coverage": [inside for _, inside in errors],
     }
     intervals = {name: _binomial_proportion(hits) for name, hits in shares.items()}
-    experiments = dict.fromkeys(m.experiment for m in marks)
+    experiments = dict.fromkeys(m.experiment for m in every)
     detected = {}
     for size in sorted({m.multiple for m in singles if math.isfinite(m.multiple)}):
         own = [m for m in singles if m.multiple == size]
@@ -184,7 +207,8 @@ def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str
         detected[f"{size:.3g}"] = {name: _binomial_proportion(said) for name, said in hits.items()}
     return {
         "format": _FORMAT,
-        "cases": len(marks),
+        "cases": len(every),
+        "not_judged": len(every) - len(marks),
         **_rates(intervals),
         "intervals": intervals,
         "detection": {size: {"cases": own["gap"]["of"], **_rates(own)} for size, own in detected.items()},
@@ -193,10 +217,10 @@ def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str
         "closure_of_best": mean([m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]),
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
         "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),
-        "experiments": {name: _experiment_rates([m for m in marks if m.experiment == name]) for name in experiments},
-        "confusion": _confusion_matrix(marks),
+        "experiments": {name: _experiment_rates([m for m in every if m.experiment == name]) for name in experiments},
+        "confusion": _confusion_matrix(every),
         "calibration": _calibration_rates(marks),
-        "marks": [asdict(m) for m in marks],
+        "marks": [asdict(m) for m in every],
     }
 
 
@@ -205,9 +229,11 @@ def _rates(intervals: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Cases, false alarms and right answers of one experiment."""
+    """Cases, those not judged, false alarms and right answers of one experiment."""
+    every, own = own, [m for m in own if m.verdict != NOT_JUDGED]
     return {
-        "cases": len(own),
+        "cases": len(every),
+        "not_judged": len(every) - len(own),
         "false_alarms": _binomial_proportion([m.gap for m in own if m.category == "null"]),
         "right": _binomial_proportion([m.right for m in own if m.category not in ("null", "finer_chain")]),
     }
@@ -417,3 +443,117 @@ def _rounded(value: float, up: bool) -> float:
     scaled = value * 10.0**digits
     whole = math.ceil(scaled - 1e-9) if up else math.floor(scaled + 1e-9)
     return round(whole / 10.0**digits, max(digits, 0))
+
+
+# -- judged again -----------------------------------------------------------------------------------------------------
+
+_EVIDENCE_FORMAT = "yid-evidence/1"
+_MIN_RECORDED_OVERLAP = 0.5  # part of a signature from which it is kept that two candidates are alike
+
+
+def evidence_to_json(finding: DiagnosisResult) -> dict[str, Any]:
+    """Return the numbers on which a diagnosis' rules rest, from which `judge_recorded_case` judges it again."""
+    record, plain = finding.record, to_lossless_plain_data
+    pairs = {
+        name: [[[e.label for e in both], decrease] for both, _, decrease in own] for name, own in record.pairs.items()
+    }
+    candidates = {entry.effect.label: entry.effect for entry in finding.screening.detectability}
+    return {
+        "format": _EVIDENCE_FORMAT,
+        "effects": {label: plain(effect.definitions) for label, effect in candidates.items()},
+        "nominal_model": _refit_to_json(finding.nominal_model),
+        "tests": [plain(test) for test in (finding.nominal_test, finding.nominal_held_out_test)],
+        "screening": _screening_to_json(finding.screening),
+        "are_offsets_stated": finding.are_offsets_stated,
+        "located_gap": None if finding.located_gap is None else plain(finding.located_gap),
+        "remaining": [plain(place) for place in finding.remaining_gap_locations],
+        "refits": {name: fit and _refit_to_json(fit) for name, fit in sorted(record.refits.items())},
+        "screenings": {name: _screening_to_json(own) for name, own in record.screenings.items()},
+        "pairs": plain(pairs),
+    }
+
+
+def _refit_to_json(fit: RefitStatistics) -> dict[str, Any]:
+    kept = {entry.name: getattr(fit, entry.name) for entry in fields(RefitStatistics)}
+    return dict(to_lossless_plain_data(kept | {"effects": [effect.label for effect in fit.effects]}))
+
+
+def _screening_to_json(screened: ScreeningResult) -> dict[str, Any]:
+    labels, overlaps = screened.confusability.labels, screened.confusability.overlap_fractions
+    near = [
+        (i, j, overlaps[i, j]) for i, j in zip(*np.nonzero(overlaps >= _MIN_RECORDED_OVERLAP), strict=True) if i != j
+    ]
+    scores = [{**vars(score), "effect": score.effect.label} for score in screened.candidate_scores]
+    seen = {entry.effect.label: entry.is_detectable for entry in screened.detectability}
+    return dict(to_lossless_plain_data({"labels": labels, "alike": near, "scores": scores, "detectable": seen}))
+
+
+class _RecordedCase:
+    """What `evidence_to_json` wrote, as the objects that rules take."""
+
+    def __init__(self, data: Mapping[str, Any]) -> None:
+        self._effects = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
+        restored, located = dataclass_from_plain_data, data["located_gap"]
+        before, held = (restored(NullTestResult, test) for test in data["tests"])
+        nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
+        self.evidence = NominalEvidence(nominal, before, held, screened, data["are_offsets_stated"])
+        self.located_gap = None if located is None else restored(LocatedGap, located)
+        self.record = SearchRecord(
+            {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
+            {name: self._screening(own) for name, own in data["screenings"].items()},
+            {
+                name: tuple(((self._effects[a], self._effects[b]), {}, decrease) for (a, b), decrease in own)
+                for name, own in data["pairs"].items()
+            },
+        )
+
+    def _refit(self, data: Mapping[str, Any]) -> RefitStatistics:
+        effects = tuple(self._effects[label] for label in data["effects"])
+        return replace(dataclass_from_plain_data(RefitStatistics, {**data, "effects": ()}), effects=effects)
+
+    def _screening(self, data: Mapping[str, Any]) -> ScreeningResult:
+        overlaps = np.eye(len(data["labels"]))
+        for i, j, fraction in data["alike"]:
+            overlaps[i, j] = fraction
+        scores = tuple(CandidateScore(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
+        seen = tuple(DetectableAmplitudes(self._effects[label], {}, own) for label, own in data["detectable"].items())
+        return ScreeningResult(seen, scores, ConfusabilityMatrix(tuple(data["labels"]), overlaps), _NO_JOINT_MODEL)
+
+    def locate(self) -> LocatedGap:
+        if self.located_gap is None:
+            raise UnrecordedRefitError("where the gap lies")
+        return self.located_gap
+
+
+_NO_JOINT_MODEL = AllCandidatesScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
+
+
+def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBase:
+    kind, _, location = label.partition("@")
+    definitions = tuple(dataclass_from_plain_data(ParameterDefinition, own) for own in data)
+    entries = (
+        Parameter(f"{label}.{q.name}", q.neutral_value, q.unit, q.lower, q.upper, q.description) for q in definitions
+    )
+    return EFFECTS[kind](kind, location, Parameters(entries), definitions=definitions)
+
+
+def judge_recorded_case(data: Mapping[str, Any], limits: Thresholds) -> dict[str, Any]:
+    """Judge what `evidence_to_json` returned by other thresholds; return the part of `yid-diagnosis/2` that is scored.
+
+    The verdict is `not_judged` where these thresholds ask for a refit that was not made. What steers the search
+    before the first screening (events, the time step, other starts) is as it was.
+    """
+    case = _RecordedCase(data)
+    try:
+        judged = judge(
+            RefitContext(cast(Any, None), limits, NULL_PROGRESS, record=case.record, is_finished=True),
+            case.evidence,
+            case.locate,
+        )
+    except UnrecordedRefitError:
+        judged = Judgement(NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, ())
+    where = () if case.located_gap is None else case.located_gap.locations
+    if judged.accepted:
+        rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
+        where = gap_locations_from_effect_closures(where, judged.closure_by_location, rest, ())
+    return judgement_to_dict(judged, case.evidence, where)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import math
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
+from yid_ocp.analysis.discretisation import refitted_residual_at_finer_step
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
@@ -38,30 +40,20 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     RefitStore,
     RefittedModel,
+    StoredFit,
     load_stored_refit,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import (
+    CandidateScore,
     GapLocation,
-    ScreeningResult,
     gap_locations_by_smoother_evidence,
     gap_locations_from_effect_closures,
-    main_gap_locations,
     merge_time_intervals,
     screen_candidates,
 )
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, SelectedEffect, held_out_gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import (
-    check_effect_amplitude_transfer,
-    decide_verdict,
-    find_unknown_verdict_reason,
-    finer_step_that_explains_gap,
-    fraction_of_smoother_chi2_decrease,
-    has_significant_gap,
-    inflate_fit_stds_by_disagreement,
-    is_barely_significant_and_unexplained,
-)
+from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.null_test import (
@@ -69,6 +61,7 @@ from yid_ocp.inference.null_test import (
     assumed_channel_noise_levels,
     residual_channel_indices,
     residual_chi2_null_test,
+    residuals_exceed_noise,
     whiten_with_extra_errors,
 )
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, select_and_smooth_unknowns
@@ -146,12 +139,14 @@ class _Examined:
     whole: EstimationProblem  # with all samples
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all recordings, where it was asked
-    before: NullTestResult
-    held: NullTestResult
-    screened: ScreeningResult
-    has_gap: bool
-    has_enough_samples: bool
+    evidence: NominalEvidence
     stated_and_finer_time_step: tuple[float, float] | None = None  # where the stated one's error was part of the gap
+
+    @property
+    def is_search_worthwhile(self) -> bool:
+        """Whether there is a gap, and enough samples to say what makes it."""
+        limits = self.search.thresholds
+        return self.evidence.has_gap(limits) and self.evidence.has_enough_samples(limits)
 
 
 def _examined(
@@ -163,21 +158,22 @@ def _examined(
     search, nominal, cuts = _followed(search, nominal)
     clock["nominal"] = time.perf_counter()
     found = _examined_about_fit(problem, search, nominal, cuts, clock)
-    while found.has_gap and found.has_enough_samples:
-        finer = finer_step_that_explains_gap(found.search, found.nominal, found.events, found.screened.candidate_scores)
+    while found.is_search_worthwhile:
+        finer = _finer_step_that_explains_gap(
+            found.search, found.nominal, found.events, found.evidence.screening.candidate_scores
+        )
         again = None if finer is None else _settled(finer, found.nominal.values, "")
         if finer is None or again is None:
             break
         finer = replace(finer, problem=replace(finer.problem, candidate_effects=search.problem.candidate_effects))
         problem = problem.with_time_step(finer.problem.problem.step.time_step)
         found = _examined_about_fit(problem, *_followed(finer, again, found.truncated), clock)
-    poor = found.has_gap and found.has_enough_samples and found.before.chi2_per_dof < limits.restart_chi2
+    poor = found.is_search_worthwhile and found.evidence.nominal_test.chi2_per_dof < limits.restart_chi2
     if poor and not search.note_skip_past_deadline("the nominal model from other starts"):
         other = _better_nominal_fit(found.search, found.nominal)
         if other is not None:
             # what the smoother says is about another fit
             found = _tested(*_followed(found.search, other, found.truncated), found.whole, found.events, None)
-            found = replace(found, has_enough_samples=True)
     clock["other_starts"] = time.perf_counter()
     steps = search.problem.problem.step.time_step, found.nominal.problem.step.time_step
     return found if steps[0] == steps[1] else replace(found, stated_and_finer_time_step=steps)
@@ -203,73 +199,56 @@ def _examined_about_fit(
 def _diagnosed(
     problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, float]
 ) -> DiagnosisResult:
-    search, nominal, before, held, screened = seen.search, seen.nominal, seen.before, seen.held, seen.screened
-    limits, enough, scores = search.thresholds, seen.has_enough_samples, screened.candidate_scores
-    changed = earlier.fit_parameters_differ_significantly(nominal, limits)
-    moved = changed and not seen.has_gap
-    gap, smoothed, trusted = seen.has_gap or moved, None, None
-    if gap and enough:
+    search, nominal, evidence = seen.search, seen.nominal, seen.evidence
+    limits, held, screened = search.thresholds, evidence.nominal_held_out_test, evidence.screening
+    evidence = replace(evidence, has_left_baseline=earlier.fit_parameters_differ_significantly(nominal, limits))
+    smoothed: SmoothedUnknownsResult | None = None
+
+    def locate() -> LocatedGap:
+        nonlocal smoothed
         search.progress.begin_stage("locating the gap", 1.0, 8.5)
         # where nothing happened it was run on all that was fitted already
-        smoothed = None if search.problem.is_split_in_blocks else seen.smoothed
-        smoothed = _smooth_about_model(nominal, limits) if smoothed is None else smoothed
-        # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
-        trusted = None if nominal.problem.has_process_noise else smoothed
-        gap = not is_barely_significant_and_unexplained(trusted, scores, before, held, limits)
-    clock["localisation"] = time.perf_counter()
-    where = () if smoothed is None else gap_locations_by_smoother_evidence(smoothed, limits.location_z)
-    fits: tuple[RefittedModel, ...] = ()
-    added: tuple[SelectedEffect, ...] = ()
-    if gap and enough and scores:
-        places = [place.location for place in main_gap_locations(where)]
-        fits, added = select_effects(search, nominal, screened, places, changed)
-    clock["refits"] = time.perf_counter()
-    carried = check_effect_amplitude_transfer(search, added[-1].refitted_model) if added else ()
-    if carried:
-        last = inflate_fit_stds_by_disagreement(added[-1].refitted_model, carried)
-        added = (*added[:-1], replace(added[-1], refitted_model=last))
-    clock["carry_over"] = time.perf_counter()
-    last = added[-1].refitted_model if added else nominal
-    total = held_out_gap_closure(nominal.held_out_loss, last.held_out_loss, limits) if added else UNDEFINED_GAP_CLOSURE
-    explained = fraction_of_smoother_chi2_decrease(nominal, added, trusted)
-    same = all(entry.is_consistent for entry in carried)
-    reason = find_unknown_verdict_reason(added, total, limits, explained, same)
-    # what parameters explain by moving is no gap
-    verdict = decide_verdict(gap and (bool(added) or not moved), enough, screened.detectability, reason, added)
-    accepted = added if verdict in ("effect", "confusable") else ()
-    final = last if accepted else nominal
-    remaining, where, rest = _after(nominal, accepted, where, before, held, limits)
-    law = _law(problem, seen, verdict, final, rest if accepted else where)
-    clock["law"] = time.perf_counter()
+        known = None if search.problem.is_split_in_blocks else seen.smoothed
+        smoothed = _smooth_about_model(nominal, limits) if known is None else known
+        by_chance = smoothed.dof_before - smoothed.dof_after
+        places = gap_locations_by_smoother_evidence(smoothed, limits.location_z)
+        decrease = smoothed.chi2_before - smoothed.chi2_after - by_chance
+        return LocatedGap(places, smoothed.plant_or_sensor_origin, decrease)
+
+    located = functools.cache(locate)
+
+    def finished(stage: str) -> None:
+        clock[stage] = time.perf_counter()
+
+    judged = judge(search, evidence, located, finished)
+    where = () if smoothed is None else located().locations
+    accepted = judged.accepted
+    final = accepted[-1].refitted_model if accepted else nominal
+    assert isinstance(final, RefittedModel)
+    remaining, rest = held, where
+    if accepted:
+        remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
+    law = _law(problem, seen, judged.verdict, final, rest)
+    finished("law")
     # what a better model explains was no event
     events = _happened(seen.whole, final, limits)[0] if accepted else seen.events
-    clock["remaining"] = time.perf_counter()
+    finished("remaining")
     finding = DiagnosisResult(
-        verdict=verdict,
+        **(vars(evidence) | vars(judged)),
         noise_floor=assumed_channel_noise_levels(nominal.problem),
-        nominal_test=before,
-        nominal_held_out_test=held,
-        detectability=screened.detectability,
-        confusability=screened.confusability,
-        candidate_scores=scores,
+        located_gap=None if smoothed is None else located(),
+        record=search.record,
         smoother_result=smoothed,
         gap_locations=where,
-        nominal_model=nominal,
-        single_effect_models=fits,
-        selected_effects=added,
-        gap_closure=total,
         remaining_test=remaining,
         remaining_gap_locations=rest,
         nominal_changes=_changes(nominal, final),
-        next_experiment=recommended_experiment_text(verdict, accepted, where, screened.detectability),
+        next_experiment=recommended_experiment_text(judged, where, screened.detectability),
+        message=insufficient_data_message(judged.verdict, evidence, limits),
         held_out_names=tuple(episode.name for episode in nominal.problem.held_out),
         is_split_in_blocks=search.problem.is_split_in_blocks,
-        message=insufficient_data_message(verdict, before, len(nominal.values), screened.detectability, limits),
         thresholds=limits,
         truncated_recordings=seen.truncated,
-        unknown_reason=reason if verdict == "unknown" else "",
-        explained_fraction=explained,
-        transfer_checks=carried,
         stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
@@ -292,6 +271,45 @@ def _law(
     if seen.stated_and_finer_time_step is not None:
         problem = problem.with_time_step(seen.stated_and_finer_time_step[1])
     return find_gap_law(seen.search, problem, final, places, seen.events)
+
+
+@dataclass(frozen=True)
+class _FinerStepRefitStore:
+    """The refits of another store that were made at a finer time step [s] than stated, under names of their own."""
+
+    store: RefitStore
+    time_step: float
+
+    def get(self, name: str) -> StoredFit | None:
+        """Return the refit stored under a name at this time step; None if there is none."""
+        return self.store.get(f"{name} at {self.time_step:g} s")
+
+    def put(self, name: str, refitted: StoredFit) -> None:
+        """Store a refit under a name and this time step."""
+        self.store.put(f"{name} at {self.time_step:g} s", refitted)
+
+
+def _finer_step_that_explains_gap(
+    search: RefitContext, fit: RefittedModel, events: EventSet, ranked: Sequence[CandidateScore]
+) -> RefitContext | None:
+    """Return all hypotheses at half the time step if that explains more than half of what the best candidate promises.
+
+    The test is one prediction at the nominal `fit` and one Gauss-Newton step from there, on the recordings to
+    estimate on without their `events`; None where it explains less or cannot be predicted.
+    """
+    h = fit.problem.step.time_step / 2
+    search.progress.begin_stage("trying half the time step", 1.0, 8.5)
+    finer = search.problem.with_time_step(h)
+    fine = problem_corrected_for_events(finer.problem, events)
+    left = refitted_residual_at_finer_step(fine, fit.problem, fit.problem.vector(fit.values), fit.evaluation)
+    if left is None:
+        return None
+    excess, rest = (float(r @ r) - np.count_nonzero(r) for r in (fit.evaluation.residual, left))
+    if excess - rest <= max((score.predicted_chi2_decrease for score in ranked), default=excess) / 2:
+        return None
+    search.progress.begin_stage(f"half the time step lowers chi2 by {excess - rest:.3g}: going on at {h:g} s")
+    store = None if search.store is None else _FinerStepRefitStore(search.store, h)
+    return replace(search, problem=finer, store=store)
 
 
 def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> EstimationProblem:
@@ -378,10 +396,8 @@ def _tested(
     before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     screened = screen_candidates(composed, (), nominal.values, limits)
-    gap = has_significant_gap(before, held, limits, screened.candidate_scores, _offsets_stated(nominal.problem))
-    enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
-    search = replace(search, problem=composed)
-    return _Examined(search, nominal, cuts, whole, events, smoothed, before, held, screened, gap, enough)
+    evidence = NominalEvidence(nominal, before, held, screened, _offsets_stated(nominal.problem))
+    return _Examined(replace(search, problem=composed), nominal, cuts, whole, events, smoothed, evidence)
 
 
 def _followed(
@@ -463,29 +479,14 @@ def _composed(
 
 
 def _after(
-    nominal: RefittedModel,
-    accepted: Sequence[SelectedEffect],
-    where: tuple[GapLocation, ...],
-    before: NullTestResult,
-    held: NullTestResult,
-    limits: Thresholds,
+    before: NullTestResult, last: RefittedModel, where: tuple[GapLocation, ...], judged: Judgement, limits: Thresholds
 ) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
-    """The held-out null test with the effects, the places of the gap, and those of the residual gap."""
-    if not accepted:
-        return held, where, where
-    last = accepted[-1].refitted_model
+    """The held-out null test with the accepted effects, the places of the gap, and those of the residual gap."""
     remaining = _held_out_null_test(last, limits)
-    left = has_significant_gap(_estimation_null_test(last, limits), remaining, limits)
+    left = residuals_exceed_noise((_estimation_null_test(last, limits), remaining), limits.null_test_limits)
     rest = gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.location_z) if left else ()
     windows = merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
-    # every effect closes what it adds to those before it
-    closed: dict[str, float] = {}
-    most = 0.0
-    for entry in accepted:
-        place, part = entry.effect.location, entry.cumulative_closure.fraction
-        closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
-        most = max(part, most)
-    return remaining, gap_locations_from_effect_closures(where, closed, rest, windows), rest
+    return remaining, gap_locations_from_effect_closures(where, judged.closure_by_location, rest, windows), rest
 
 
 def _changes(before: RefittedModel, after: RefittedModel) -> tuple[NominalParameterChange, ...]:

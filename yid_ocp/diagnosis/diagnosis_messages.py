@@ -9,27 +9,23 @@ from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsR
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
-from yid_ocp.diagnosis.refit import RefittedModel
+from yid_ocp.diagnosis.refit import RefitStatistics
 from yid_ocp.diagnosis.screening import (
     DetectableAmplitudes,
     GapLocation,
     main_gap_locations,
 )
-from yid_ocp.diagnosis.select import (
-    SelectedEffect,
-)
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
+    Judgement,
+    NominalEvidence,
     failed_transfer_checks,
     independent_assumption_count,
     required_fraction_of_smoother_chi2_decrease,
 )
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
-from yid_ocp.inference.null_test import (
-    NullTestResult,
-    residuals_exceed_noise,
-)
+from yid_ocp.inference.null_test import residuals_exceed_noise
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _PRIOR_RANGE_TOLERANCE = 0.25  # part of its range by which an amplitude may leave it unnoticed
@@ -77,11 +73,12 @@ def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
 
 
 def recommended_experiment_text(
-    verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[DetectableAmplitudes]
+    judged: Judgement, where: Sequence[GapLocation], seen: Sequence[DetectableAmplitudes]
 ) -> str:
     """Return a sentence that recommends the next recording, from verdict, gap location and confusable effects."""
-    rivals = next((entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1), ())
-    if rivals and verdict != "insufficient_data":
+    verdict = judged.verdict
+    rivals = next((entry.equivalent_effects for entry in judged.accepted if len(entry.equivalent_effects) > 1), ())
+    if rivals:
         return _separating_experiment(rivals)
     unseen = [entry.effect.label for entry in seen if not entry.is_detectable]
     place = where[0].location if where and where[0].gap_share > 0 else ""
@@ -94,16 +91,15 @@ def recommended_experiment_text(
     return _NEXT_EXPERIMENT_TEXTS[case].format(place=place, unseen=listed)
 
 
-def insufficient_data_message(
-    verdict: str, before: NullTestResult, unknowns: int, seen: Sequence[DetectableAmplitudes], limits: Thresholds
-) -> str:
+def insufficient_data_message(verdict: str, seen: NominalEvidence, limits: Thresholds) -> str:
     """Return a message why the data are insufficient; the empty string if they suffice."""
     if verdict != "insufficient_data":
         return ""
-    if not any(entry.is_detectable for entry in seen):
+    if not any(entry.is_detectable for entry in seen.screening.detectability):
         return "no candidate of its expected size would be visible in these recordings."
+    unknowns = len(seen.nominal_model.values)
     needed = f"at least {limits.min_samples_per_unknown * unknowns:.0f} are needed"
-    said = f"{before.degrees_of_freedom:.0f} effective samples for {unknowns} unknowns, {needed}"
+    said = f"{seen.nominal_test.degrees_of_freedom:.0f} effective samples for {unknowns} unknowns, {needed}"
     return f"{said}; record longer or free fewer parameters."
 
 
@@ -158,10 +154,10 @@ def _gap(finding: DiagnosisResult) -> str:
         return f"The data are insufficient: {finding.message}"
     if finding.verdict == "no_gap":
         return f"There is no relevant gap ({sizes}; p = {p:.2g})."
-    best = min(finding.candidate_scores, key=lambda score: score.p_value, default=None)
+    best = min(finding.screening.candidate_scores, key=lambda score: score.p_value, default=None)
     if residuals_exceed_noise((first, held), limits.null_test_limits) or best is None:
         return f"The gap is real ({sizes}; p {_p_value_relation(p)})."
-    small = _p_value_relation(min(1.0, best.p_value * len(finding.candidate_scores)))
+    small = _p_value_relation(min(1.0, best.p_value * len(finding.screening.candidate_scores)))
     said = f"As a whole the recordings are explained to within their noise ({sizes})"
     return f"{said}, but not along what {best.effect.label} would do (p {small})."
 
@@ -252,7 +248,7 @@ def _model_error(finding: DiagnosisResult) -> str:
     return f" of {said}" if said else ""
 
 
-def _figures(effect: EffectBase, fit: RefittedModel) -> str:
+def _figures(effect: EffectBase, fit: RefitStatistics) -> str:
     text = []
     for name, r in fit.effect_parameters_as_reported(effect).items():
         known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
@@ -260,7 +256,7 @@ def _figures(effect: EffectBase, fit: RefittedModel) -> str:
     return ", ".join(text)
 
 
-def _out_of_range(effect: EffectBase, fit: RefittedModel) -> list[str]:
+def _out_of_range(effect: EffectBase, fit: RefitStatistics) -> list[str]:
     """Amplitudes beyond the range that an engineer would expect."""
     found = []
     for name in effect.amplitude_names:

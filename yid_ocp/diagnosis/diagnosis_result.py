@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsRemovedAndAdded
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
-from yid_ocp.diagnosis.refit import RefittedModel
-from yid_ocp.diagnosis.screening import (
-    CandidateScore,
-    ConfusabilityMatrix,
-    DetectableAmplitudes,
-    GapLocation,
-    bonferroni_min_p_value,
-)
+from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel, SearchRecord
+from yid_ocp.diagnosis.screening import GapLocation, bonferroni_min_p_value
 from yid_ocp.diagnosis.select import (
     GapClosure,
-    SelectedEffect,
     held_out_gap_closure,
     held_out_improvement,
     largest_relative_rmse_reduction,
@@ -29,8 +22,9 @@ from yid_ocp.diagnosis.select import (
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
-    EffectAmplitudeTransferCheck,
-    UnknownVerdictReason,
+    Judgement,
+    LocatedGap,
+    NominalEvidence,
     failed_transfer_checks,
     independent_assumption_count,
 )
@@ -58,23 +52,14 @@ class NominalParameterChange:
     std_after: float
 
 
-@dataclass(frozen=True, repr=False)
-class DiagnosisResult(ReprMixin):
+@dataclass(frozen=True, repr=False, kw_only=True)
+class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     """Result of a diagnosis: verdict, gap, locations, effects and the statistics on which they are based."""
 
-    verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
-    nominal_test: NullTestResult  # on the recordings to estimate on
-    nominal_held_out_test: NullTestResult
-    detectability: tuple[DetectableAmplitudes, ...]
-    confusability: ConfusabilityMatrix
-    candidate_scores: tuple[CandidateScore, ...]  # first pass, best first
     smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None where there is no gap to locate
     gap_locations: tuple[GapLocation, ...]
     nominal_model: RefittedModel
-    single_effect_models: tuple[RefittedModel, ...]  # of the first round, best first
-    selected_effects: tuple[SelectedEffect, ...]
-    gap_closure: GapClosure
     remaining_test: NullTestResult  # held-out, with the effects added
     remaining_gap_locations: tuple[GapLocation, ...]
     nominal_changes: tuple[NominalParameterChange, ...]  # when the accepted effects are added
@@ -88,9 +73,8 @@ class DiagnosisResult(ReprMixin):
     counterfactual: ErrorsWithEffectsRemovedAndAdded | None = None
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
-    unknown_reason: UnknownVerdictReason = ""
-    explained_fraction: float = 1.0  # what the effects explain over what the smoother explains
-    transfer_checks: tuple[EffectAmplitudeTransferCheck, ...] = ()
+    located_gap: LocatedGap | None = None
+    record: SearchRecord = field(default_factory=SearchRecord)
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
     untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
     search_seconds: float = 0.0  # from the start to the end of the search for effects
@@ -102,7 +86,7 @@ class DiagnosisResult(ReprMixin):
         effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction
         said = f"{100 * closed:.3g} % of the held-out gap closed" if effects and math.isfinite(closed) else ""
         rows = [("candidate", "parameters", "closure alone", "p")]
-        for entry in _ranked_candidates(self)[:8]:
+        for entry in _ranked_candidates(self, self)[:8]:
             values = {name: own for name, own in entry["parameters"].items() if own["value"] is not None}
             known = ", ".join(f"{name} = {own['value']:.3g} {own['unit']}" for name, own in values.items())
             alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
@@ -112,13 +96,14 @@ class DiagnosisResult(ReprMixin):
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
         """Effects of an `effect` or `confusable` verdict, in the order they were added; empty for other verdicts."""
-        named = self.verdict in ("effect", "confusable")
-        return tuple(entry.effect for entry in self.selected_effects) if named else ()
+        return tuple(entry.effect for entry in self.accepted)
 
     @property
     def final_model(self) -> RefittedModel:
         """The model with all accepted effects; the nominal model if there are none."""
-        return self.selected_effects[-1].refitted_model if self.accepted_effects else self.nominal_model
+        last = self.accepted[-1].refitted_model if self.accepted else self.nominal_model
+        assert isinstance(last, RefittedModel)
+        return last
 
     @property
     def model_error_by_unit(self) -> dict[str, tuple[str, float]]:
@@ -132,28 +117,22 @@ class DiagnosisResult(ReprMixin):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
-        smoothed, accepted, since = self.smoother_result, self.accepted_effects, self.baseline_comparison
-        finer = self.stated_and_finer_time_step
+        smoothed, since, finer = self.smoother_result, self.baseline_comparison, self.stated_and_finer_time_step
         cuts = "recording kept=kept_duration whole=full_duration"
         carried = "effect=effect_label parameter value=estimation_value std=estimation_std again=held_out_value"
         carried += " again_std=held_out_std unit agrees=is_consistent"
         changes = "before=value_before after=value_after std=std_after unit"
-        rivals = [entry.equivalent_effects for entry in self.selected_effects if len(entry.equivalent_effects) > 1]
-        closed = self.gap_closure if accepted else None
+        judged = judgement_to_dict(self, self, self.gap_locations)
         return {
             "format": _FORMAT,
-            "verdict": self.verdict,
+            **judged,
             "gap": {
-                "before": _state(self.nominal_model, self.nominal_held_out_test),
+                **judged["gap"],
                 "after": _state(self.final_model, self.remaining_test),
-                **_closure(closed),
                 "held_out": list(self.held_out_names),
                 "finer_time_step": None if finer is None else finer[1],
                 "cut": [object_attributes_to_json_dict(c, cuts) for c in self.truncated_recordings],
             },
-            "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.gap_locations],
-            "which": _ranked_candidates(self),
-            "effects": [object_attributes_to_json_dict(e, _EFFECT) for e in accepted],
             "remaining": {
                 "p_value": self.remaining_test.p_value,
                 "model_error": {
@@ -165,7 +144,6 @@ class DiagnosisResult(ReprMixin):
             "law": None if self.law is None else self.law.to_dict(),
             "rejected_candidates": _rejected_candidates(self),
             "carried_over": [object_attributes_to_json_dict(c, carried) for c in self.transfer_checks],
-            "confusable": [[object_attributes_to_json_dict(e, _EFFECT) for e in own] for own in rivals if accepted],
             "events": [event.to_dict() for event in self.events.disturbances],
             "not_judged": [
                 object_attributes_to_json_dict(f, "recording joint from=start_time") for f in self.events.overspeeds
@@ -188,7 +166,7 @@ class DiagnosisResult(ReprMixin):
                 }
                 for entry in self.selected_effects
             ],
-            "unseen": [v.effect.label for v in self.detectability if not v.is_detectable],
+            "unseen": [v.effect.label for v in self.screening.detectability if not v.is_detectable],
             "noise": {
                 f.channel: object_attributes_to_json_dict(f, "std=noise_std unit samples=n_samples")
                 for f in self.noise_floor
@@ -198,6 +176,20 @@ class DiagnosisResult(ReprMixin):
             "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
             "seconds": dict(self.stage_seconds),
         }
+
+
+def judgement_to_dict(judged: Judgement, seen: NominalEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
+    """Return what is scored of a diagnosis as a JSON-compatible dictionary: the part of a result that rules decide."""
+    closed = judged.gap_closure if judged.accepted else None
+    rivals = [entry.equivalent_effects for entry in judged.accepted if len(entry.equivalent_effects) > 1]
+    return {
+        "verdict": judged.verdict,
+        "gap": {"before": _state(seen.nominal_model, seen.nominal_held_out_test), **_closure(closed)},
+        "where": [object_attributes_to_json_dict(place, _PLACE) for place in where],
+        "which": _ranked_candidates(judged, seen),
+        "effects": [object_attributes_to_json_dict(entry.effect, _EFFECT) for entry in judged.accepted],
+        "confusable": [[object_attributes_to_json_dict(e, _EFFECT) for e in own] for own in rivals],
+    }
 
 
 def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
@@ -225,7 +217,7 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
         "p_value": min_bonferroni_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
-        "candidate": min(1.0, bonferroni_min_p_value(finding.candidate_scores)),
+        "candidate": min(1.0, bonferroni_min_p_value(finding.screening.candidate_scores)),
         "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
         **of_effects,
         "assumptions": independent_assumption_count(added),
@@ -235,7 +227,7 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     return {name: to_json_types(value) for name, value in found.items()}
 
 
-def _behind(fit: RefittedModel, first: RefittedModel) -> dict[str, float]:
+def _behind(fit: RefitStatistics, first: RefitStatistics) -> dict[str, float]:
     """How much worse a refit is than the first."""
     lost, error = held_out_improvement(fit.held_out_loss, first.held_out_loss)
     left, squares = fit.held_out_loss.chi2_per_sample, penalized_chi2_difference(fit, first)
@@ -258,7 +250,7 @@ def _baseline_to_json(found: EarlierRunsComparison) -> dict[str, Any]:
     return {**known, "parameters": parameters, "changed": changed}
 
 
-def _state(fit: RefittedModel, test: NullTestResult) -> dict[str, Any]:
+def _state(fit: RefitStatistics, test: NullTestResult) -> dict[str, Any]:
     channels = fit.held_out_loss.channel_rmse
     return {
         "rmse": {name: value for name, (value, _) in channels.items()},
@@ -285,14 +277,15 @@ def _closure(closed: GapClosure | None) -> dict[str, Any]:
     return to_json_types({"closure": closed.fraction, "closure_ci": [closed.ci_low, closed.ci_high]})
 
 
-def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
+def _ranked_candidates(judged: Judgement, seen: NominalEvidence) -> list[dict[str, Any]]:
     """All candidates ranked: added effects, then other refits by held-out loss, then the rest by score."""
-    scores = {score.effect.label: score for score in finding.candidate_scores}
-    alone = {fit.effects[0].label: fit for fit in finding.single_effect_models}
-    entries: list[tuple[EffectBase, RefittedModel | None]] = [
-        *((effect, finding.final_model) for effect in finding.accepted_effects),
-        *((fit.effects[0], fit) for fit in finding.single_effect_models),
-        *((score.effect, None) for score in finding.candidate_scores),
+    ranked, first = seen.screening.candidate_scores, judged.single_effect_models
+    scores = {score.effect.label: score for score in ranked}
+    alone = {fit.effects[0].label: fit for fit in first}
+    entries: list[tuple[EffectBase, RefitStatistics | None]] = [
+        *((entry.effect, judged.accepted[-1].refitted_model) for entry in judged.accepted),
+        *((fit.effects[0], fit) for fit in first),
+        *((score.effect, None) for score in ranked),
     ]
     listed: dict[str, dict[str, Any]] = {}
     for effect, fit in entries:
@@ -301,7 +294,7 @@ def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
         score, own = scores.get(effect.label), alone.get(effect.label)
         step = {} if score is None else score.predicted_values
         reported = effect.parameters_as_reported(step) if fit is None else fit.effect_parameters_as_reported(effect)
-        before = finding.nominal_model.held_out_loss
+        before = seen.nominal_model.held_out_loss
         listed[effect.label] = {
             **object_attributes_to_json_dict(effect, _EFFECT),
             "parameters": {name: object_attributes_to_json_dict(r, "value std unit") for name, r in reported.items()},

@@ -6,16 +6,18 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, fields, replace
+from typing import Protocol, TypeVar, cast
 
 import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
+from yid_ocp.diagnosis.screening import CandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
@@ -36,6 +38,7 @@ from yid_ocp.solvers.base import SolverResult
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
 """A refit starts near its end and must be good to a small part of its std and of `chi2_equivalence` only."""
+_Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # times the prior range that a std may be: beyond it the parameter is not known at all
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
@@ -77,15 +80,14 @@ class StoredFit:
 
 
 @dataclass(frozen=True)
-class RefittedModel(StoredFit):
-    """The nominal model with some effects after a refit: values, standard deviations, evaluation and held-out loss."""
+class RefitStatistics(StoredFit):
+    """All that a rule asks of a refit: where it ended, and how well it predicts both sets of recordings."""
 
     effects: tuple[EffectBase, ...]
-    problem: EstimationProblem  # of the composed system, with the nominal parameters and those of the effects free
     cost: float
-    evaluation: Evaluation
     held_out_loss: HeldOutLoss
-    is_from_store: bool = False
+    residual_count: int  # of the recordings to estimate on, priors among them
+    has_process_noise: bool  # whether errors of torques drive the motion
 
     @property
     def effect_parameter_count(self) -> int:
@@ -95,6 +97,15 @@ class RefittedModel(StoredFit):
     def effect_parameters_as_reported(self, effect: EffectBase) -> dict[str, ReportedParameterValue]:
         """Return an effect's fitted parameters in reported units with standard deviations, by name."""
         return effect.parameters_as_reported(self.values, self.std)
+
+
+@dataclass(frozen=True)
+class RefittedModel(RefitStatistics):
+    """The nominal model with some effects after a refit, as a problem with its evaluation."""
+
+    problem: EstimationProblem  # of the composed system, with the nominal parameters and those of the effects free
+    evaluation: Evaluation
+    is_from_store: bool = False
 
 
 class RefitStore(Protocol):
@@ -116,8 +127,25 @@ class NominalSolutionAndRefitStore:
 
 
 @dataclass(frozen=True)
+class SearchRecord:
+    """What a search for effects was answered, by name, so that other rules can be tried on it without a refit."""
+
+    refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None where there is no fit
+    screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # beside effects that were added
+    pairs: dict[str, tuple[CandidatePair, ...]] = field(default_factory=dict)  # by the effect that is not among them
+
+
+class UnrecordedRefitError(LookupError):
+    """What rules ask was not worked out by the search whose record they are tried on."""
+
+
+@dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress, store and deadline that all refits of one diagnosis share."""
+    """Problem, thresholds, progress, store and deadline of one diagnosis; what rules ask is answered by refits.
+
+    With `is_finished` it is answered from the record alone, and `UnrecordedRefitError` says that it is not there; the
+    problem then does not matter.
+    """
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
@@ -126,12 +154,68 @@ class RefitContext:
     deadline: float = math.inf  # value of `time.perf_counter` after which nothing more is tried [s]
     skipped: list[str] = field(default_factory=list)  # what was not tried, of all copies of this context
     left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
+    record: SearchRecord = field(default_factory=SearchRecord)  # likewise
+    is_finished: bool = False
 
     def note_skip_past_deadline(self, *what: str) -> bool:
         """Whether the deadline for refits has passed; if so, `what` is noted as skipped."""
         is_late = time.perf_counter() >= self.deadline
         self.skipped.extend(what if is_late else ())
         return is_late
+
+    def refit(
+        self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str = ""
+    ) -> RefitStatistics | None:
+        """Return the model with some effects refitted, by a name that says from where; None if no rollout succeeds."""
+        asked = (self.problem, effects, start, self.store, name, self.thresholds)
+        return self._answer(self.record.refits, name or join_effect_labels(effects), lambda: refit_with_effects(*asked))
+
+    def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
+        """Return the same effects fitted on the held-out recordings; None where that cannot be done."""
+        name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
+        return self._answer(self.record.refits, name, lambda: self._turned(fit, name))
+
+    def _turned(self, fit: RefitStatistics, name: str) -> RefittedModel | None:
+        """The effects of a fit where recordings to estimate on and held-out ones have changed places."""
+        if self.problem.is_split_in_blocks:
+            return None
+        self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
+        problem = self.problem.problem
+        turned = replace(self.problem, problem=problem.with_episodes(problem.held_out, problem.episodes))
+        turned = turned.whitened_at(fit.values) if problem.has_process_noise else turned
+        # what both sets of recordings have in common, nothing of single recordings' starts
+        names = {*turned.nominal_free_parameters, *(n for effect in fit.effects for n in effect.parameters.names)}
+        start = {name: value for name, value in fit.values.items() if name in names}
+        return refit_with_effects(turned, fit.effects, start, self.store, name, self.thresholds)
+
+    def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
+        """Return all candidates screened beside some effects, by a name that says at which fit's values."""
+        return self._answer(
+            self.record.screenings, name, lambda: screen_candidates(self.problem, base, values, self.thresholds)
+        )
+
+    def ranked_pairs(self, screened: ScreeningResult, without: str = "") -> tuple[CandidatePair, ...]:
+        """Return the pairs of candidates that promise most, without one label; see `_MAX_RECORDED_PAIRS`."""
+        labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
+        found = screened.joint_score_model.ranked_pairs(labels)
+        return self._answer(self.record.pairs, without, lambda: tuple(itertools.islice(found, _MAX_RECORDED_PAIRS)))
+
+    def _answer(self, answers: dict[str, _Answer], name: str, work: Callable[[], _Answer]) -> _Answer:
+        """What is worked out and put on record, or what the record says."""
+        if self.is_finished:
+            if name not in answers:
+                raise UnrecordedRefitError(name)
+            return answers[name]
+        found = work()
+        # a model's rollouts would fill the memory
+        light = isinstance(found, RefittedModel)
+        kept = {own.name: getattr(found, own.name) for own in fields(RefitStatistics)} if light else {}
+        answers.setdefault(name, cast(_Answer, RefitStatistics(**kept)) if light else found)
+        return found
+
+
+_MAX_RECORDED_PAIRS = 48
+"""Pairs of candidates that a search looks at; beyond them all promise less than those that are refitted."""
 
 
 @dataclass(frozen=True)
@@ -220,8 +304,9 @@ def _model(
     x: Array,
     is_from_store: bool = False,
 ) -> RefittedModel:
-    rest = (tuple(effects), own, finish.cost, finish, _held_out_loss(own, x), is_from_store)
-    return RefittedModel(known.values, known.std, known.amplitude_std, known.solver_message, *rest)
+    kept = (known.values, known.std, known.amplitude_std, known.solver_message, tuple(effects), finish.cost)
+    size = (len(finish.residual), own.has_process_noise)
+    return RefittedModel(*kept, _held_out_loss(own, x), *size, own, finish, is_from_store)
 
 
 def _half_done(
@@ -333,7 +418,7 @@ def refit_with_each_effect(
     tried: Sequence[tuple[Sequence[EffectBase], Mapping[str, float]]],
     values: Mapping[str, float],
     where: str = "",
-) -> list[RefittedModel]:
+) -> list[RefitStatistics]:
     """Refit the model with each of several effects or pairs added to `base`; return the refits that succeed.
 
     Each of those `tried` stands beside the parameters at which it begins, `values` is where all other unknowns begin,
@@ -348,20 +433,19 @@ def refit_with_each_effect(
     search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}", 2 + 0.5 * len(tried), ahead)
     parts = PartsDoneCounter(search.progress, len(tried), join_effect_labels(tried[0][0]))
 
-    def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefittedModel | None:
+    def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefitStatistics | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
         name = f"{join_effect_labels(effects)} {where}" if where else ""
-        start = {**values, **entry[1]}
-        fit = refit_with_effects(search.problem, effects, start, search.store, name, search.thresholds)
+        fit = search.refit(effects, {**values, **entry[1]}, name)
         text = f"no fit with {label}"
         if fit is not None:
-            how = "resumed the refit" if fit.is_from_store else "refitted"
+            how = "resumed the refit" if getattr(fit, "is_from_store", False) else "refitted"
             search.left_by[join_effect_labels(effects)] = left = f"{fit.held_out_loss.chi2_per_sample:.4g}"
             text = f"{how} with {label}: held-out chi2/n {left}"
         parts.count_done(text, lambda: [head, *sorted(search.left_by.items(), key=lambda entry: float(entry[1]))])
         return fit
 
-    fits: list[RefittedModel | None] = []
+    fits: list[RefitStatistics | None] = []
     rest, begun = list(tried), time.perf_counter()
     while rest and not search.note_skip_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
         # a batch costs less than its refits one by one; within a limit, so many as will end before it, best first

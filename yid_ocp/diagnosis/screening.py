@@ -265,7 +265,7 @@ class ConfusabilityMatrix:
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
 
-_CandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
+CandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
 """Two candidates, their values after the step of the linear model, and by how much more than by chance r'r falls."""
 
 
@@ -282,7 +282,7 @@ class AllCandidatesScoreModel:
     def _columns(self) -> list[IntArray]:
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
-    def ranked_pairs(self, among: Sequence[str]) -> Iterator[_CandidatePair]:
+    def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
         """Yield all pairs of the candidates labelled in `among`, largest predicted decrease of r'r first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.

@@ -13,18 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
-from yid_ocp.diagnosis.refit import (
-    HeldOutLoss,
-    RefitContext,
-    RefittedModel,
-    refit_with_each_effect,
-    refit_with_effects,
-)
-from yid_ocp.diagnosis.screening import (
-    ScreeningResult,
-    bonferroni_min_p_value,
-    screen_candidates,
-)
+from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics, refit_with_each_effect
+from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_min_p_value
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
@@ -51,7 +41,7 @@ class SelectedEffect:
     """An effect added by forward selection, with its refitted model, cumulative closure and equivalent effects."""
 
     effect: EffectBase
-    refitted_model: RefittedModel  # with all effects up to this one
+    refitted_model: RefitStatistics  # with all effects up to this one
     cumulative_closure: GapClosure  # of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # effects that the data cannot tell from this one, the chosen one first
 
@@ -95,11 +85,13 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
-def _chi2(fit: RefittedModel) -> float:
+def _chi2(fit: RefitStatistics) -> float:
     return fit.held_out_loss.chi2_per_sample
 
 
-def _near_best_models(fits: Sequence[RefittedModel], limits: Thresholds = DEFAULT_THRESHOLDS) -> list[RefittedModel]:
+def _near_best_models(
+    fits: Sequence[RefitStatistics], limits: Thresholds = DEFAULT_THRESHOLDS
+) -> list[RefitStatistics]:
     """Models that predict the held-out recordings as well as the best one, the simplest first."""
     best = min(fits, key=_chi2)
     likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
@@ -113,7 +105,7 @@ def _near_best_models(fits: Sequence[RefittedModel], limits: Thresholds = DEFAUL
     likeliest = min(near, key=lambda fit: penalized_chi2_difference(fit, best))
     near = [fit for fit in near if not _noise_difference(fit, likeliest, limits) > 2 * limits.min_log_bayes_factor]
 
-    def order(fit: RefittedModel) -> tuple[bool, int, float]:
+    def order(fit: RefitStatistics) -> tuple[bool, int, float]:
         odd = any(_is_amplitude_outside_prior(effect, fit, limits) for effect in fit.effects[-1:])
         return odd, fit.effect_parameter_count, penalized_chi2_difference(fit, likeliest)
 
@@ -136,13 +128,13 @@ def _is_predicting_as_well(loss: HeldOutLoss, best: HeldOutLoss, limits: Thresho
     return float(ratios.mean()) <= float(np.std(ratios, ddof=1)) / math.sqrt(count)
 
 
-def _noise_difference(fit: RefittedModel, other: RefittedModel, limits: Thresholds) -> float:
+def _noise_difference(fit: RefitStatistics, other: RefitStatistics, limits: Thresholds) -> float:
     """`penalized_chi2_difference`; NaN where either leaves more than noise, so that squares are errors of a model."""
     left = _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
     return penalized_chi2_difference(fit, other) if left else math.nan
 
 
-def penalized_chi2_difference(fit: RefittedModel, other: RefittedModel) -> float:
+def penalized_chi2_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
     """Return r'r of `fit` minus r'r of `other`, over fitted and held-out recordings, plus a parameter penalty.
 
     Every parameter counts as the one by which chance alone lowers r'r.
@@ -151,7 +143,7 @@ def penalized_chi2_difference(fit: RefittedModel, other: RefittedModel) -> float
     return held + 2 * (fit.cost - other.cost) + fit.effect_parameter_count - other.effect_parameter_count
 
 
-def _bic_prefers(fit: RefittedModel, best: RefittedModel, limits: Thresholds) -> bool:
+def _bic_prefers(fit: RefitStatistics, best: RefitStatistics, limits: Thresholds) -> bool:
     """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates, alike within a block.
 
     Schwarz 1978, doi:10.1214/aos/1176344136.
@@ -162,11 +154,11 @@ def _bic_prefers(fit: RefittedModel, best: RefittedModel, limits: Thresholds) ->
     return blocks * math.log(_chi2(fit) / _chi2(best)) <= fewer * math.log(blocks)
 
 
-def _likely(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
+def _likely(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
     return _is_significant(effect, fit, limits) and not _is_shape_outside_prior(effect, fit, limits)
 
 
-def _is_shape_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
+def _is_shape_outside_prior(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether a shape exceeds its prior range by `max_shape_out_of_range_factor` or the margin in widths."""
     for name in effect.shape_parameter_names:
         low, high = effect.prior_ranges[name]
@@ -178,7 +170,7 @@ def _is_shape_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thre
     return False
 
 
-def _is_amplitude_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
+def _is_amplitude_outside_prior(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether an amplitude lies more than `prior_range_margin_in_widths` outside its prior range."""
     for name in effect.amplitude_names:
         low, high = effect.prior_ranges[name]
@@ -188,7 +180,7 @@ def _is_amplitude_outside_prior(effect: EffectBase, fit: RefittedModel, limits: 
     return False
 
 
-def _is_significant(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
+def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether any amplitude is at least `min_z` standard deviations from neutral."""
     neutral, std = effect.neutral_values, fit.amplitude_std
     return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
@@ -233,10 +225,10 @@ def _refit_shortlist(
     return [((s.effect,), s.predicted_values) for s in chosen.values()]
 
 
-def _from_before(search: RefitContext) -> list[RefittedModel]:
+def _from_before(search: RefitContext) -> list[RefitStatistics]:
     """Candidates refitted from the earlier run's parameters: the nominal fit's stand in for what is missing."""
     try:
-        screened = screen_candidates(search.problem, (), {}, search.thresholds)
+        screened = search.screen((), {}, "from the earlier run's parameters")
     except SolverError:
         return []
     search.progress.begin_stage("trying candidates from the earlier run's parameters")
@@ -244,9 +236,9 @@ def _from_before(search: RefitContext) -> list[RefittedModel]:
     return refit_with_each_effect(search, (), chosen, {}, "from the earlier run's parameters")
 
 
-def _likelier(fits: Sequence[RefittedModel]) -> list[RefittedModel]:
+def _likelier(fits: Sequence[RefitStatistics]) -> list[RefitStatistics]:
     """Of every effect the fit of least cost, in the order of their first ones."""
-    best: dict[str, RefittedModel] = {}
+    best: dict[str, RefitStatistics] = {}
     for fit in fits:
         label = fit.effects[-1].label
         best[label] = min(best.get(label, fit), fit, key=lambda entry: entry.cost)
@@ -255,11 +247,11 @@ def _likelier(fits: Sequence[RefittedModel]) -> list[RefittedModel]:
 
 def select_effects(
     search: RefitContext,
-    nominal: RefittedModel,
+    nominal: RefitStatistics,
     screened: ScreeningResult,
     places: Sequence[str] = (),
     moved: bool = False,
-) -> tuple[tuple[RefittedModel, ...], tuple[SelectedEffect, ...]]:
+) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
     """Select effects by forward selection on the held-out gap, then try replacing and removing each.
 
     `places` are where the smoother says that the gap lies, and `moved` is whether the nominal fit has left what an
@@ -268,7 +260,7 @@ def select_effects(
     selected.
     """
     limits, alone, current = search.thresholds, screened, nominal
-    first: tuple[RefittedModel, ...] = ()
+    first: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     paired = False
     while len(added) < limits.max_effects:
@@ -280,19 +272,19 @@ def select_effects(
             search.progress.begin_stage(
                 f"scoring the residual gap next to {', '.join(e.label for e in base)}", 1.0, ahead
             )
-            screened = screen_candidates(search.problem, base, current.values, limits)
+            screened = search.screen(base, current.values, f"beside {join_effect_labels(base)}")
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)
             if _little_is_left(current, limits) and p_value >= limits.gap_significance_level_by_candidate:
                 break
-            if len(base) == 1 and _futile([nominal, current, *first], alone, screened, limits):
+            if len(base) == 1 and _futile(search, [nominal, current, *first], alone, screened):
                 break
         shortlist = _refit_shortlist(screened, limits, base, places)
         fits = refit_with_each_effect(search, base, shortlist, current.values)
         if moved and not base and not search.note_skip_past_deadline("candidates from the earlier run's parameters"):
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
-            pairs = _pairs_to_refit(alone, limits, base[0])
+            pairs = _pairs_to_refit(search, alone, base[0])
             for fit in refit_with_each_effect(search, (), pairs, nominal.values, "together"):
                 one = fit.effects[0]
                 if _likely(one, fit, limits) and not _is_amplitude_outside_prior(one, fit, limits):
@@ -329,30 +321,30 @@ def select_effects(
     return first, kept
 
 
-def _futile(fits: Sequence[RefittedModel], alone: ScreeningResult, rest: ScreeningResult, limits: Thresholds) -> bool:
+def _futile(
+    search: RefitContext, fits: Sequence[RefitStatistics], alone: ScreeningResult, rest: ScreeningResult
+) -> bool:
     """Whether no refit closes half of the gap and no two effects promise to explain it; never beside torque noise."""
-    nominal, current, *tried = fits
+    limits, (nominal, current, *tried) = search.thresholds, fits
     best = held_out_gap_closure(nominal.held_out_loss, min(tried, key=_chi2).held_out_loss)
-    if nominal.problem.has_process_noise or not best.fraction < 0.5:
+    if nominal.has_process_noise or not best.fraction < 0.5:
         return False
-    *_, pair = next(
-        iter(alone.joint_score_model.ranked_pairs([s.effect.label for s in alone.candidate_scores])), (0.0,)
-    )
+    *_, pair = next(iter(search.ranked_pairs(alone)), (0.0,))
     second = max((score.predicted_chi2_decrease for score in rest.candidate_scores), default=0.0)
     promised = max(pair, 2 * (nominal.cost - current.cost) + second)
-    return promised < limits.min_explained_fraction * (2 * nominal.cost - len(nominal.evaluation.residual))
+    return promised < limits.min_explained_fraction * (2 * nominal.cost - nominal.residual_count)
 
 
-def _pairs_to_refit(screened: ScreeningResult, limits: Thresholds, without: EffectBase) -> list[_Start]:
+def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[_Start]:
     """The pairs of candidates to refit: best penalized decrease first, without confusable duplicates."""
+    limits = search.thresholds
 
     def same(one: EffectBase, other: EffectBase) -> bool:
         alike = screened.confusability.confusable_with(one.label, limits.signature_overlap)
         return one.label == other.label or other.label in alike
 
-    labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without.label]
     chosen: list[_Start] = []
-    for (a, b), values, _ in screened.joint_score_model.ranked_pairs(labels):
+    for (a, b), values, _ in search.ranked_pairs(screened, without.label):
         if len(chosen) == limits.n_refit_pairs:
             break
         before = (pair for pair, _ in chosen)
@@ -361,12 +353,12 @@ def _pairs_to_refit(screened: ScreeningResult, limits: Thresholds, without: Effe
     return chosen
 
 
-def _little_is_left(fit: RefittedModel, limits: Thresholds) -> bool:
+def _little_is_left(fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the effects of a fit leave little but noise; a gap that is as little is one without any."""
     return bool(fit.effects) and _noise_is_left(limits, fit.held_out_loss)
 
 
-def _worth_adding(current: RefittedModel, chosen: RefittedModel, limits: Thresholds) -> bool:
+def _worth_adding(current: RefitStatistics, chosen: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the last effect of a fit closes a significant and relevant part of the gap, and is significant itself."""
     before, after = current.held_out_loss, chosen.held_out_loss
     gained, error = held_out_improvement(before, after)
@@ -375,14 +367,14 @@ def _worth_adding(current: RefittedModel, chosen: RefittedModel, limits: Thresho
     return (closes or _lr_decisive(before, after, limits)) and _is_there(current, chosen, chosen.effects[-1], limits)
 
 
-def _is_there(without: RefittedModel, full: RefittedModel, effect: EffectBase, limits: Thresholds) -> bool:
+def _is_there(without: RefitStatistics, full: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
     """Whether an effect is significant and removes a relevant part of the held-out error."""
     reduced = _is_rmse_reduced(without.held_out_loss, full.held_out_loss, limits)
     return reduced and _is_significant(effect, full, limits)
 
 
 def _reconsidered(
-    search: RefitContext, nominal: RefittedModel, added: Sequence[SelectedEffect], paired: bool
+    search: RefitContext, nominal: RefitStatistics, added: Sequence[SelectedEffect], paired: bool
 ) -> tuple[SelectedEffect, ...]:
     """Every effect tried for its place again beside the others: without it, and others instead of it."""
     kept = tuple(added)
@@ -406,7 +398,7 @@ def _labels(added: Sequence[SelectedEffect]) -> frozenset[str]:
 
 
 def _revised(
-    search: RefitContext, nominal: RefittedModel, kept: tuple[SelectedEffect, ...], entry: SelectedEffect
+    search: RefitContext, nominal: RefitStatistics, kept: tuple[SelectedEffect, ...], entry: SelectedEffect
 ) -> tuple[SelectedEffect, ...]:
     """The effects without one of them, with another in its place, or as they are with what would do as well."""
     limits, full, label = search.thresholds, kept[-1].refitted_model, entry.effect.label
@@ -419,10 +411,12 @@ def _revised(
         search.progress.begin_stage(f"left {label} out again: the others do as well")
         return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
     search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
-    screened = screen_candidates(search.problem, rest, without.values, limits)
+    company = f"in the place of {label}"
+    screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
     tried = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
     own = replace(full, effects=(*rest, entry.effect))
-    others = refit_with_each_effect(search, rest, [pair for pair in tried if pair[0][0].label != label], without.values)
+    tried = [pair for pair in tried if pair[0][0].label != label]
+    others = refit_with_each_effect(search, rest, tried, without.values, company)
     if not _is_amplitude_outside_prior(entry.effect, own, limits):
         others = [fit for fit in others if not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
     near = _near_best_models([own, *others], limits)
@@ -435,7 +429,7 @@ def _revised(
     return _rebuilt(search, nominal, placed, replace(chosen, effects=tuple(e.effect for e in placed)))
 
 
-def _needed(without: RefittedModel, full: RefittedModel, effect: EffectBase, limits: Thresholds) -> bool:
+def _needed(without: RefitStatistics, full: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
     """Whether held-out recordings are predicted significantly worse without an effect that is significant."""
     gained, error = held_out_improvement(without.held_out_loss, full.held_out_loss)
     sure = gained > error or _lr_decisive(without.held_out_loss, full.held_out_loss, limits)
@@ -443,7 +437,7 @@ def _needed(without: RefittedModel, full: RefittedModel, effect: EffectBase, lim
 
 
 def _rebuilt(
-    search: RefitContext, nominal: RefittedModel, entries: Sequence[SelectedEffect], last: RefittedModel
+    search: RefitContext, nominal: RefitStatistics, entries: Sequence[SelectedEffect], last: RefitStatistics
 ) -> tuple[SelectedEffect, ...]:
     """Effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
     effects = [entry.effect for entry in entries]
@@ -456,6 +450,8 @@ def _rebuilt(
     return tuple(found)
 
 
-def _again(search: RefitContext, effects: Sequence[EffectBase], near: RefittedModel, name: str) -> RefittedModel | None:
+def _again(
+    search: RefitContext, effects: Sequence[EffectBase], near: RefitStatistics, name: str
+) -> RefitStatistics | None:
     """A refit that begins where another one ended."""
-    return refit_with_effects(search.problem, effects, near.values, search.store, name, search.thresholds)
+    return search.refit(effects, near.values, name)

@@ -7,22 +7,23 @@ robot comes out the same wherever it is fitted; so the held-out recordings are f
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
-
-from yid_ocp.analysis.discretisation import refitted_residual_at_finer_step
-from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
-from yid_ocp.diagnosis.hypotheses import join_effect_labels
-from yid_ocp.diagnosis.refit import RefitContext, RefitStore, RefittedModel, StoredFit, refit_with_effects
-from yid_ocp.diagnosis.screening import CandidateScore, DetectableAmplitudes, bonferroni_min_p_value
-from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
+from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
+from yid_ocp.diagnosis.screening import (
+    CandidateScore,
+    DetectableAmplitudes,
+    GapLocation,
+    ScreeningResult,
+    bonferroni_min_p_value,
+    main_gap_locations,
+)
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, SelectedEffect, select_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
-from yid_ocp.inference.smoother import SmoothedUnknownsResult
 
 UnknownVerdictReason = Literal["", "none", "unsure", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""
@@ -57,32 +58,122 @@ class EffectAmplitudeTransferCheck:
         return abs(self.estimation_value - self.held_out_value), spread
 
 
+@dataclass(frozen=True)
+class LocatedGap:
+    """What the smoother says of the nominal model's gap."""
+
+    locations: tuple[GapLocation, ...]
+    origin: str  # see `SmoothedUnknownsResult.plant_or_sensor_origin`
+    chi2_decrease: float  # by unknown forces, offsets and biases, beyond what chance takes
+
+
+@dataclass(frozen=True)
+class NominalEvidence:
+    """What is known of a gap before effects are searched for."""
+
+    nominal_model: RefitStatistics
+    nominal_test: NullTestResult  # on the recordings to estimate on
+    nominal_held_out_test: NullTestResult
+    screening: ScreeningResult
+    are_offsets_stated: bool  # whether the size of torque offsets or of constant sensor errors is
+    has_left_baseline: bool = False  # whether parameters are no more what an earlier run found
+
+    def has_gap(self, limits: Thresholds) -> bool:
+        """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount."""
+        tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
+        return has_significant_gap(*tests, limits, ranked, self.are_offsets_stated)
+
+    def has_enough_samples(self, limits: Thresholds) -> bool:
+        """Whether there are enough effective samples for the unknowns."""
+        enough = limits.min_samples_per_unknown * len(self.nominal_model.values)
+        return self.nominal_test.degrees_of_freedom >= enough
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What follows from the numbers of a diagnosis: verdict, effects, and the statistics on which they rest."""
+
+    verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
+    unknown_reason: UnknownVerdictReason
+    single_effect_models: tuple[RefitStatistics, ...]  # of the first round, best first
+    selected_effects: tuple[SelectedEffect, ...]
+    gap_closure: GapClosure
+    explained_fraction: float  # what the effects explain over what the smoother explains
+    transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
+
+    @property
+    def accepted(self) -> tuple[SelectedEffect, ...]:
+        """The effects of an `effect` or `confusable` verdict, in the order they were added; empty for others."""
+        return self.selected_effects if self.verdict in ("effect", "confusable") else ()
+
+    @property
+    def closure_by_location(self) -> dict[str, float]:
+        """What the accepted effects at each location close beyond those added before."""
+        closed: dict[str, float] = {}
+        most = 0.0
+        for entry in self.accepted:
+            place, part = entry.effect.location, entry.cumulative_closure.fraction
+            closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
+            most = max(part, most)
+        return closed
+
+
+def judge(
+    search: RefitContext,
+    seen: NominalEvidence,
+    locate: Callable[[], LocatedGap],
+    finished: Callable[[str], None] = lambda _: None,
+) -> Judgement:
+    """Return the verdict that follows from what is known of the gap and from what a search for effects is answered.
+
+    A function of numbers alone: refits, screenings and the smoother (`locate`) are asked for by name, and are answered
+    from a record as well. `finished` is called with the name of each stage.
+    """
+    limits, scores = search.thresholds, seen.screening.candidate_scores
+    seen_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
+    moved = seen.has_left_baseline and not seen_gap
+    gap, located, trusted = seen_gap or moved, None, None
+    if gap and enough:
+        located = locate()
+        # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
+        trusted = None if seen.nominal_model.has_process_noise else located
+        gap = not is_barely_significant_and_unexplained(trusted, seen, limits)
+    finished("localisation")
+    fits: tuple[RefitStatistics, ...] = ()
+    added: tuple[SelectedEffect, ...] = ()
+    if gap and enough and scores and located is not None:
+        places = [place.location for place in main_gap_locations(located.locations)]
+        fits, added = select_effects(search, seen.nominal_model, seen.screening, places, seen.has_left_baseline)
+    finished("refits")
+    carried = check_effect_amplitude_transfer(search, added[-1].refitted_model) if added else ()
+    if carried:
+        last = inflate_fit_stds_by_disagreement(added[-1].refitted_model, carried)
+        added = (*added[:-1], replace(added[-1], refitted_model=last))
+    finished("carry_over")
+    total = added[-1].cumulative_closure if added else UNDEFINED_GAP_CLOSURE
+    explained = fraction_of_smoother_chi2_decrease(seen.nominal_model, added, trusted)
+    reason = find_unknown_verdict_reason(added, total, limits, explained, not failed_transfer_checks(carried))
+    # what parameters explain by moving is no gap
+    gap = gap and (bool(added) or not moved)
+    verdict = decide_verdict(gap, enough, seen.screening.detectability, reason, added)
+    return Judgement(verdict, reason if verdict == "unknown" else "", fits, added, total, explained, carried)
+
+
 def check_effect_amplitude_transfer(
-    search: RefitContext, fit: RefittedModel
+    search: RefitContext, fit: RefitStatistics
 ) -> tuple[EffectAmplitudeTransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
 
     Empty if one recording is split, or if the model cannot be fitted there, which is no evidence against it.
     """
-    if search.problem.is_split_in_blocks or not fit.effects:
-        return ()
-    search.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
-    problem = search.problem.problem
-    turned = replace(search.problem, problem=problem.with_episodes(problem.held_out, problem.episodes))
-    if problem.has_process_noise:
-        turned = turned.whitened_at(fit.values)
-    # what both sets of recordings have in common, nothing of single recordings' starts
-    names = {*turned.nominal_free_parameters, *(name for effect in fit.effects for name in effect.parameters.names)}
-    start = {name: value for name, value in fit.values.items() if name in names}
-    name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
-    again = refit_with_effects(turned, fit.effects, start, search.store, name, search.thresholds)
+    again = search.refit_on_held_out(fit) if fit.effects else None
     if again is None:
         return ()
     return tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again, search.thresholds))
 
 
 def _compare(
-    effect: EffectBase, first: RefittedModel, second: RefittedModel, limits: Thresholds
+    effect: EffectBase, first: RefitStatistics, second: RefitStatistics, limits: Thresholds
 ) -> list[EffectAmplitudeTransferCheck]:
     """The amplitudes of one effect in two fits."""
     neutral, found = effect.neutral_values, []
@@ -100,8 +191,8 @@ def _compare(
 
 
 def inflate_fit_stds_by_disagreement(
-    fit: RefittedModel, entries: Sequence[EffectAmplitudeTransferCheck]
-) -> RefittedModel:
+    fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
+) -> RefitStatistics:
     """Return the fit with standard deviations increased for amplitudes that disagree between the recordings.
 
     Where two fits differ by more than `_DISAGREEMENT_Z` standard deviations of both together, each is known to the
@@ -143,59 +234,17 @@ def has_significant_gap(
     return best < limits.gap_significance_level_by_candidate and largest > 1 + limits.min_channel_excess_chi2_per_dof
 
 
-@dataclass(frozen=True)
-class _FinerStepRefitStore:
-    """The refits of another store that were made at a finer time step [s] than stated, under names of their own."""
-
-    store: RefitStore
-    time_step: float
-
-    def get(self, name: str) -> StoredFit | None:
-        """Return the refit stored under a name at this time step; None if there is none."""
-        return self.store.get(f"{name} at {self.time_step:g} s")
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit under a name and this time step."""
-        self.store.put(f"{name} at {self.time_step:g} s", refitted)
-
-
-def finer_step_that_explains_gap(
-    search: RefitContext, fit: RefittedModel, events: EventSet, ranked: Sequence[CandidateScore]
-) -> RefitContext | None:
-    """Return all hypotheses at half the time step if that explains more than half of what the best candidate promises.
-
-    The test is one prediction at the nominal `fit` and one Gauss-Newton step from there, on the recordings to
-    estimate on without their `events`; None where it explains less or cannot be predicted.
-    """
-    h = fit.problem.step.time_step / 2
-    search.progress.begin_stage("trying half the time step", 1.0, 8.5)
-    finer = search.problem.with_time_step(h)
-    fine = problem_corrected_for_events(finer.problem, events)
-    left = refitted_residual_at_finer_step(fine, fit.problem, fit.problem.vector(fit.values), fit.evaluation)
-    if left is None:
-        return None
-    excess, rest = (float(r @ r) - np.count_nonzero(r) for r in (fit.evaluation.residual, left))
-    if excess - rest <= max((score.predicted_chi2_decrease for score in ranked), default=excess) / 2:
-        return None
-    search.progress.begin_stage(f"half the time step lowers chi2 by {excess - rest:.3g}: going on at {h:g} s")
-    store = None if search.store is None else _FinerStepRefitStore(search.store, h)
-    return replace(search, problem=finer, store=store)
-
-
 def is_barely_significant_and_unexplained(
-    smoothed: SmoothedUnknownsResult | None,
-    ranked: Sequence[CandidateScore],
-    before: NullTestResult,
-    held_out: NullTestResult,
-    limits: Thresholds,
+    located: LocatedGap | None, seen: NominalEvidence, limits: Thresholds
 ) -> bool:
     """Whether an excess counts as chance: barely significant, and explained by no unknown or candidate.
 
     A significant excess without shape stays a gap: understated noise looks like that.
     """
-    best = bonferroni_min_p_value(ranked)
-    barely = min(before.p_value, held_out.p_value) > limits.unexplained_p_factor * limits.significance_level
-    has_no_place = smoothed is None or smoothed.plant_or_sensor_origin == "none"
+    best = bonferroni_min_p_value(seen.screening.candidate_scores)
+    surest = min(seen.nominal_test.p_value, seen.nominal_held_out_test.p_value)
+    barely = surest > limits.unexplained_p_factor * limits.significance_level
+    has_no_place = located is None or located.origin == "none"
     return barely and best >= limits.significance_level and has_no_place
 
 
@@ -249,12 +298,10 @@ def find_unknown_verdict_reason(
 
 
 def fraction_of_smoother_chi2_decrease(
-    nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmoothedUnknownsResult | None
+    nominal: RefitStatistics, added: Sequence[SelectedEffect], located: LocatedGap | None
 ) -> float:
     """Return the effects' decrease of r'r divided by the smoother's, each less degrees of freedom; 1 if undefined."""
-    if smoothed is None or not added:
+    if located is None or not added or located.chi2_decrease <= 0:
         return 1.0
     last = added[-1].refitted_model
-    by_effects = 2 * (nominal.cost - last.cost) - last.effect_parameter_count
-    by_smoother = smoothed.chi2_before - smoothed.chi2_after - (smoothed.dof_before - smoothed.dof_after)
-    return float(by_effects / by_smoother) if by_smoother > 0 else 1.0
+    return (2 * (nominal.cost - last.cost) - last.effect_parameter_count) / located.chi2_decrease

@@ -123,6 +123,8 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said = [f"{count} {'case' if count == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
     if right["of"]:
         said.append(f"of {right['of']} gaps found, {right['count']} were named right: kind and place first")
+    if result.get("not_judged"):
+        said.append(f"{result['not_judged']} not judged: these thresholds ask for refits that were not made")
     if alarms["of"]:
         said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
     yield from (SummaryStatement(text, "verdict") for text in said)
@@ -163,9 +165,10 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         sizes.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
-    experiments: TableRows = [("experiment", "cases", "false alarms", "right")]
+    experiments: TableRows = [("experiment", "cases", "not judged", "false alarms", "right")]
     for name, own in result["experiments"].items():
-        experiments.append((name, str(own["cases"]), _rate(own["false_alarms"]), _rate(own["right"])))
+        counts = (str(own["cases"]), str(own.get("not_judged", 0)))
+        experiments.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
     cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
     for entry in result["marks"]:
@@ -176,6 +179,10 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         shares = (_share(entry["closure"]), _share(entry["best"]))
         cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
     tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
+    if (rescored := result.get("rescored")) is not None:
+        head = ("case", "truth", "then", "now")
+        differ: TableRows = [head, *(tuple(own[key] for key in head) for own in rescored["changed"])]
+        tables = {"Score": marks, "Judged otherwise": differ, **tables}
     if (calibration := result.get("calibration_of_thresholds")) is not None:
         # quantiles beside what is set
         kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}

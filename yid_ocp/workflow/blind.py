@@ -27,7 +27,7 @@ from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_decision_statistics
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
-from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_strict_json, write_text
+from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
 from yid_ocp.report.html import write_report
@@ -51,6 +51,10 @@ log = logging.getLogger(__name__)
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `blind` and return its exit code."""
+    if arguments.rescore is not None:
+        folder, target = arguments.rescore, arguments.out or Path(arguments.rescore) / "rescored"
+        again = functools.partial(rescore_blind, folder, target, arguments.overrides)
+        return run_command_and_print(arguments, again)
     runs = [
         load_config(path, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
         for path in arguments.configs or [None]
@@ -134,15 +138,65 @@ def run_blind(
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
         write_strict_json(proof.folder / "thresholds.json", to_json_types(found | made))
-    folder, written = proof.folder, to_json_types(result)
-    write_strict_json(folder / "result.json", written)
-    write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
-    draw_blind_results(folder, written)
+    folder = proof.folder
+    written = _write_result(folder, result)
     if all(entry.output.write_report for entry in runs):
         progress.begin_stage("writing the report")
         said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
         write_report(folder / "report.html", ReportData(folder.name, said, written))
     return CommandOutcome(folder, written, None)
+
+
+def _write_result(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
+    """Write `result.json`, `table.md` and the pictures; return what was written."""
+    written: dict[str, Any] = to_json_types(result)
+    write_strict_json(folder / "result.json", written)
+    write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
+    draw_blind_results(folder, written)
+    return written
+
+
+def rescore_blind(
+    folder: str | Path, out: str | Path, overrides: Sequence[str] = (), progress: Progress = NULL_PROGRESS
+) -> CommandOutcome[None]:
+    """Judge the finished cases of a blind validation again by the rules of now and other thresholds, without a refit.
+
+    `out` gets `result.json` (`yid-blind/1`), with `rescored`: the cases whose verdict or effects differ from what was
+    said, and how many are `not_judged`, because these thresholds ask for a refit that the diagnosis did not make.
+    """
+    made, target = Path(folder), make_folder(out)
+    commitment = read_input_json(made / "commitment.json")
+    labels = {}
+    for label in blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"]):
+        labels[label.case] = label
+    limits = {
+        name: load_config(made / "configs" / f"{name}.yaml", overrides).diagnosis for name in commitment["configs"]
+    }
+    marks, changed = [], []
+    answers, best = _stored_values(made / "answers"), _stored_values(made / "best")
+    progress.begin_stage(f"judging {len(answers)} of {commitment['cases']} cases")
+    for case, found in sorted(answers.items()):
+        label, then, now = labels[case], found["result"], found["result"]
+        if found.get("evidence") is not None:
+            config = label.experiment.rpartition(".")[0]
+            now = blind_scores.judge_recorded_case(found["evidence"], limits[config])
+        shares = (math.nan if best.get(case) is None else float(best[case]), float(found["seconds"]))
+        before, mark = (blind_scores.score_blind_case(label, told, *shares) for told in (then, now))
+        marks.append(mark)
+        if (before.verdict, before.answer, before.confusable) != (mark.verdict, mark.answer, mark.confusable):
+            told = {"case": case, "truth": mark.truth, "then": f"{before.verdict} {before.answer}"}
+            changed.append({**told, "now": f"{mark.verdict} {mark.answer}", "right": [before.right, mark.right]})
+    kept = {key: commitment[key] for key in ("seed", "purpose")}
+    rescored = {"settings": list(overrides), "changed": changed, "of": str(made)}
+    result = blind_scores.detection_and_false_alarm_rates(marks) | {**kept, "rescored": rescored}
+    return CommandOutcome(target, _write_result(target, result | {"code": package_source_hash()}), None)
+
+
+def _stored_values(folder: Path) -> dict[str, Any]:
+    """What the tasks of a folder returned, by their names, whatever version of the package they ran."""
+    files = sorted(folder.glob("*.json"), key=lambda file: file.stat().st_mtime)
+    entries = [read_input_json(file) for file in files if not file.name.endswith(".error.json")]
+    return {str(entry["name"]): entry["value"] for entry in entries}
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------
@@ -275,16 +329,20 @@ def _diagnose_case_from_recordings_task(
 ) -> dict[str, Any]:
     """Task: diagnose a case from its recordings, the last one held out; returns {seconds, result}.
 
-    For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
+    `evidence` beside them is what every rule needs, to judge the case again. For calibration, one without a gap has
+    `open` too: the statistics of a diagnosis that takes anything for a gap.
     """
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
     begun = time.perf_counter()
+    evidence = None
     try:
-        result = blind.diagnose_blind_case(ensemble, case, candidates, run.diagnosis).to_dict()
+        finding = blind.diagnose_blind_case(ensemble, case, candidates, run.diagnosis)
+        result, evidence = finding.to_dict(), blind_scores.evidence_to_json(finding)
     except YidError as error:
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
+    found["evidence"] = evidence
     if experiment["purpose"] == blind.ALLOWED_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
         wide = blind_scores.permissive_thresholds(run.diagnosis)
         try:

@@ -138,7 +138,7 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     """The final model for result.json: its parameters and effects, and the free parameters' covariance."""
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
-    idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
+    idle = {entry.effect.label for entry in finding.screening.detectability} - {effect.label for effect in fit.effects}
     theta, _ = problem.theta_and_initial_state_deviation(problem.vector(fit.values), 0)
     found = {}
     for entry, value in zip(problem.system.parameters, theta, strict=True):

@@ -218,7 +218,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
     percent = finding.verdict != "no_gap" and excess > 0
     factor = 100 / excess if percent else 1.0
-    promised = {own.effect.label: factor * own.predicted_chi2_decrease for own in finding.candidate_scores}
+    promised = {own.effect.label: factor * own.predicted_chi2_decrease for own in finding.screening.candidate_scores}
     entries: dict[str, tuple[tuple[float, float, float] | None, float]] = {}
     for entry in result["which"][:_MAX_CANDIDATES]:
         name, closed = f"{entry['kind']}@{entry['location']}", None
@@ -297,13 +297,13 @@ def _library_curves(table: LawTable, at: Array) -> dict[str, Array]:
 
 
 def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
-    labels = finding.confusability.labels
+    labels = finding.screening.confusability.labels
     names = [f"{entry['kind']}@{entry['location']}" for entry in result["which"][:_MAX_CANDIDATES]]
     names = [name for name in names if name in labels]
     if len(names) < 2:
         return None
     at = [labels.index(name) for name in names]
-    values = finding.confusability.overlap_fractions[np.ix_(at, at)]
+    values = finding.screening.confusability.overlap_fractions[np.ix_(at, at)]
     pairs = ((min(values[i, j], values[j, i]), names[i], names[j]) for i, j in combinations(range(len(names)), 2))
     said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
