@@ -134,12 +134,16 @@ static void predict(const Filter *f, int s, double *P, double *room, double *pan
         for (int j = 0; j < i; j++) P[(size_t)j * na + i] = P[(size_t)i * na + j];
 }
 
-/* Whether the steps were taken; not where there is too little memory. */
-int yid_kalman_steps(const Filter *f) {
-    const int na = f->size[3];
-    int most = f->size[2] > na ? f->size[2] : na;
+static int widest(const Filter *f) {
+    int most = f->size[2] > f->size[3] ? f->size[2] : f->size[3];
     for (int s = 0; s < f->size[0]; s++)
         if (f->row_start[s + 1] - f->row_start[s] > most) most = f->row_start[s + 1] - f->row_start[s];
+    return most;
+}
+
+/* Whether the steps were taken; not where there is too little memory. */
+int yid_kalman_steps(const Filter *f) {
+    const int na = f->size[3], most = widest(f);
     double *room = malloc(sizeof(double) * most * (3 * (size_t)most + COLUMNS)), *whitening = f->whitening;
     if (!room) return 0;
     double *panel = room + 3 * (size_t)most * most;
@@ -151,5 +155,65 @@ int yid_kalman_steps(const Filter *f) {
         whitening += r * r;
     }
     free(room);
+    return 1;
+}
+
+/* Columns of measurements along the steps. Forward, `rows` (rows, columns) are measured and become the normalized
+ * innovations, `state` (NA, columns) is the mean, to which `push` (steps, NK - NS, columns), if any, is added beside the
+ * parameters of a step and `shift` (steps, NA - NS) to the first column's parameters after it. Backward, `rows` are
+ * innovations and become the smoothed noise, `state` is the costate. `seen` (steps, NA, columns), if any, takes the means
+ * before the steps and the costates after them. */
+typedef struct {
+    const int *columns;
+    double *rows, *state, *seen;
+    const double *push, *shift;
+} Columns;
+
+/* Whether it was done; not where there is too little memory. */
+int yid_kalman_columns(const Filter *f, const Columns *c, int backward) {
+    const int count = f->size[0], ns = f->size[1], width = f->size[2], na = f->size[3], nk = f->size[4];
+    const int n = *c->columns, m = nk - ns, most = widest(f);
+    double *sums = malloc(sizeof(double) * most * (3 * (size_t)n + COLUMNS)), *x = c->state;
+    if (!sums) return 0;
+    double *white = sums + (size_t)most * n, *moved = white + (size_t)most * n, *panel = moved + (size_t)most * n;
+    const double *end = f->whitening;
+    for (int s = 0; backward && s < count; s++) end += (f->row_start[s + 1] - f->row_start[s]) * (f->row_start[s + 1] - f->row_start[s]);
+    for (int k = 0; k < count; k++) {
+        const int s = backward ? count - 1 - k : k, first = f->row_start[s], r = f->row_start[s + 1] - first;
+        const double *M = f->move + (size_t)s * ns * width, *decay = f->decay + (size_t)s * (na - ns);
+        const double *H = f->observation + (size_t)first * na, *P = f->projected + (size_t)first * na;
+        const double *W = backward ? (end -= r * r) : end;
+        double *rows = c->rows + (size_t)first * n;
+        if (!backward) end += r * r;
+        if (c->seen) memcpy(c->seen + (size_t)s * na * n, x, sizeof(double) * na * n);
+        memset(white, 0, sizeof(double) * r * n);
+        if (!backward) {
+            add_product(-1.0, (Matrix){H, na, 1}, (Matrix){x, n, 1}, r, na, n, 0, rows, n, panel);
+            add_product(1.0, (Matrix){W, r, 1}, (Matrix){rows, n, 1}, r, r, n, 0, white, n, panel);
+            add_product(1.0, (Matrix){P, 1, na}, (Matrix){white, n, 1}, na, r, n, 0, x, n, panel);
+            memcpy(sums, x, sizeof(double) * ns * n);
+            if (c->push) memcpy(sums + (size_t)ns * n, c->push + (size_t)s * m * n, sizeof(double) * m * n);
+            else memset(sums + (size_t)ns * n, 0, sizeof(double) * m * n);
+            for (int p = ns; p < na; p++) add_row(1.0, x + (size_t)p * n, n, sums + (size_t)(ns + (p - ns) % m) * n);
+            memset(x, 0, sizeof(double) * ns * n);
+            add_product(1.0, (Matrix){M, width, 1}, (Matrix){sums, n, 1}, ns, nk, n, 0, x, n, panel);
+        } else {
+            memset(moved, 0, sizeof(double) * nk * n);
+            add_product(1.0, (Matrix){M, 1, width}, (Matrix){x, n, 1}, nk, ns, n, 0, moved, n, panel);
+            memcpy(x, moved, sizeof(double) * ns * n);
+        }
+        for (int p = ns; p < na; p++) {
+            double *own = x + (size_t)p * n;
+            for (int j = 0; j < n; j++) own[j] = decay[p - ns] * own[j] + (backward ? moved[(size_t)(ns + (p - ns) % m) * n + j] : 0);
+            if (!backward) own[0] += c->shift[(size_t)s * (na - ns) + p - ns];
+        }
+        if (backward) {
+            add_product(-1.0, (Matrix){P, na, 1}, (Matrix){x, n, 1}, r, na, n, 0, rows, n, panel);
+            add_product(1.0, (Matrix){W, 1, r}, (Matrix){rows, n, 1}, r, r, n, 0, white, n, panel);
+            add_product(1.0, (Matrix){H, 1, na}, (Matrix){white, n, 1}, na, r, n, 0, x, n, panel);
+        }
+        memcpy(rows, white, sizeof(double) * r * n);
+    }
+    free(sums);
     return 1;
 }

@@ -116,7 +116,89 @@ def _library() -> ctypes.CDLL | None:
     return compile_and_load_library(source, level="-O2")
 
 
-def kalman_matrices_and_final_covariance(
+@dataclass(frozen=True)
+class KalmanSteps:
+    """Successive steps of a linear Kalman filter with fixed gains, in compiled code if possible.
+
+    Matrices are those of `KalmanStepMatrices`, one step after another; rows of step j begin at `row_start[j]`.
+    """
+
+    row_start: Sequence[int]
+    moves: Array  # state rows of k steps' transitions and, beside them, noise of the states, (k, ns, ns + m + noises)
+    noises: int
+    decay: Array  # of the parameters, shape (k, nx - ns)
+    observation: Array  # shape (r, nx)
+    whitening: Array  # shape (sum of squared row counts,)
+    projected_covariance: Array  # shape (r, nx)
+
+    @property
+    def _spans(self) -> list[slice]:
+        return [slice(*ends) for ends in pairwise(self.row_start)]
+
+    @property
+    def _transitions(self) -> list[FilterStateTransition]:
+        known = self.moves.shape[2] - self.noises
+        return [FilterStateTransition(move[:, :known], own) for move, own in zip(self.moves, self.decay, strict=True)]
+
+    def _single_steps(self) -> list[tuple[slice, KalmanStepMatrices]]:
+        roots = np.split(self.whitening, np.cumsum([(span.stop - span.start) ** 2 for span in self._spans])[:-1])
+        found = []
+        for span, root, transition in zip(self._spans, roots, self._transitions, strict=True):
+            own, count = self.observation[span], span.stop - span.start
+            step = KalmanStepMatrices(own, root.reshape(count, count), self.projected_covariance[span], transition)
+            found.append((span, step))
+        return found
+
+    def normalized_innovations_and_next_mean(
+        self, mean: Array, measured: Array, shift: Array, push: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Normalized innovations (r, c), the state means (nx, c) after the steps, and those before each (k, nx, c).
+
+        `push` (k, m, c) is added to a step's parameters in its transition; `shift` (k, nx - ns) to those of the first
+        column after it.
+        """
+        if (library := _library()) is not None:
+            return self._compiled_columns(library, measured, mean, shift, push)
+        white, seen, ns = np.empty_like(measured), np.empty((len(self.moves), *mean.shape)), self.moves.shape[1]
+        for k, (span, step) in enumerate(self._single_steps()):
+            seen[k] = mean
+            white[span], mean = step.normalized_innovations_and_next_mean(mean, measured[span])
+            if push is not None:
+                mean[:ns] += step.transition.state_rows[:, ns:] @ push[k]
+            mean[ns:, 0] += shift[k]
+        return white, mean, seen
+
+    def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
+        """Smoothed measurement noise (r, c), the costate (nx, c) before the steps, and those after each (k, nx, c)."""
+        if (library := _library()) is not None:
+            return self._compiled_columns(library, white, costate, None, None)
+        noise, seen = np.empty_like(white), np.empty((len(self.moves), *costate.shape))
+        for k, (span, step) in reversed(list(enumerate(self._single_steps()))):
+            seen[k] = costate
+            noise[span], costate = step.smoothed_measurement_noise_and_costate(white[span], costate)
+        return noise, costate, seen
+
+    def _compiled_columns(
+        self, library: ctypes.CDLL, rows: Array, state: Array, shift: Array | None, push: Array | None
+    ) -> tuple[Array, Array, Array]:
+        """Results of the mean's recursion, or without a shift of the costate's."""
+        rows, state, seen = rows.copy(), state.copy(), np.empty((len(self.moves), *state.shape))
+        size = np.array([*self.moves.shape, len(state), self.moves.shape[2] - self.noises], np.int32)
+        known = [size, np.array(self.row_start, np.int32), self.moves, self.decay, None, self.observation]
+        steps = [*known, self.whitening, self.projected_covariance, None]
+        inputs = [None if a is None else np.ascontiguousarray(a) for a in (push, shift)]
+        columns = [np.array(state.shape[1:], np.int32), rows, state, seen, *inputs]
+        if not library.yid_kalman_columns(_addresses(steps), _addresses(columns), ctypes.c_int(shift is None)):
+            raise out_of_memory_error("the work on one step of a filter", 4 * state.nbytes)
+        return rows, state, seen
+
+
+def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_void_p]:
+    """A struct of the addresses of contiguous arrays, which must be kept as long; None is a null pointer."""
+    return (ctypes.c_void_p * len(arrays))(*(None if array is None else array.ctypes.data for array in arrays))
+
+
+def kalman_steps_and_final_covariance(
     covariance: Array,
     observation: Array,
     row_start: Sequence[int],
@@ -124,32 +206,28 @@ def kalman_matrices_and_final_covariance(
     noises: int,
     decay: Array,
     variance: Array,
-) -> tuple[list[KalmanStepMatrices], Array]:
-    """Successive filter steps with fixed gains, and the state covariance after the last; in compiled code if possible.
+) -> tuple[KalmanSteps, Array]:
+    """Successive filter steps with fixed gains, and the state covariance (nx, nx) after the last.
 
-    `moves` (k, ns, ns + m + c) are the state rows of k steps' transitions and, beside them, what c unit `noises` add to
-    the states; `decay` (k, nx - ns) is that of the parameters, `variance` (k, nx - ns) that of their process noise.
-    Rows of the observation (r, nx) stand in the order of the steps, those of step j from `row_start[j]` to the next.
+    Of the moves (k, ns, ns + m + noises) the last columns are what unit noises add to the states; `variance`
+    (k, nx - ns) is that of the parameters' process noise. Other arguments are as in `KalmanSteps`.
     """
-    na, ns, library, steps = len(covariance), moves.shape[1], _library(), list[KalmanStepMatrices]()
-    spans, known = [slice(*ends) for ends in pairwise(row_start)], moves.shape[2] - noises
-    transitions = [FilterStateTransition(move[:, :known], own) for move, own in zip(moves, decay, strict=True)]
+    count, library, covariance = np.diff(row_start), _library(), covariance.copy()
+    white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)
+    moves, decay, variance, observation = map(np.ascontiguousarray, (moves, decay, variance, observation))
+    found = KalmanSteps(row_start, moves, noises, decay, observation, white, projected)
+    ns, known = moves.shape[1], moves.shape[2] - noises
     if library is None:
-        parameters = np.arange(ns, na)
-        for k, (span, transition) in enumerate(zip(spans, transitions, strict=True)):
+        roots, parameters = np.split(white, np.cumsum(count**2)[:-1]), np.arange(ns, len(covariance))
+        for k, (span, transition) in enumerate(zip(found._spans, found._transitions, strict=True)):
             step, covariance, _ = kalman_matrices_and_next_covariance(covariance, observation[span], transition)
-            steps.append(step)
+            roots[k][:], projected[span] = step.whitening.ravel(), step.projected_covariance
             covariance[parameters, parameters] += variance[k]
             covariance[:ns, :ns] += moves[k, :, known:] @ moves[k, :, known:].T
             covariance = 0.5 * (covariance + covariance.T)
-        return steps, covariance
-    size, squares = np.array([*moves.shape, na, known], np.int32), [(span.stop - span.start) ** 2 for span in spans]
-    white, projected, covariance = np.empty(sum(squares)), np.empty_like(observation), covariance.copy()
-    arrays: list[NDArray[Any]] = [size, np.array(row_start, np.int32)]
-    arrays += [*map(np.ascontiguousarray, (moves, decay, variance, observation)), white, projected, covariance]
-    if not library.yid_kalman_steps((ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))):
+        return found, covariance
+    size = np.array([*moves.shape, len(covariance), known], np.int32)
+    arrays = [size, np.array(row_start, np.int32), moves, decay, variance, observation, white, projected, covariance]
+    if not library.yid_kalman_steps(_addresses(arrays)):
         raise out_of_memory_error("the work on one step of a filter", 4 * covariance.nbytes)
-    for span, root, transition in zip(spans, np.split(white, np.cumsum(squares)[:-1]), transitions, strict=True):
-        own = observation[span]
-        steps.append(KalmanStepMatrices(own, root.reshape(len(own), len(own)), projected[span], transition))
-    return steps, covariance
+    return found, covariance

@@ -39,12 +39,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import (
-    FilterStateTransition,
-    KalmanStepMatrices,
-    kalman_matrices_and_final_covariance,
-    kalman_matrices_and_next_covariance,
-)
+from yid_ocp.inference.kalman import KalmanSteps, kalman_steps_and_final_covariance
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
     ResidualDerivativesAtNodes,
@@ -64,17 +59,21 @@ _MAX_ROLLOUTS = 6  # each about the torque offset estimated from the one before
 _TORQUE_BIAS_TOLERANCE = 0.05  # change of the torque offset, in stated standard deviations, below which these end
 
 
-class _FilterStep(NamedTuple):
-    """One step of a frozen filter of (d, w, b)."""
+class _FilterPart(NamedTuple):
+    """Some steps of a frozen filter of (d, w, b)."""
 
-    rows: IntArray  # of the residual
-    kalman: KalmanStepMatrices
-    by_torque: Array  # their slopes by a known torque, shape (r, nu)
+    first: int  # of them
+    rows: IntArray  # of the residual, in the order of the steps
+    step_of_row: IntArray
+    kalman: KalmanSteps
+    by_torque: Array  # slopes of the rows by a known torque of their step, shape (r, nu)
 
-    @property
-    def holds_noise(self) -> bool:
-        """Whether w stays what it is."""
-        return bool(self.kalman.transition.decay[0])
+    def fresh_noise(self, noise: Array) -> Array:
+        """Known noise (N, nu) that begins behind each of the steps, and zeros for the offsets, shape (k, 2 nu)."""
+        found = np.zeros_like(self.kalman.decay)
+        behind = self.first + 1 + np.flatnonzero(self.kalman.decay[:, 0] == 0)
+        found[behind - self.first - 1, : noise.shape[1]] = noise[behind]
+        return found
 
 
 class _SmoothedInputErrors(NamedTuple):
@@ -89,7 +88,7 @@ class _SmoothedInputErrors(NamedTuple):
 class WhiteningFilter:
     """Kalman filter, linearized along one rollout, that whitens the residual of a recording."""
 
-    filter_steps: tuple[_FilterStep, ...]  # one for every node
+    filter_steps: tuple[_FilterPart, ...]  # up to the last node
     input_error_model: InputErrorModel  # with the values of b and w about which it is linearised
     initial_covariance: Array  # of (d, w, b) before all measurements, shape (na, na)
     state_mask: BoolArray  # states that d is made up of, shape (nx,)
@@ -102,39 +101,34 @@ class WhiteningFilter:
         the tracking filter's correction of the torque, and its derivative [N m].
         """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
-        for k, step in enumerate(self.filter_steps):
-            result[step.rows], mean = self._updated(k, mean, rows[step.rows], push)
+        for part in self.filter_steps:
+            result[part.rows], mean, _ = self._updated(part, mean, rows[part.rows], push)
         bias = mean[-len(self.input_error_model.torque_bias) :]
         bias[:, 0] += self.input_error_model.torque_bias
         return result, bias
 
     def _smooth_input_errors(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
         """Smoothed torque and state errors given all measurements (Bryson, Frazier 1963); arguments as in whitening."""
-        errors, last = self.input_error_model, len(self.filter_steps) - 1
-        nu, ns = len(errors.torque_bias), int(np.count_nonzero(self.state_mask))
+        errors, (count, nu) = self.input_error_model, self.input_error_model.torque_noise.shape
+        ns = int(np.count_nonzero(self.state_mask))
         torque = slice(ns, ns + nu)
-        column, noise = rows[:, None], np.zeros((len(rows), 1))
-        mean = self._expected(1)
-        for k, step in enumerate(self.filter_steps):
-            noise[step.rows], mean = self._updated(k, mean, column[step.rows], push)
-        offset = mean[-nu:, 0] + errors.torque_bias
-        white, costate = np.zeros_like(errors.torque_noise), np.zeros_like(mean)
-        for k in range(last, -1, -1):
-            step = self.filter_steps[k]
-            if not step.holds_noise:
-                white[k + 1] = errors.torque_std**2 * costate[torque, 0]
-            noise[step.rows], costate = step.kalman.smoothed_measurement_noise_and_costate(noise[step.rows], costate)
+        noise, bias = self.whiten_and_estimate_torque_bias(rows[:, None], push)
+        after, costate = np.zeros((count + 1, nu)), np.zeros((len(self.initial_covariance), 1))
+        for part in reversed(self.filter_steps):
+            found = part.kalman.smoothed_measurement_noise_and_costate(noise[part.rows], costate)
+            noise[part.rows], costate = found[:2]
+            after[part.first : part.first + len(found[2])] = found[2][:, torque, 0]
         mean = self._expected(1) + self.initial_covariance @ costate
-        white[0] = errors.torque_noise[0] + mean[torque, 0]
-        error = np.zeros((last + 1, len(self.state_mask)))
-        for k, step in enumerate(self.filter_steps):
-            error[k, self.state_mask] = mean[:ns, 0]
+        fresh = np.concatenate([part.kalman.decay[:, 0] == 0 for part in self.filter_steps])[: count - 1]
+        white = np.vstack([errors.torque_noise[0] + mean[torque, 0], errors.torque_std**2 * after[: count - 1]])
+        # a torque's error stays what it is until another one begins
+        white = white[np.maximum.accumulate(np.where(np.append(True, fresh), np.arange(count), 0))]
+        error = np.zeros((count + 1, len(self.state_mask)))
+        for part in self.filter_steps:
             # without the sensors' noise there is no innovation; what rounding makes of one keeps the error bounded
-            _, mean = self._updated(k, mean, column[step.rows] - noise[step.rows], push)
-            if k + 1 < last:
-                white[k + 1] = white[k] if step.holds_noise else white[k + 1]
-                mean[torque, 0] = white[k + 1] - errors.torque_noise[k + 1]
-        return _SmoothedInputErrors(offset, white, error)
+            _, mean, before = self._updated(part, mean, rows[part.rows, None] - noise[part.rows], push, white)
+            error[part.first : part.first + len(before), self.state_mask] = before[:, :ns, 0]
+        return _SmoothedInputErrors(bias[:, 0], white, error)
 
     def _expected(self, columns: int) -> Array:
         """Mean of (d, w, b) before all measurements; no derivative in further columns, shape (na, columns)."""
@@ -143,19 +137,20 @@ class WhiteningFilter:
         mean[len(mean) - len(known) :, 0] = -known
         return mean
 
-    def _updated(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
-        """Innovations of step k, and the mean of another w after it."""
-        step, nu = self.filter_steps[k], len(self.input_error_model.torque_bias)
-        known = None if push is None or k >= len(push) else push[k]
-        white, later = step.kalman.normalized_innovations_and_next_mean(
-            mean, own if known is None else own - step.by_torque @ known
-        )
-        if known is not None:
-            move = step.kalman.transition.state_rows
-            later[: len(move)] += move[:, len(move) : len(move) + nu] @ known
-        if not step.holds_noise:
-            later[len(later) - 2 * nu : len(later) - nu, 0] -= self.input_error_model.torque_noise[k + 1]
-        return white, later
+    def _updated(
+        self, part: _FilterPart, mean: Array, own: Array, push: Array | None, white: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Innovations of some steps, the mean of another w after them, and the means before each.
+
+        The mean of what `white` (N, nu), if given, says of w.
+        """
+        noise = self.input_error_model.torque_noise
+        known = None
+        if push is not None and part.first < len(push):
+            own = own - np.einsum("ru,ruc->rc", part.by_torque, push[part.step_of_row])
+            known = push[part.first : part.first + len(part.kalman.moves)]
+        shift = part.fresh_noise(-noise if white is None else white - noise)
+        return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known)
 
 
 def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) -> WhiteningFilter:
@@ -173,10 +168,11 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     # behind the last node nothing moves
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
-    transition = FilterStateTransition(np.eye(len(kept), len(kept) + nu), np.ones(2 * nu))
-    kalman, covariance, _ = kalman_matrices_and_next_covariance(covariance, observe, transition)
+    still = np.eye(len(kept), len(kept) + nu)[None], 0, np.ones((1, 2 * nu)), np.zeros((1, 2 * nu))
+    kalman, covariance = kalman_steps_and_final_covariance(covariance, observe, (0, len(rows)), *still)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
-    return WhiteningFilter((*made, _FilterStep(rows, kalman, none)), errors, first, live, spread)
+    last = _FilterPart(count, rows, np.full(len(rows), count), kalman, none)
+    return WhiteningFilter((*made, last), errors, first, live, spread)
 
 
 def _filter_steps(
@@ -186,9 +182,9 @@ def _filter_steps(
     slopes: ResidualDerivativesAtNodes,
     rows_of_node: Sequence[IntArray],
     covariance: Array,
-) -> tuple[list[_FilterStep], Array]:
+) -> tuple[list[_FilterPart], Array]:
     """The filter of the kept states' slopes over all steps, from the covariance before them to that after them."""
-    (count, nu), ns, made = course.rollout.torque.shape, len(kept), list[_FilterStep]()
+    (count, nu), ns, made, begun = course.rollout.torque.shape, len(kept), list[_FilterPart](), 0
     # another w where it is fresh, and the same b
     fresh = np.append(np.diff(errors.sample_of_step) != 0, False)[:, None]
     decay = np.hstack([np.repeat(1.0 - fresh, nu, axis=1), np.ones((count, nu))])
@@ -207,13 +203,14 @@ def _filter_steps(
         inputs = np.concatenate([driving, shaken], axis=2)
     na, nx, known = len(covariance), course.rollout.state.shape[1], ns + nu
     columns = np.concatenate([kept, np.arange(nx, nx + inputs.shape[2])])
-    ordered = slopes.select_residual_rows(np.concatenate(rows_of_node))
+    order, step_of_row = np.concatenate(rows_of_node), np.repeat(np.arange(count), list(map(len, rows_of_node)))
+    ordered = slopes.select_residual_rows(order)
     (before, after), by_effort = ordered.by_state, ordered.by_effort.sum(axis=0)
     ends = np.cumsum([0, *map(len, rows_of_node)])
     for state, effort in step_derivatives_along_rollout(
         course.model_functions.step, course.theta, course.rollout, inputs, feedback
     ):
-        span = slice(len(made), len(made) + len(state))
+        span = slice(begun, begun + len(state))
         move = state if ns == nx else state[:, kept[:, None], columns]
         starts, own = ends[span.start : span.stop + 1], slice(ends[span.start], ends[span.stop])
         starts = (starts - starts[0]).tolist()
@@ -226,8 +223,9 @@ def _filter_steps(
         observe[:, known:] = observe[:, ns:known]
         observe[:, :ns] += before[own]
         noise = (inputs.shape[2] - nu, decay[span], variance[span])
-        steps, covariance = kalman_matrices_and_final_covariance(covariance, observe, starts, move, *noise)
-        made += map(_FilterStep, rows_of_node[span], steps, np.split(by_torque, starts[1:-1]))
+        steps, covariance = kalman_steps_and_final_covariance(covariance, observe, starts, move, *noise)
+        made.append(_FilterPart(begun, order[own], step_of_row[own], steps, by_torque))
+        begun = span.stop
     return made, covariance
 
 
