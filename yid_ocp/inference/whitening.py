@@ -259,6 +259,8 @@ def _whitened_episode(
     if episode.input_errors is None:
         return episode, None
     result = predictor.predict_episode(episode, *at, False, guess)
+    if guess is not None and not isinstance(result, str):
+        episode = replace(episode, equilibrium_guess=result.equilibrium_guess)
     if before is not None and not isinstance(result, str):
         episode = _about_smoothed(predictor, episode, at[0], result, before)
         result = predictor.predict_episode(episode, *at, False, guess)
@@ -315,7 +317,7 @@ def problem_whitened_at(
 
     It is the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened already,
     the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number of
-    relinearizations; 2 at a fit.
+    relinearizations; 2 at a fit. Further searches for equilibria begin at those found from the guesses, if any.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)

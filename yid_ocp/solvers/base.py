@@ -222,6 +222,7 @@ class SolverResult:
     history: tuple[Iterate, ...]
     n_evaluations: int
     equilibrium_guesses: EquilibriumGuesses | None = None
+    evaluation: Evaluation | None = None  # at `x`, with Jacobian, where the solver has it
     stopped_at_noise_level: bool = False  # many steps lowered the cost negligibly compared with the noise
     stopped_by_callback: bool = False  # `StopSearch`
 
@@ -303,8 +304,9 @@ _SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 _MAX_WHITENING_PASSES = 6
 # A search that comes this near to a known fit takes that fit [standard deviations]. Two searches may well end farther
-# apart in one minimum, by the tolerance of a solver or the weights of the last pass, and the better end counts.
-_SAME_FIT_STDS = 0.01
+# apart in one minimum, by the weights of the last pass, and the better end counts; under the same weights they do so
+# only by the tolerance of a solver.
+_SAME_FIT_STDS, _SAME_MINIMUM_STDS = 0.01, 0.2
 _STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
@@ -481,8 +483,9 @@ def _fit_from(
 ) -> _Fit:
     """The fit of one start, by shorter horizons where the rollout fails there."""
     history: list[Iterate] = []
-    evaluations = 0
-    if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
+    evaluations, first = 0, problem.evaluate(x, False) if getattr(solver, "needs_rollout", True) else None
+    warm = first.equilibrium_guesses or None if first is not None and first.ok else None
+    if first is not None and not first.ok:
         longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
         for fraction in _HORIZON_FRACTIONS:
             note = f"first {fraction * longest:.3g} s"
@@ -500,7 +503,7 @@ def _fit_from(
             if problem.evaluate(x, derivatives=False).ok:
                 break
     passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
-    weighted, warm = problem, None
+    weighted = problem
     for number in range(passes):
         weighted = problem_whitened_at(weighted, x, warm) if passes > 1 else problem
         which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
@@ -510,19 +513,27 @@ def _fit_from(
         # the second pass is the first about torque offsets that are not guessed
         if (number and len(result.history) < 2) or result.stopped_by_callback:
             break
-        # a search that has come to a known fit is not weighted again
-        if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
+        # a search that has come to a known fit, after its first pass under the weights of that, is not weighted again
+        same = next((fit for fit in known if passes > 1 and _is_at(fit, x)), None)
+        if same is None and passes > 1 and known and not number:
+            best = min(known, key=lambda fit: fit.evaluation.cost)
+            again = _minimize_cost(solver, best.weighted, x, _noting(callback, f"{which}, weights of a known fit"))
+            evaluations, history = evaluations + again.n_evaluations, [*history, *again.history]
+            same = best if _is_at(best, again.x, _SAME_MINIMUM_STDS) else None
+        if same is not None:
             return replace(same, n_evaluations=evaluations, history=history)
+    finish = result.evaluation
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
-        weighted = problem_whitened_at(problem, x, warm, rounds=2)
-    return _Fit(result, weighted.evaluate(x, equilibrium_guesses=warm), weighted, evaluations, history)
+        weighted, finish = problem_whitened_at(problem, x, warm, rounds=2), None
+    finish = finish or weighted.evaluate(x, equilibrium_guesses=warm)
+    return _Fit(result, finish, weighted, evaluations, history)
 
 
-def _is_at(fit: _Fit, x: Array) -> bool:
+def _is_at(fit: _Fit, x: Array, most: float = _SAME_FIT_STDS) -> bool:
     """Whether a point differs from a fit by d with |J d| next to nothing; no |d_i| / std_i is larger than that."""
     slopes = fit.evaluation.jacobian if fit.evaluation.ok else None
-    return slopes is not None and float(np.linalg.norm(slopes @ (x - fit.result.x))) < _SAME_FIT_STDS
+    return slopes is not None and float(np.linalg.norm(slopes @ (x - fit.result.x))) < most
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:

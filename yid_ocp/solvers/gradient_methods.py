@@ -85,7 +85,8 @@ class GaussNewton(SolverWithCheckedSettings):
             return recorder.solver_result_with_iterates(Status.FAILED, now.message, x)
 
         def ended(status: Status, message: str) -> SolverResult:
-            return recorder.solver_result_with_iterates(status, message, x, now.equilibrium_guesses)
+            made = recorder.solver_result_with_iterates(status, message, x, now.equilibrium_guesses)
+            return replace(made, evaluation=now)
 
         mu, rejected = self.initial_damping, 0
         while True:
