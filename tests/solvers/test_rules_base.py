@@ -219,7 +219,7 @@ def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing(
     solution = solve(problem, solver, callback=told.append, restarts=False)
     assert [entry.note for entry in told] == [f"pass {k} of at most 6" for k in (1, 1, 2, 2, 3)]
     assert starts(solver) == [[1.0], [2.0], [2.5]]
-    assert problem.frozen == [([1.0], None), ([2.0], "warm"), ([2.5], "warm")]
+    assert problem.frozen == [([1.0], ("warm", "warm")), ([2.0], "warm"), ([2.5], "warm")]
     assert solution.x.tolist() == [2.5]
     assert solution.problem.frozen_at == [2.5]
     assert solution.n_evaluations == 5
