@@ -185,9 +185,9 @@ class KalmanSteps:
         rows, state, seen = rows.copy(), state.copy(), np.empty((len(self.moves), *state.shape))
         size = np.array([*self.moves.shape, len(state), self.moves.shape[2] - self.noises], np.int32)
         known = [size, np.array(self.row_start, np.int32), self.moves, self.decay, None, self.observation]
-        steps = [*known, self.whitening, self.projected_covariance, None]
+        steps: list[NDArray[Any] | None] = [*known, self.whitening, self.projected_covariance, None]
         inputs = [None if a is None else np.ascontiguousarray(a) for a in (push, shift)]
-        columns = [np.array(state.shape[1:], np.int32), rows, state, seen, *inputs]
+        columns: list[NDArray[Any] | None] = [np.array(state.shape[1:], np.int32), rows, state, seen, *inputs]
         if not library.yid_kalman_columns(_addresses(steps), _addresses(columns), ctypes.c_int(shift is None)):
             raise out_of_memory_error("the work on one step of a filter", 4 * state.nbytes)
         return rows, state, seen
@@ -227,7 +227,8 @@ def kalman_steps_and_final_covariance(
             covariance = 0.5 * (covariance + covariance.T)
         return found, covariance
     size = np.array([*moves.shape, len(covariance), known], np.int32)
-    arrays = [size, np.array(row_start, np.int32), moves, decay, variance, observation, white, projected, covariance]
+    arrays: list[NDArray[Any] | None] = [size, np.array(row_start, np.int32), moves, decay, variance, observation]
+    arrays += [white, projected, covariance]
     if not library.yid_kalman_steps(_addresses(arrays)):
         raise out_of_memory_error("the work on one step of a filter", 4 * covariance.nbytes)
     return found, covariance
