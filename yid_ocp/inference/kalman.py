@@ -184,8 +184,8 @@ class KalmanSteps:
         """Results of the mean's recursion, or without a shift of the costate's."""
         rows, state, seen = rows.copy(), state.copy(), np.empty((len(self.moves), *state.shape))
         size = np.array([*self.moves.shape, len(state), self.moves.shape[2] - self.noises], np.int32)
-        known = [size, np.array(self.row_start, np.int32), self.moves, self.decay, None, self.observation]
-        steps: list[NDArray[Any] | None] = [*known, self.whitening, self.projected_covariance, None]
+        steps: list[NDArray[Any] | None] = [size, np.array(self.row_start, np.int32), self.moves, self.decay, None]
+        steps += [self.observation, self.whitening, self.projected_covariance, None]
         inputs = [None if a is None else np.ascontiguousarray(a) for a in (push, shift)]
         columns: list[NDArray[Any] | None] = [np.array(state.shape[1:], np.int32), rows, state, seen, *inputs]
         if not library.yid_kalman_columns(_addresses(steps), _addresses(columns), ctypes.c_int(shift is None)):
