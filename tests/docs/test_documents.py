@@ -311,7 +311,16 @@ def test_the_workflow_runs_what_is_there_on_every_python_that_is_claimed(reposit
     assert jobs["lowest-versions"]["steps"][1]["with"]["python-version"] == claimed[0]
 
 
-def test_the_picture_of_the_readme_is_there(repository) -> None:
-    [picture] = re.findall(r"^!\[.*?\]\((.*?)\)$", read(repository, "README.md"), re.MULTILINE)
-    assert (repository / picture).stat().st_size < 200_000
-    assert f"benchmarks/diagnosis_picture.py RUN {picture}" in read(repository, "README.md")
+def test_the_pictures_of_the_readme_are_there_with_their_commands(repository) -> None:
+    readme = read(repository, "README.md")
+    pictures = re.findall(r"^!\[.*?\]\((.*?)\)$", readme, re.MULTILINE)
+    for picture, limit in zip(pictures, (1.5e6, 2e5), strict=True):
+        assert (repository / picture).stat().st_size < limit
+    for picture in pictures:
+        [command] = re.findall(rf"python (benchmarks/\w+\.py) [A-Z ]+ {picture}", readme)
+        assert (repository / command).is_file()
+        assert f"{picture}" in read(repository, command)
+    # a GIF of several frames
+    moving = (repository / pictures[0]).read_bytes()
+    assert moving[:6] == b"GIF89a"
+    assert moving.count(b"\x21\xf9\x04") > 20
