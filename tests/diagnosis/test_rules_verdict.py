@@ -29,13 +29,14 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     LocatedGap,
     NominalEvidence,
+    _check_effect_amplitude_transfer,
     _compare,
-    check_effect_amplitude_transfer,
+    _effects_with_transfer_checks,
+    _inflate_fit_stds_by_disagreement,
     decide_verdict,
     find_unknown_verdict_reason,
     fraction_of_smoother_chi2_decrease,
     has_significant_gap,
-    inflate_fit_stds_by_disagreement,
     is_barely_significant_and_unexplained,
 )
 from yid_ocp.display import NULL_PROGRESS
@@ -320,10 +321,10 @@ def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
 )
 def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(first, second, std):
     one, other = (of("spring@elbow", {"k": value, "s": 3.0}, {"k": size}) for value, size in (first, second))
-    counted = inflate_fit_stds_by_disagreement(one, _compare(SPRING, one, other, Thresholds()))
+    counted = _inflate_fit_stds_by_disagreement(one, _compare(SPRING, one, other, Thresholds()))
     assert counted.std == one.std | {"spring@elbow.k": pytest.approx(std)}
     assert counted.values == one.values
-    again = inflate_fit_stds_by_disagreement(other, _compare(SPRING, other, one, Thresholds()))
+    again = _inflate_fit_stds_by_disagreement(other, _compare(SPRING, other, one, Thresholds()))
     reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
     assert not abs(first[0] - second[0]) > reach  # their intervals overlap
 
@@ -350,7 +351,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", refitted)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
-    [entry] = check_effect_amplitude_transfer(search, first)
+    [entry] = _check_effect_amplitude_transfer(search, first)
     assert (entry.estimation_value, entry.held_out_value, entry.is_consistent) == (2.0, 7.0, False)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
     assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
@@ -363,5 +364,31 @@ def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, bloc
     asked = []
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", lambda *_: asked.append(True))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
-    assert check_effect_amplitude_transfer(search, fit(effects)) == ()
+    assert _check_effect_amplitude_transfer(search, fit(effects)) == ()
     assert bool(asked) is (not blocks and bool(effects))
+
+
+@cases(
+    "place, kept, agrees",
+    {
+        "of one place, the last leaves": ("elbow", ["friction@elbow"], True),
+        "of two places, both stay": ("wrist", ["friction@elbow", "friction@wrist"], False),
+    },
+)
+def test_of_effects_that_share_a_torque_one_leaves_where_the_other_transfers_alone(monkeypatch, place, kept, agrees):
+    first, second = effect("friction@elbow"), effect("friction@wrist" if place == "wrist" else "spring@elbow")
+    pair = fit([first, second], values={f"{first.label}.a": 0.3, f"{second.label}.a": 0.5})
+    alone = fit([first], values={f"{first.label}.a": 0.8})
+
+    def refitted(problem, effects, start, store, name, limits):
+        if "held-out" not in name:
+            return alone
+        swapped = {f"{first.label}.a": 0.9, f"{second.label}.a": 0.0}
+        return fit(effects, values=swapped if len(effects) > 1 else {f"{first.label}.a": 0.79})
+
+    monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", refitted)
+    search = RefitContext(AllCandidatesProblem(Problem(), (first, second), False), Thresholds(), NULL_PROGRESS)
+    both = (added(first, fitted=alone), added(second, fitted=pair))
+    chosen, checks = _effects_with_transfer_checks(search, fit(), both)
+    assert [entry.effect.label for entry in chosen] == kept
+    assert all(entry.is_consistent for entry in checks) is agrees

@@ -450,6 +450,16 @@ def _rebuilt(
     return tuple(found)
 
 
+def selection_without(
+    search: RefitContext, nominal: RefitStatistics, kept: Sequence[SelectedEffect], entry: SelectedEffect
+) -> tuple[SelectedEffect, ...]:
+    """Return the selected effects without one of them, the others refitted; empty if they cannot be."""
+    full, rest = kept[-1].refitted_model, [other for other in kept if other is not entry]
+    name = f"{join_effect_labels(full.effects)} without {entry.effect.label}"
+    without = _again(search, [other.effect for other in rest], full, name)
+    return () if without is None else _rebuilt(search, nominal, rest, without)
+
+
 def _again(
     search: RefitContext, effects: Sequence[EffectBase], near: RefitStatistics, name: str
 ) -> RefitStatistics | None:

@@ -20,7 +20,13 @@ from yid_ocp.diagnosis.screening import (
     bonferroni_min_p_value,
     main_gap_locations,
 )
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, SelectedEffect, select_effects
+from yid_ocp.diagnosis.select import (
+    UNDEFINED_GAP_CLOSURE,
+    GapClosure,
+    SelectedEffect,
+    select_effects,
+    selection_without,
+)
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
@@ -145,10 +151,7 @@ def judge(
         places = [place.location for place in main_gap_locations(located.locations)]
         fits, added = select_effects(search, seen.nominal_model, seen.screening, places, seen.has_left_baseline)
     finished("refits")
-    carried = check_effect_amplitude_transfer(search, added[-1].refitted_model) if added else ()
-    if carried:
-        last = inflate_fit_stds_by_disagreement(added[-1].refitted_model, carried)
-        added = (*added[:-1], replace(added[-1], refitted_model=last))
+    added, carried = _effects_with_transfer_checks(search, seen.nominal_model, added)
     finished("carry_over")
     total = added[-1].cumulative_closure if added else UNDEFINED_GAP_CLOSURE
     explained = fraction_of_smoother_chi2_decrease(seen.nominal_model, added, trusted)
@@ -159,7 +162,32 @@ def judge(
     return Judgement(verdict, reason if verdict == "unknown" else "", fits, added, total, explained, carried)
 
 
-def check_effect_amplitude_transfer(
+def _effects_with_transfer_checks(
+    search: RefitContext, nominal: RefitStatistics, added: tuple[SelectedEffect, ...]
+) -> tuple[tuple[SelectedEffect, ...], tuple[EffectAmplitudeTransferCheck, ...]]:
+    """Return the selected effects, their standard deviations increased by disagreement, and their transfer checks.
+
+    Effects of one place divide a torque between them as the noise happens to fall. Where they do not transfer, one of
+    them is left out if the others transfer without it, the last one first.
+    """
+    if not added:
+        return added, ()
+    checks = _check_effect_amplitude_transfer(search, added[-1].refitted_model)
+    places = [entry.effect.location for entry in added]
+    shared = [entry for entry in reversed(added) if places.count(entry.effect.location) > 1]
+    for entry in shared if failed_transfer_checks(checks) else ():
+        fewer = selection_without(search, nominal, added, entry)
+        own = _check_effect_amplitude_transfer(search, fewer[-1].refitted_model) if fewer else ()
+        if own and not failed_transfer_checks(own):
+            added, checks = fewer, own
+            break
+    if not checks:
+        return added, ()
+    last = _inflate_fit_stds_by_disagreement(added[-1].refitted_model, checks)
+    return (*added[:-1], replace(added[-1], refitted_model=last)), checks
+
+
+def _check_effect_amplitude_transfer(
     search: RefitContext, fit: RefitStatistics
 ) -> tuple[EffectAmplitudeTransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
@@ -190,7 +218,7 @@ def _compare(
     return found
 
 
-def inflate_fit_stds_by_disagreement(
+def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
     """Return the fit with standard deviations increased for amplitudes that disagree between the recordings.
