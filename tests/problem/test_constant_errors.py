@@ -1,13 +1,18 @@
-"""Errors of measured efforts that are constant over a recording are noise of all its samples together."""
+"""Errors of efforts and clocks that are constant over a recording are noise of all its samples together."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_problems import pendulum_step, taken
+from small_problems import H, pendulum_step, taken
 
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.inference.whitening import problem_whitened_at
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.system import System
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
     _estimated_constant_errors,
@@ -126,3 +131,85 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T
     assert counted @ counted == pytest.approx(plain @ np.linalg.solve(covariance, plain), rel=1e-9)
+
+
+# -- clocks -----------------------------------------------------------------------------------------------------------
+
+BENCH = """<mujoco>
+  <option timestep="0.00025" integrator="implicitfast"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.6"/>
+      <body name="lower" pos="0 0 -0.3">
+        <joint name="elbow" axis="0 1 0" {elbow}/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.015" mass="0.3"/>
+        <site name="tip" pos="0 0 -0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="shoulder" kp="4000" dampratio="1"/></actuator>
+</mujoco>"""
+
+
+def swung(late, frequency, seed):
+    """Two seconds of MuJoCo's bench: the shoulder's angle, and its tip to half a millimetre, marked `late` [s] late."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(BENCH.format(elbow='stiffness="3" damping="0.02"'))
+    data, noise, begin = mujoco.MjData(model), np.random.default_rng(seed), round(late / 0.00025)
+    t, angle, place = 0.01 * np.arange(200), [], []
+    for k in range(8000):
+        mujoco.mj_kinematics(model, data)
+        if k % 40 == 0:
+            angle.append(data.qpos[:1] + 1e-4 * noise.standard_normal())
+        if (k + begin) % 40 == 0:
+            place.append(data.site("tip").xpos + 5e-4 * noise.standard_normal(3))
+        data.ctrl = 0.7 * np.sin(2 * np.pi * frequency * k / 4000) * np.sin(np.pi * k / 8000) ** 2
+        mujoco.mj_step(model, data)
+    seen = PointGroup("points", ("tip",), t + 0.01, np.array(place)[:, None])
+    return Recording(JointGroup(("shoulder",), t, np.array(angle)), (seen,), name=f"run_{seed}")
+
+
+def test_damping_is_right_where_markers_are_half_a_millisecond_late(tmp_path):
+    file = tmp_path / "bench.xml"
+    file.write_text(BENCH.format(elbow=""))
+    spring = {"elbow": RobotJointSpring(2.0, 0.0)}
+    seen = {"prescribed": ["shoulder"], "point_frames": ["tip"]}
+    system = System.build(read_urdf(file), springs=spring, damping={"elbow": 0.05}, **seen)
+    late = [swung(0.0005, frequency, i) for i, frequency in enumerate((0.9, 1.4))]
+    truth, found = {"elbow.stiffness": 3.0, "elbow.damping": 0.02}, {}
+    for std in (0.0, None):
+        sensors = {"joints.position": SensorOptions(std=1e-4), "points": SensorOptions(std=5e-4, clock_std=std)}
+        told = ProblemOptions(path_cutoff=20.0, sensors=sensors, has_uncertain_point_clocks=True)
+        solution = solve(EstimationProblem(compile_step(system, 0.005), late, tuple(truth), told), GaussNewton())
+        entries = {name: solution.parameters[name] for name in truth}
+        found[std] = {name: (entry.value - truth[name]) / entry.std for name, entry in entries.items()}
+        assert std is not None or all(entry.verdict == "identifiable" for entry in entries.values())
+    assert abs(found[None]["elbow.damping"]) < 2.5
+    assert abs(found[0.0]["elbow.damping"]) > 5.0, "an offset that is denied is taken for damping"
+
+
+@pytest.mark.parametrize(
+    ("free", "effects", "clock_std", "group", "expected"),
+    [
+        ("elbow.damping", (), None, "points_mocap", H / 2),
+        ("elbow.mass", (), None, "points_mocap", None),
+        ("elbow.damping", (), None, "points_arm", None),
+        ("elbow.damping", (), 0.0, "points_mocap", None),
+        ("elbow.mass", (), 0.01, "points_mocap", 0.01),
+        ("elbow.damping", (("camera_latency", "points_mocap", {}),), None, "points_mocap", None),
+    ],
+    ids=["half a sample", "no damper is free", "the arm's", "one clock", "as stated", "an effect of the model says it"],
+)
+def test_a_clock_is_uncertain_where_dampers_are_free(urdf_folder, free, effects, clock_std, group, expected):
+    step = pendulum_step(urdf_folder, effects, prescribed=tuple(BIAS))
+    sensors = {"joints.position": SensorOptions(std=1e-4), "points_mocap": SensorOptions(clock_std=clock_std)}
+    told = ProblemOptions(sensors=sensors, has_uncertain_point_clocks=True)
+    made = taken(step, 3, efforts=False, camera=False)
+    made = replace(made, points=(replace(made.points[0], name=group),))
+    problem = EstimationProblem(step, [made], (free,), told)
+    [samples] = [own for own in problem.episodes[0].measurements if own.sensor.group_name == group]
+    assert samples.has_uncertain_errors is (expected is not None)
+    if expected is not None:
+        rates = np.gradient(samples.value, H, axis=0)
+        np.testing.assert_allclose(samples.change_by_clock, expected * rates, rtol=1e-6)

@@ -208,8 +208,8 @@ class Episode:
 
     @property
     def has_uncertain_sensor_biases(self) -> bool:
-        """Whether a sensor has a constant error of unknown size over the recording, which is treated as noise."""
-        return any(np.any(samples.bias_std > 0) for samples in self.measurements)
+        """Whether a sensor or its clock has an error of unknown size over the recording, which is treated as noise."""
+        return any(samples.has_uncertain_errors for samples in self.measurements)
 
     @property
     def name(self) -> str:
@@ -217,7 +217,9 @@ class Episode:
         return self.recording.name
 
 
-def prepare_episode(functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array) -> Episode:
+def prepare_episode(
+    functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array, free: Sequence[str]
+) -> Episode:
     """Prepare an episode: place a recording's inputs and measurements on the nodes of a rollout's time grid.
 
     At the nominal parameters `theta` encoder noise is converted to effort and the filter's gains are computed.
@@ -241,7 +243,8 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         torque = mean_step_inputs(*read, servos=system.servos)
         arm = smoothed_joint_angles_at_nodes(*read, LowPassFilter(math.inf))
         smooth = smoothed_joint_angles_at_nodes(*read, low_pass) if options.arm_tracking_feedback == "lqr" else arm
-    samples = _samples(step, recording, options, theta, grid)
+    uncertain = options.has_uncertain_point_clocks and any("damping" in name for name in free)
+    samples = _samples(step, recording, options, theta, grid, uncertain)
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))
     if functions.input_corrections.angles_depend_on_effort:
@@ -279,8 +282,8 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
         last = min(entry.predictable_nodes[1], steps - (episode.grid.steps - entry.predictable_nodes[1]))
         early = entry.node + entry.fraction <= last + 1e-9
         parts = {name: getattr(entry, name)[early] for name in ("node", "fraction", "value", "weight", "std")}
-        if entry.noise_correlation is not None:
-            parts["noise_correlation"] = entry.noise_correlation[early]
+        for name in ("noise_correlation", "change_by_clock"):
+            parts |= {} if getattr(entry, name) is None else {name: getattr(entry, name)[early]}
         samples.append(replace(entry, **parts, predictable_nodes=(entry.predictable_nodes[0], last)))
     loop, errors = episode.tracking_feedback, episode.input_errors
     at_nodes = ("prescribed_path", "measured_driven_angles", "joint_loads", "smoothed_driven_angles")
@@ -322,7 +325,7 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
 
 
 def _samples(
-    step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: TimeGrid
+    step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: TimeGrid, has_uncertain_clocks: bool
 ) -> tuple[SensorMeasurements, ...]:
     around = SensorDataInputs(
         step.system,
@@ -333,6 +336,7 @@ def _samples(
         twice_applied_effort_filter(options.path_cutoff),
         LowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
+        has_uncertain_clocks,
     )
     found = [data for kind in SENSOR_READERS for data in SENSOR_READERS[kind](around)]
     if options.weighting == "paper":

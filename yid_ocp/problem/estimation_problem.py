@@ -109,7 +109,7 @@ class EstimationProblem(ReprMixin):
         names = (*free, *(name for name in may_free if name not in free))
         functions = ModelFunctions(step, names, options.initial_state_fit_parameters)
         check_parameter_bounds(step.system, free, theta)
-        prepare = partial(prepare_episode, functions, options=options, theta=theta)
+        prepare = partial(prepare_episode, functions, options=options, theta=theta, free=free)
         episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
@@ -431,7 +431,7 @@ class EstimationProblem(ReprMixin):
         functions = self.model_functions.with_time_step(time_step)
 
         def placed(episode: Episode) -> Episode:
-            made = prepare_episode(functions, episode.recording, self.options, self.theta)
+            made = prepare_episode(functions, episode.recording, self.options, self.theta, self.free)
             loads, times = made.joint_loads.copy(), (made.grid.node_times, episode.grid.node_times)
             for column, known in zip(loads.T, episode.joint_loads.T, strict=True):
                 column[:] = np.interp(*times, known)

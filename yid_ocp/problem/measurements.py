@@ -89,6 +89,19 @@ class SensorMeasurements:
     predictable_nodes: tuple[int, int]  # first and last node at which the sensor can be predicted
     bias_std: Array  # standard deviation of a constant error of every output, zero where there is none, (k,)
     noise_correlation: Array | None = None  # of the noise of a sample's outputs, if not independent, (M, k, k)
+    change_by_clock: Array | None = None  # of the outputs by one std of the clock's offset, (M, k)
+
+    @property
+    def has_uncertain_errors(self) -> bool:
+        """Whether outputs have constant errors, or the clock an offset, of unknown size over the recording."""
+        return bool(np.any(self.bias_std > 0)) or self.change_by_clock is not None
+
+    @property
+    def error_directions(self) -> Array:
+        """Change of the outputs by one std of each constant error and of the clock's offset, (M, k, m)."""
+        own = self.bias_std * np.eye(len(self.bias_std))[self.bias_std > 0]
+        constant = np.broadcast_to(own.T, (len(self.value), *own.T.shape))
+        return constant if self.change_by_clock is None else np.dstack([constant, self.change_by_clock])
 
     @property
     def channel_name_per_output(self) -> tuple[str, ...]:
@@ -229,7 +242,8 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
     std = np.where(seen, data.std, np.nan)
     bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
     span = data.predictable_nodes or (0, grid.steps)
-    return SensorMeasurements(data.sensor, node, fraction, data.value, weight, std, span, bias, data.noise_correlation)
+    more = data.noise_correlation, data.change_by_clock
+    return SensorMeasurements(data.sensor, node, fraction, data.value, weight, std, span, bias, *more)
 
 
 def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
@@ -242,7 +256,8 @@ def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid)
     weight[nearest_node == 0] = 0.0
     weight[nearest_node == grid.steps] *= np.sqrt(2.0)
     none, exact = np.zeros(len(samples.bias_std)), np.zeros(len(nearest_node))
-    return replace(samples, node=nearest_node, fraction=exact, weight=weight, bias_std=none, noise_correlation=None)
+    made = replace(samples, node=nearest_node, fraction=exact, weight=weight, bias_std=none)
+    return replace(made, noise_correlation=None, change_by_clock=None)
 
 
 def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
@@ -274,11 +289,11 @@ def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
 
 
 def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasurements]) -> Array:
-    """Derivatives (r, m) of whitened measurements with respect to constant sensor errors of unit variance.
+    """Derivatives (r, m) of whitened measurements with respect to errors of sensors and clocks of unit variance.
 
     Those of the residual, prediction minus measurement, have the opposite sign.
     """
-    parts = [(s.weight * s.bias_std)[:, :, None] * np.eye(len(s.bias_std))[:, s.bias_std > 0] for s in samples]
+    parts = [s.weight[:, :, None] * s.error_directions for s in samples]
     count, before = sum(part.shape[2] for part in parts), 0
     found = np.zeros((sum(s.n_residuals for s in samples), count))
     rows = 0
@@ -292,7 +307,7 @@ def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasure
 def subtract_estimated_biases(
     samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
 ) -> tuple[SensorMeasurements, ...]:
-    """Measurements minus their constant errors, which are estimated from a prediction; their `bias_std` is zero.
+    """Measurements minus their constant errors and their clocks' offsets, which are estimated from a prediction.
 
     `predicted` has the shape (M, k) for each.
     """
@@ -304,8 +319,8 @@ def subtract_estimated_biases(
     left = _estimated_constant_errors(slopes, residual)
     made = []
     for s in samples:
-        error, own = s.bias_std.copy(), s.bias_std > 0
-        error[own] *= left[: np.count_nonzero(own)]
-        left = left[np.count_nonzero(own) :]
-        made.append(replace(s, value=s.value - error, bias_std=np.zeros_like(error)))
+        directions = s.error_directions
+        own, left = left[: directions.shape[2]], left[directions.shape[2] :]
+        none = np.zeros_like(s.bias_std)
+        made.append(replace(s, value=s.value - directions @ own, bias_std=none, change_by_clock=None))
     return tuple(made)

@@ -82,6 +82,8 @@ class ProblemOptions:
         Known values of parameters that differ from recording to recording, such as where markers sit.
     known_initial_states : mapping of recording to array_like, shape (nx,)
         State (q, p, z) in which a recording starts, in place of equilibrium or of the fit.
+    has_uncertain_point_clocks : bool
+        Whether groups of points may be late by half a sample, as noise, where dampers are free.
     data_issues : tuple of Issue
         Data quality issues found in the recordings.
     excess_residual_criteria : ExcessResidualCriteria
@@ -152,6 +154,7 @@ class ProblemOptions:
     ] = ()
     parameters_by_recording: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     known_initial_states: Mapping[str, ArrayLike] = field(default_factory=dict)
+    has_uncertain_point_clocks: bool = False
     data_issues: tuple[Issue, ...] = ()
     excess_residual_criteria: ExcessResidualCriteria = ExcessResidualCriteria()
     checked_discretisations: tuple[DiscretisationName, ...] = ("links", "time_step")

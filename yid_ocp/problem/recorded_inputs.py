@@ -9,7 +9,7 @@ import scipy.interpolate
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.effects import signal_kinds_required_by_any_effect
+from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR_PARAMETER, PositionServo
@@ -217,6 +217,15 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
         if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")
     return frozenset(found & signal_kinds_required_by_any_effect() | mounted)
+
+
+def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
+    """Kinds of effects that are no candidates, by the signals that the recordings lack for them."""
+    present, found = recorded_signal_kinds(recordings), dict[str, list[str]]()
+    for kind in EFFECTS:
+        if missing := sorted(EFFECTS[kind].required_sensors - present):
+            found.setdefault(" and ".join(missing), []).append(kind)
+    return found
 
 
 def prescribed_coordinates_at_nodes(

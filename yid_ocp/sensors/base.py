@@ -60,6 +60,14 @@ class SensorOptions:
             "N m, ...",
         ),
     ] = None
+    clock_std: Annotated[
+        _NonNegative | None,
+        OptionInfo(
+            "standard deviation of a constant offset of a group of points' clock from that of the joints, another "
+            "in every recording; half a sample when absent and dampers are free, else 0; 0 where one clock drives both",
+            "s",
+        ),
+    ] = None
     effort_sampling_kind: Annotated[
         EffortSamplingKind | None,
         OptionInfo(
@@ -326,6 +334,7 @@ class SensorDataInputs:
     effort_filter: _SmoothingFilter  # filter of prescribed joints' efforts
     path_filter: _SmoothingFilter  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
+    has_uncertain_clocks: bool = False  # of points, where nothing is said
 
 
 @dataclass(frozen=True)
@@ -339,6 +348,7 @@ class SensorData:
     predictable_nodes: tuple[int, int] | None = None  # the first and the last one; all when absent
     bias_std: Array | None = None  # std of every output's constant error in the recording, shape (k,)
     noise_correlation: Array | None = None  # correlation of the outputs' noise in a sample, (M, k, k)
+    change_by_clock: Array | None = None  # of the outputs by one std of the clock's offset in the recording, (M, k)
 
 
 SENSOR_READERS: Registry[Callable[[SensorDataInputs], list[SensorData]]] = Registry("kind of sensor")

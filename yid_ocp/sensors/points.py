@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
@@ -21,6 +22,7 @@ from yid_ocp.sensors.base import (
     SensorDataInputs,
     SensorOptions,
 )
+from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _POINTS = CHANNEL_KINDS.register("points")(ChannelSpecification("points", "position", "m", ("x", "y", "z")))
 
@@ -86,7 +88,31 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
         what = f"the noise level of group '{group.name}' is neither recorded nor given"
         raise DataError(what, where=where, hint=f"set sensors.{group.name}.std [m]")
     sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), recorded_camera_pose(group))
-    return SensorData(sensor, group.t[inside], value, std)
+    change = _clock_offset_std(around, sensor, group, choice) * _rates(group.t[inside], value)
+    return SensorData(sensor, group.t[inside], value, std, change_by_clock=change if np.any(change) else None)
+
+
+def _clock_offset_std(
+    around: SensorDataInputs, sensor: PointSensor, group: RecordedPointGroup, choice: SensorOptions
+) -> float:
+    """Standard deviation of the clock's offset [s]; zero where an effect of the model makes the group late."""
+    if choice.clock_std is not None:
+        return choice.clock_std
+    seen = [(channel, sensor.camera_pose is not None) for channel in sensor.channel_names]
+    late = (effect.added_channel_delay(*own) for effect in around.system.effects for own in seen)
+    own = is_point_group_measured_by_arm(group) or around.recording.joints is None or not around.has_uncertain_clocks
+    if own or not all(ca.SX(delay).is_zero() for delay in late):
+        return 0.0
+    return 0.5 * float(np.median(np.diff(group.t))) if len(group.t) > 1 else 0.0
+
+
+def _rates(t: Array, values: Array) -> Array:
+    """Rates of change (M, k) of outputs, by central differences of what was measured; zero where nothing was."""
+    rates = np.zeros(values.shape)
+    for column, rate in zip(values.T, rates.T, strict=True):
+        if np.count_nonzero(seen := np.isfinite(column)) > 1:
+            rate[seen] = np.gradient(column[seen], t[seen])
+    return rates
 
 
 def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:

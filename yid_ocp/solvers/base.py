@@ -442,7 +442,7 @@ class _MultiStartSearch:
             message += "; weighted by the sensors' noise alone, without the noise that drives the motion"
         constant = any(episode.has_uncertain_sensor_biases for episode in self._problem.episodes)
         if constant and not getattr(solver, "needs_rollout", True):
-            message += "; weighted without the constant errors that measured efforts may have"
+            message += "; weighted without the constant errors that sensors and clocks may have"
         if not finish.ok:
             return Status.FAILED, finish.message
         ended = result.stopped_at_noise_level or is_stationary_point(self._best.weighted, result.x, finish)

@@ -99,6 +99,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
+        has_uncertain_point_clocks=not clamps,  # which move by points' own clock
         excess_residual_criteria=run.diagnosis.null_test_residual_limits,
         checked_discretisations=_checked_discretisations(run),
         divided_links_model=_divided_links_model(run, system),

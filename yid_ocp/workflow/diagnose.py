@@ -20,7 +20,6 @@ from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.law import law_tables_csv
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import (
@@ -35,7 +34,7 @@ from yid_ocp.files import (
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
+from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
 from yid_ocp.report.animation import Animation, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
@@ -114,7 +113,9 @@ def run_diagnose(
             "model": _final_model_to_dict(finding),
             "doubts": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.estimated_torque_offsets(last.problem, x),
-            "not_candidates": _kinds_without_their_signals(problem),
+            "not_candidates": effect_kinds_without_recorded_signals(
+                [episode.recording for episode in (*problem.episodes, *problem.held_out)]
+            ),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
@@ -122,16 +123,6 @@ def run_diagnose(
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
     refits.delete_file()
     return CommandOutcome(folder.path, written, finding)
-
-
-def _kinds_without_their_signals(problem: EstimationProblem) -> dict[str, list[str]]:
-    """Kinds of effects that are no candidates, by the signals that the recordings lack for them."""
-    present = recorded_signal_kinds([episode.recording for episode in (*problem.episodes, *problem.held_out)])
-    found: dict[str, list[str]] = {}
-    for kind in EFFECTS:
-        if missing := sorted(EFFECTS[kind].required_sensors - present):
-            found.setdefault(" and ".join(missing), []).append(kind)
-    return found
 
 
 def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:

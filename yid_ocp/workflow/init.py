@@ -21,6 +21,7 @@ from yid_ocp.model.objects.base import InitCommandObject, comma_separated_number
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
+from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
 from yid_ocp.report.animation import recording_animation
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
@@ -72,7 +73,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     print_result(
         arguments,
         result,
-        lambda: [*_summary_lines(proposal, out, result["picture"] is not None), *doubts],
+        lambda: [*_summary_lines(proposal, out, recordings, result["picture"] is not None), *doubts],
         f"configuration: {out}",
         str(out),
     )
@@ -178,7 +179,9 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
     write_text(out.parent / _SCHEMA_FILE, json.dumps(config_json_schema(), indent=1) + "\n")
 
 
-def _summary_lines(proposal: ProposedConfigChoices, out: Path, has_picture: bool) -> list[str]:
+def _summary_lines(
+    proposal: ProposedConfigChoices, out: Path, recordings: Sequence[Recording], has_picture: bool
+) -> list[str]:
     held = ", ".join(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     lines = [
         f"joints: {', '.join(proposal.joints)}",
@@ -189,7 +192,15 @@ def _summary_lines(proposal: ProposedConfigChoices, out: Path, has_picture: bool
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
     picture = [f"picture of what was guessed: {out.with_suffix('.html')}"] if has_picture else []
-    return [*lines, *picture, "", f"next: yid-ocp check {out}, then yid-ocp solve {out}", ""]
+    for signals, kinds in effect_kinds_without_recorded_signals(recordings).items():
+        lines.append(f"diagnose does not try {', '.join(kinds)}: nothing was recorded of {signals}")
+    lines += [*picture, "", f"next: yid-ocp check {out}, then yid-ocp solve {out}"]
+    has_efforts = "joints.effort" in proposal.noise_by_group
+    if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
+        is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts
+        more = " --set sensors.joints.effort.use=true" if is_left_out else ""
+        lines.append(f"friction of the arm's joints: yid-ocp friction {out}{more}")
+    return [*lines, ""]
 
 
 def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices) -> Recording:
@@ -373,13 +384,14 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
 def _friction(proposal: ProposedConfigChoices) -> Iterator[str]:
     about = "of geared arms, its sizes free; `yid-ocp friction` tries every law of the ladder"
     moving = [name for name in proposal.joints if name not in proposal.still_joints]
-    if proposal.motor_preset:
-        law = {"law": "load"} | ({"joints": moving} if proposal.still_joints else {})
+    has_efforts = "joints.effort" in proposal.noise_by_group
+    law = {"law": "load" if proposal.motor_preset else "coulomb"} | (
+        {"joints": moving} if proposal.still_joints else {}
+    )
+    uses_efforts = has_efforts and (proposal.arm_mode == "driven" or proposal.is_identified_from_efforts)
+    if proposal.motor_preset or (moving and uses_efforts):
         yield _line("  ", "friction", _value(law), about)
-    elif moving and not proposal.has_object and proposal.is_identified_from_efforts:
-        law = {"law": "coulomb"} | ({"joints": moving} if proposal.still_joints else {})
-        yield _line("  ", "friction", _value(law), about)
-    elif proposal.arm_mode == "servo" or "joints.effort" in proposal.noise_by_group:
+    elif proposal.arm_mode == "servo" or has_efforts:
         yield _line("  ", "# friction", "{law: coulomb}", about)
 
 
