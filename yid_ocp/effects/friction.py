@@ -49,7 +49,7 @@ class _JointFriction(EffectBase):
 
 
 @EFFECTS.register("joint_viscous")
-class JointViscous(_JointFriction):
+class _JointViscous(_JointFriction):
     """Viscous friction F = -b v of an arm joint, in addition to the model's damping."""
 
     equation = "F = -b v"
@@ -62,7 +62,7 @@ class JointViscous(_JointFriction):
 
 
 @EFFECTS.register("joint_coulomb")
-class JointCoulomb(_JointFriction):
+class _JointCoulomb(_JointFriction):
     """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s = `SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
@@ -75,7 +75,7 @@ class JointCoulomb(_JointFriction):
 
 
 @EFFECTS.register("joint_stribeck")
-class JointStribeck(_JointFriction):
+class _JointStribeck(_JointFriction):
     """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), added to Coulomb friction with the same v_s."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
@@ -91,7 +91,7 @@ class JointStribeck(_JointFriction):
 
 
 @EFFECTS.register("joint_load_friction")
-class JointLoadFriction(_JointFriction):
+class _JointLoadFriction(_JointFriction):
     """Friction that grows with the torque through a gear: F = -share |motor torque - external torque| sgn(v).
 
     The torque from outside is that of weights and grasps beyond the joint. Both signs are rounded off: that of the
@@ -123,7 +123,7 @@ class JointLoadFriction(_JointFriction):
 
 
 @EFFECTS.register("joint_presliding")
-class JointPresliding(EffectBase):
+class _JointPresliding(EffectBase):
     """Dahl friction, which also holds at rest: F = -tau_c s with the state ds/dt = (v - |v| s) / yield_angle.
 
     s follows the angle, not time: over a step of d = h v
@@ -182,7 +182,7 @@ def _left(x: ca.SX) -> ca.SX:
 
 
 @EFFECTS.register("joint_spring")
-class JointSpring(EffectBase):
+class _JointSpring(EffectBase):
     """Spring across an arm joint; it adds elastic energy V += 1/2 stiffness (q - rest_angle)^2."""
 
     equation = "V += 1/2 stiffness (q - rest_angle)^2"
