@@ -55,7 +55,7 @@ def scene(run: Path, title: str = "") -> dict[str, Any]:
     """First scene of the report of a run whose title begins so."""
     report = (run / "report.html").read_text(encoding="utf-8")
     texts = re.findall(r'<div class="scene">\s*<script type="application/json">(.*?)</script>', report, re.DOTALL)
-    return next(entry for text in texts for entry in json.loads(text) if entry["title"].startswith(title))
+    return next(entry for text in texts for entry in json.loads(text)["scenes"] if entry["title"].startswith(title))
 
 
 def both(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
@@ -68,7 +68,8 @@ def frames(shown: dict[str, Any], browser: str) -> list[Image.Image]:
     """Pictures of a scene, evenly spaced in time."""
     texts = {name: (TEMPLATES / name).read_text(encoding="utf-8") for name in ("scene.js", "page.css")}
     viewer = texts["scene.js"].split("// a moment can be linked to")[0]
-    parts = {"css": texts["page.css"], "viewer": viewer, "scenes": json.dumps([shown]), "note": NOTE}
+    scenes = json.dumps({"scenes": [shown], "meshes": {}})
+    parts = {"css": texts["page.css"], "viewer": viewer, "scenes": scenes, "note": NOTE}
     with tempfile.TemporaryDirectory() as folder:
         page, picture = Path(folder) / "page.html", Path(folder) / "frames.png"
         page.write_text(PAGE % {"width": WIDTH, "height": HEIGHT, "frames": FRAMES, **parts}, encoding="utf-8")

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import casadi as ca
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.data import JointGroup, PointGroup, Recording
@@ -15,9 +19,15 @@ from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.report import figures
-from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, recording_animation
+from yid_ocp.report.animation import (
+    ConfigurationTrajectory,
+    animation_of_trajectories,
+    recording_animation,
+    scenes_to_dict,
+)
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
+from yid_ocp.vision.surface_meshes import load_robot_meshes_by_joint
 
 # -- in motion ---------------------------------------------------------------------------------------------------------
 
@@ -88,7 +98,7 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     arm, recorded = measured.sticks[0].end_indices[1], np.where(np.isin(np.arange(n), at), q[:1] + 0.01, q[:1])
     moved = animated(single_arm, recorded).positions
     np.testing.assert_allclose(measured.positions[0, arm], moved[0, arm], atol=1e-9)
-    page = made.to_dict()
+    [page] = scenes_to_dict([made])["scenes"]
     assert page["motions"][1]["places"][0][3 * k] is None
     first = np.array(page["motions"][0]["places"][0]).reshape(-1, 3) / page["scale"]
     np.testing.assert_allclose(first, predicted.positions[0], atol=0.51 / page["scale"])
@@ -102,6 +112,76 @@ def test_a_recording_alone_is_a_scene_where_it_has_places(single_arm):
     assert [motion.name for motion in alone.motions] == ["measured"]
     other = JointGroup(("elsewhere",), t, np.zeros((3, 1)))
     assert recording_animation("a", single_arm, theta, Recording(other, (), name="a")) is None
+
+
+@pytest.fixture(scope="module")
+def worn(single_arm):
+    """A moving arm that wears the meshes of its robot, as a page has it, and its configurations."""
+    t = np.linspace(0.0, 2.0, 401)
+    q = 0.4 * np.sin(t)[:, None] * np.ones(single_arm.n_coordinates)
+    told = ConfigurationTrajectory("predicted", single_arm, single_arm.parameters.vector(), t, q)
+    return scenes_to_dict([animation_of_trajectories(name, [told]) for name in "abcd"], "package:baxter")
+
+
+def test_a_robot_wears_its_meshes_thinned(single_arm, worn):
+    assert len(json.dumps(worn, separators=(",", ":"))) < 1_000_000
+    assert set(worn["meshes"]) == {"", *single_arm.driven}
+    assert 2000 < sum(len(faces) for _, faces in worn["meshes"].values()) / 3 < 10_001
+    whole = load_robot_meshes_by_joint("package:baxter", single_arm.numeric_mechanism())
+    scale = worn["scenes"][0]["scale"]
+    for name in single_arm.driven:
+        mesh = whole[single_arm.mechanism.joint_index(name)]
+        flat, faces = (np.array(own).reshape(-1, 3) for own in worn["meshes"][name])
+        # every corner is near the surface, and the thinned link is as long, wide and high
+        away, _ = cKDTree(mesh.vertices).query(flat / scale)
+        assert away.max() < 0.03
+        np.testing.assert_allclose(np.ptp(flat / scale, axis=0), np.ptp(mesh.vertices, axis=0), atol=0.03)
+        assert len({tuple(sorted(face)) for face in faces.tolist()}) == len(faces)
+        assert all(len(set(face)) == 3 for face in faces.tolist())
+
+
+def test_meshes_move_with_their_joints(single_arm, worn):
+    [motion] = worn["scenes"][0]["motions"]
+    names = [name for name in worn["meshes"] if name]
+    symbols = ca.SX.sym("q", single_arm.n_coordinates)
+    moved = forward_kinematics(single_arm.mechanism, symbols)
+    index = single_arm.mechanism.joint_index("left_w1")
+    function = ca.Function("pose", [symbols], [moved.joint_rotations[index], moved.joint_origins[index]])
+    for k in (0, 77, 149):
+        rotation, origin = (np.array(own) for own in function(0.4 * np.sin(worn["scenes"][0]["t"][k])))
+        row = np.array(motion["poses"][k]).reshape(len(names), 7)[names.index("left_w1")]
+        np.testing.assert_allclose(row[:3] / worn["scenes"][0]["scale"], origin.ravel(), atol=1e-4)
+        np.testing.assert_allclose(Rotation.from_quat(row[3:] / 1e4).as_matrix(), rotation, atol=1e-3)
+
+
+def test_a_robot_without_meshes_is_sticks(single_arm, urdf_folder):
+    told = ConfigurationTrajectory(
+        "p", single_arm, single_arm.parameters.vector(), np.arange(2), np.zeros((2, single_arm.n_coordinates))
+    )
+    for robot in (None, str(urdf_folder / "double_pendulum.urdf"), "nowhere.urdf"):
+        page = scenes_to_dict([animation_of_trajectories("a", [told])], robot)
+        assert page["meshes"] == {}
+        assert page["scenes"][0]["motions"][0]["sticks"]
+
+
+def test_what_acts_is_where_it_acts(single_arm):
+    n, t = single_arm.n_coordinates, np.array([0.0, 1.0, 2.0])
+    q = np.random.default_rng(0).uniform(-0.4, 0.4, size=(3, n))
+    push = np.arange(9.0).reshape(3, 3)
+    places = ("T1", "left_e0", "left", "camera_group")
+    acting = [(f"on {place}", place, "N", push) for place in places]
+    told = ConfigurationTrajectory("p", single_arm, single_arm.parameters.vector(), t, q, acting)
+    [motion] = animation_of_trajectories("a", [told]).motions
+    at = {label: (k, values) for label, k, _, values in motion.acting}
+    np.testing.assert_array_equal(at["on T1"][1], push)
+    for label, frame in (("on T1", "T1:75%"), ("on left", single_arm.grasps[0].held_frame)):
+        for now, posture in zip(motion.positions, q, strict=True):
+            np.testing.assert_allclose(now[at[label][0]], point(single_arm, frame, posture), atol=1e-9)
+    assert motion.acting[1][1] >= 0
+    # what has no place is written beside the picture
+    assert at["on camera_group"][0] == -1
+    # a mark is no part of the object
+    assert len(motion.sticks) == len(animated(single_arm, q).sticks)
 
 
 # -- sparsity patterns -------------------------------------------------------------------------------------------------

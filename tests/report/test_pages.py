@@ -28,7 +28,7 @@ from yid_ocp.report.html import _plotly_script, _shared_script, write_report, wr
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT
 from yid_ocp.workflow.build_problem import load_problem
-from yid_ocp.workflow.diagnose import _held_out_predictions
+from yid_ocp.workflow.diagnose import _held_out_predictions, _scenes
 from yid_ocp.workflow.solve import solution_to_result_dict
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -195,6 +195,11 @@ def page_of(finding, folder) -> str:
 def test_every_verdict_has_its_chapters(found, verdict, left_out, tmp_path):
     finding, chapters = found[verdict], tuple(name for name in CHAPTERS if name not in left_out)
     assert finding.verdict == verdict
+    scenes = _scenes(finding, _held_out_predictions(finding))
+    acting = [{(label, unit, values.shape[1]) for label, _, unit, values in e.motions[-2].acting} for e in scenes]
+    friction = {("joint_coulomb@elbow", "", 0)} if verdict == "effect" else set()
+    assert acting[0] == friction
+    assert [("force elbow", "N m", 1) in own for own in acting[1:]] == ([] if verdict == "no_gap" else [True])
     page = page_of(finding, tmp_path)
     assert tuple(re.findall(r'<h3 id="(\w+)">', page)) == chapters
     text = text_of(page)

@@ -121,7 +121,7 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
     assert "picture of what was guessed: run.html" in capsys.readouterr().out
     page = Path("run.html").read_text()
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
-    model, measured = (scene[0] if isinstance(scene, list) else scene)["motions"]
+    model, measured = scene["scenes"][0]["motions"]
     assert set(measured["points"]) == {"cable:50%", "w_cable"}
     assert set(measured["points"]) <= set(model["points"])
     # a straight stick that is seen where it is: points and frames meet all the time

@@ -1,7 +1,8 @@
-"""Animation data: stick figures and points of arms and object over time, measured and predicted."""
+"""Animation data: sticks, points, robot meshes and acting forces over time, measured and predicted."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -9,15 +10,23 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
+from yid_ocp.errors import YidError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
+from yid_ocp.model.urdf import resolve_urdf_path
+from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint
 
 _MAX_FRAMES = 150  # moments of a motion that a page holds; between two it goes straight
+_PUSHED_POINT = "75%"  # of a segment, where an unknown push acts
 _ARM_RADIUS = 0.03  # how thick an arm is drawn [m]
 _POSITION_SCALE = 1e4  # places are kept as whole numbers of a tenth of a millimetre
+_MAX_MESH_FACES = {True: 6000, False: 4000}  # triangles on a page of all links that move, and of those that do not
+_FIRST_MESH_CELL, _CELL_GROWTH = 0.004, 1.3  # edge of the cubes in which vertices become one [m], and what it grows by
+_QUATERNION_SCALE = 1e4
 _MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # what counts as one place [m], as one time [s]
 
 
@@ -36,6 +45,8 @@ class _AnimatedMotion:
 
     `positions` (F, K, 3) [m] are NaN where nothing is known; `point_indices` names those that a sensor sees;
     `is_new_measurement` (F, number of points) tells those measured at that moment from those held until the next one.
+    `acting` are label, index of the place (-1: no place), unit and values (F, k) of what acts there; `arm` are system,
+    parameters and configurations (F, n) of an arm that may wear meshes.
     """
 
     name: str
@@ -43,14 +54,18 @@ class _AnimatedMotion:
     positions: Array
     point_indices: Mapping[str, int]
     is_new_measurement: BoolArray | None = None
+    acting: Sequence[tuple[str, int, str, Array]] = ()
+    arm: tuple[System, Array, Array] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         fresh, places = self.is_new_measurement, self.positions.reshape(len(self.positions), -1)
+        acting = [(*own, [[float(f"{x:.3g}") for x in row] for row in values.tolist()]) for *own, values in self.acting]
         return {
             "name": self.name,
             "sticks": [[*own.end_indices, round(own.radius, 4), int(own.is_object_part)] for own in self.sticks],
             "points": dict(self.point_indices),
             "fresh": None if fresh is None else fresh.astype(int).tolist(),
+            "acting": acting,
             "places": [[round(_POSITION_SCALE * x) if isfinite(x) else None for x in row] for row in places.tolist()],
         }
 
@@ -63,29 +78,96 @@ class Animation:
     t: Array
     motions: tuple[_AnimatedMotion, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready data for the page's script: integers in units of 0.1 mm, null where unknown."""
-        t = [round(float(t), 4) for t in self.t]
-        motions = [motion.to_dict() for motion in self.motions]
-        return {"title": self.title, "t": t, "scale": _POSITION_SCALE, "motions": motions}
+
+def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dict[str, Any]:
+    """JSON-ready data of scenes: places as integers in units of 0.1 mm, null where unknown, and meshes by joint.
+
+    The arm of a scene's last model, or of its measured motion where it has no model, wears the meshes of the robot's
+    URDF. Without any that can be read there are none, and the arm is sticks.
+    """
+    meshes: dict[str, TriangleMesh] | None = None
+    made = []
+    for scene in scenes:
+        motions = [motion.to_dict() for motion in scene.motions]
+        arms = [(i, motion.arm) for i, motion in enumerate(scene.motions) if motion.arm is not None]
+        models = [entry for entry in arms if scene.motions[entry[0]].name != "measured"]
+        for i, (system, theta, q) in (models or arms)[-1:]:
+            meshes = _thinned_robot_meshes(robot, system) if meshes is None else meshes
+            motions[i]["poses"] = _joint_poses(system, theta, q, [name for name in meshes if name])
+        t = [round(float(t), 4) for t in scene.t]
+        made.append({"title": scene.title, "t": t, "scale": _POSITION_SCALE, "motions": motions})
+    parts = {
+        name: [np.rint(_POSITION_SCALE * mesh.vertices).astype(int).ravel().tolist(), mesh.faces.ravel().tolist()]
+        for name, mesh in (meshes or {}).items()
+    }
+    return {"scenes": made, "meshes": parts}
+
+
+def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, TriangleMesh]:
+    """Thinned meshes of a robot by the joint that carries them, the empty name for what does not move."""
+    try:
+        # the libraries that read meshes take a third of a second to import
+        if robot is None or b"<visual" not in resolve_urdf_path(robot).read_bytes():
+            return {}
+        found = load_robot_meshes_by_joint(robot, system.numeric_mechanism())
+    except (OSError, YidError):
+        return {}
+    for moving, most in _MAX_MESH_FACES.items():
+        own, cell = {j: mesh for j, mesh in found.items() if (j >= 0) == moving}, _FIRST_MESH_CELL
+        while sum(len(mesh.faces) for mesh in own.values()) > most:
+            own = {j: _with_merged_vertices(mesh, cell) for j, mesh in own.items()}
+            cell *= _CELL_GROWTH
+        found |= own
+    return {system.mechanism.joint_names[j] if j >= 0 else "": mesh for j, mesh in found.items()}
+
+
+def _with_merged_vertices(mesh: TriangleMesh, cell: float) -> TriangleMesh:
+    """A mesh with one vertex, their mean, in place of all in a cube of edge `cell` [m], and the faces that remain."""
+    cubes = np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64)
+    _, index = np.unique(cubes @ np.cumprod([1, *(cubes.max(0)[:2] + 1)]), return_inverse=True)
+    means = np.column_stack([np.bincount(index, x) for x in mesh.vertices.T]) / np.bincount(index)[:, None]
+    corners = np.sort(faces := index[mesh.faces], axis=1)
+    whole = np.flatnonzero((np.diff(corners, axis=1) > 0).all(axis=1))
+    kept = whole[np.unique(corners[whole] @ [1, len(means), len(means) ** 2], return_index=True)[1]]
+    return TriangleMesh(means, faces[kept])
+
+
+def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -> list[list[int]]:
+    """Place and quaternion (x, y, z, w) of joints at configurations (F, n), as integers, a row for each moment."""
+    symbols, index = ca.SX.sym("q", system.n_coordinates), system.mechanism.joint_index
+    moved = forward_kinematics(system.mechanism, symbols)
+    parts = [ca.horzcat(moved.joint_rotations[index(name)], moved.joint_origins[index(name)]) for name in names]
+    function = ca.Function("poses", [symbols, system.parameters.symbols], [ca.densify(ca.horzcat(ca.SX(3, 0), *parts))])
+    if not names:
+        return []
+    found = np.array(function.map(len(q))(q.T, np.tile(theta[:, None], (1, len(q)))))
+    poses = found.reshape(3, len(q), len(names), 4).transpose(1, 2, 0, 3)
+    turned = Rotation.from_matrix(poses[..., :3].reshape(-1, 3, 3)).as_quat().reshape(*poses.shape[:2], 4)
+    rows = np.concatenate([_POSITION_SCALE * poses[..., 3], _QUATERNION_SCALE * turned], axis=2)
+    return np.rint(rows).astype(int).reshape(len(q), -1).tolist()
 
 
 @dataclass(frozen=True)
 class ConfigurationTrajectory:
-    """Trajectory of a model: configurations q (N, n) at times t (N,) [s]."""
+    """Trajectory of a model: configurations q (N, n) at times t (N,) [s].
+
+    `acting` is what a page marks: label, where it acts (a joint, segment, grasp or frame), unit, and values (N, k): a
+    vector in world axes, one size, or nothing, as for an effect.
+    """
 
     name: str
     system: System
     theta: Array
     t: Array
     q: Array
+    acting: Sequence[tuple[str, str, str, Array]] = ()
 
     def _q_at(self, t: Array) -> Array:
         """Configurations (F, n) at other times, on straight lines between the known ones."""
         return np.stack([np.interp(t, self.t, column) for column in self.q.T], axis=1)
 
 
-def _model_motion(told: ConfigurationTrajectory, q: Array) -> _AnimatedMotion:
+def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _AnimatedMotion:
     """Joints, tips and points of a system at configurations q (F, n), and the lines between them."""
     system, tree = told.system, told.system.mechanism
     symbols, names, owned = ca.SX.sym("q", system.n_coordinates), tree.joint_names, _link_radii(system, told.theta)
@@ -93,11 +175,15 @@ def _model_motion(told: ConfigurationTrajectory, q: Array) -> _AnimatedMotion:
     origins = list(kinematics.joint_origins)
     pairs = [(joint.parent_index, j, names[j] in owned) for j, joint in enumerate(tree.joints)]
     points: dict[str, int] = {}
-    for name in _shown_frames(system):
+    acting = [_acting_place(system, location) for _, location, *_ in told.acting]
+    indices: dict[str | int, int] = {j: j for j in range(len(origins))}
+    shown = _shown_frames(system)
+    for name in dict.fromkeys([*shown, *(place for place in acting if isinstance(place, str))]):
         frame = tree.frame(name)
+        indices[name] = len(origins)
         origins.append(kinematics.frame_position(frame))
         points |= {name: len(origins) - 1} if name in system.point_frames else {}
-        if frame.joint_index >= 0:
+        if frame.joint_index >= 0 and (name not in acting or name in shown):
             pairs.append((frame.joint_index, len(origins) - 1, names[frame.joint_index] in owned))
     base = len(origins)
     places = ca.Function("places", [symbols, system.parameters.symbols], [ca.horzcat(*origins, ca.SX(3, 1))])
@@ -118,10 +204,29 @@ def _model_motion(told: ConfigurationTrajectory, q: Array) -> _AnimatedMotion:
             # an effect may have put joints between two links
             child = owned.get(names[b] if b < len(names) else names[a], _ARM_RADIUS)
             known[ends] = (owned.get(names[a], child) if own else _ARM_RADIUS, own)
-    kept = sorted({k for ends in known for k in ends} | {first[k] for k in points.values()})
+    marked = [-1 if place is None else first[indices[place]] for place in acting]
+    kept = sorted({k for ends in known for k in ends} | {first[k] for k in points.values()} | {*marked} - {-1})
     at = {k: i for i, k in enumerate(kept)}
     sticks = [_Stick((at[a], at[b]), radius, own) for (a, b), (radius, own) in known.items()]
-    return _AnimatedMotion(told.name, sticks, positions(q)[:, kept], {name: at[first[k]] for name, k in points.items()})
+    near = np.clip(np.searchsorted(told.t, t, "right") - 1, 0, None)
+    acts = zip(told.acting, marked, strict=True)
+    marks = [(label, at.get(k, -1), unit, values[near]) for (label, _, unit, values), k in acts]
+    named = {name: at[first[k]] for name, k in points.items()}
+    return _AnimatedMotion(told.name, sticks, positions(q)[:, kept], named, acting=marks, arm=(system, told.theta, q))
+
+
+def _acting_place(system: System, location: str) -> str | int | None:
+    """Index of a joint, or name of a frame, at which a location is marked; None for one that has no place."""
+    if location in system.mechanism.joint_names:
+        return system.mechanism.joint_index(location)
+    held = {grasp.name: grasp.held_frame for grasp in system.grasps}
+    pushed = {layout.name: f"{layout.name}:{_PUSHED_POINT}" for layout in system.segment_layouts}
+    for name in (held.get(location), pushed.get(location), location, location.partition(":")[2]):
+        with contextlib.suppress(YidError):
+            if name:
+                system.mechanism.frame(name)
+                return name
+    return None
 
 
 def _link_radii(system: System, theta: Array) -> dict[str, float]:
@@ -158,7 +263,7 @@ def animation_of_trajectories(
     Of a recording its points are shown, and its arms where it recorded their angles; at most `_MAX_FRAMES` frames.
     """
     t = _frame_times(told[0].t)
-    motions = [_model_motion(entry, entry._q_at(t)) for entry in told]
+    motions = [_model_motion(entry, t, entry._q_at(t)) for entry in told]
     if recording is not None:
         motions.append(_measured_motion(told[0], recording, t))
     return Animation(title, t, tuple(motions))
@@ -179,7 +284,7 @@ def recording_animation(
     if not has_straight_object:
         return Animation(title, t, (motion,))
     unbent = replace(told, name="model on the recorded angles, nothing bent")
-    return Animation(title, t, (_model_motion(unbent, _with_recorded_angles(told, recording, t)), motion))
+    return Animation(title, t, (_model_motion(unbent, t, _with_recorded_angles(told, recording, t)), motion))
 
 
 def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t: Array) -> Array:
@@ -197,10 +302,11 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     system, joints = told.system, recording.joints
     moved = {*system.driven, *system.prescribed}
     sticks: list[_Stick] = []
-    places = np.full((len(t), 0, 3), np.nan)
+    places, arm = np.full((len(t), 0, 3), np.nan), None
     if joints is not None and joints.position is not None and moved and moved <= {*joints.names}:
-        moved_arms = _model_motion(told, _with_recorded_angles(told, recording, t))
+        moved_arms = _model_motion(replace(told, acting=()), t, _with_recorded_angles(told, recording, t))
         sticks, places = [own for own in moved_arms.sticks if not own.is_object_part], moved_arms.positions
+        arm = moved_arms.arm
     seen: dict[str, Array] = {}
     fresh: dict[str, BoolArray] = {}
     for group in recording.points:
@@ -214,7 +320,7 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     indices = {name: places.shape[1] + i for i, name in enumerate(seen)}
     places = np.concatenate([places, *(own[:, None] for own in seen.values())], axis=1)
     now_measured = np.stack(list(fresh.values()), axis=1) if fresh else None
-    return _AnimatedMotion("measured", sticks, places, indices, now_measured)
+    return _AnimatedMotion("measured", sticks, places, indices, now_measured, arm=arm)
 
 
 def _spacing(t: Array) -> float:

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.estimate_history import pool_estimates
+from yid_ocp.arrays import Array
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
-from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
+from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel
+from yid_ocp.diagnosis.screening import smoothed_unknown_units
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import law_tables_csv
 from yid_ocp.errors import DataError, OutputError
@@ -34,8 +36,9 @@ from yid_ocp.files import (
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
-from yid_ocp.report.animation import Animation, animation_of_trajectories
+from yid_ocp.report.animation import Animation, ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
@@ -48,6 +51,7 @@ from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder, software_a
 
 log = logging.getLogger(__name__)
 _STORE_FORMAT = "yid-refits/1"
+_MAX_SHOWN_UNKNOWNS = 5  # in a picture; the page's maps and trajectories.h5 have all
 
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
@@ -243,12 +247,40 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[EpisodeWithNominalAndE
     for episode, *outcomes in predicted:
         told = []
         for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
-            theta = fit.problem.theta_and_initial_state_deviation(fit.problem.vector(fit.values), 0)[0]
-            told.append(
-                prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
-            )
+            course, unseen = _course(name, fit, episode, outcome), np.zeros((episode.grid.steps + 1, 0))
+            told.append(replace(course, acting=[(own.label, own.location, "", unseen) for own in fit.effects]))
         scenes.append(animation_of_trajectories(f"{episode.name} (held out)", told, episode.recording))
+    scenes[1:1] = _unknown_force_scene(finding)
     return scenes
+
+
+def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePrediction) -> ConfigurationTrajectory:
+    theta = fit.problem.theta_and_initial_state_deviation(fit.problem.vector(fit.values), 0)[0]
+    return prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
+
+
+def _unknown_force_scene(finding: DiagnosisResult) -> list[Animation]:
+    """The nominal model in the recording that it explains worst, with the largest unknown forces and offsets."""
+    fit, smoothed = finding.nominal_model, finding.smoother_result
+    if smoothed is None or not smoothed.smoothed_unknowns:
+        return []
+    trace = max(smoothed.smoothed_unknowns, key=lambda own: float(np.linalg.norm(own.posterior_mean)))
+    pairs = zip(fit.problem.episodes, fit.evaluation.episode_predictions, strict=True)
+    episode, outcome = next(pair for pair in pairs if pair[0].name == trace.recording)
+    since = episode.grid.node_times - episode.grid.start_time
+    at = np.clip(np.searchsorted(trace.interval_edges, since, "right") - 1, 0, len(trace.posterior_mean) - 1)
+    units, found = smoothed_unknown_units(fit.problem.system, trace), list[tuple[float, tuple[str, str, str, Array]]]()
+    for group in dict.fromkeys(trace.unknown_groups):
+        columns = [i for i, own in enumerate(trace.unknown_groups) if own == group]
+        values = (trace.reference_std * trace.posterior_mean)[at][:, columns]
+        is_vector = [trace.unknown_names[i][-1] for i in columns] == ["x", "y", "z"] and group.kind != "force"
+        values = values if is_vector else np.linalg.norm(values, axis=1, keepdims=True)
+        if smoothed.group_variance[group] > 0:
+            own = (f"{group.kind} {group.location}", group.location, units[columns[0]], values)
+            found.append((float(np.linalg.norm(trace.posterior_mean[:, columns])), own))
+    shown = [own for _, own in sorted(found, key=lambda entry: -entry[0])[:_MAX_SHOWN_UNKNOWNS]]
+    course = replace(_course("nominal model", fit, episode, outcome), acting=shown)
+    return [animation_of_trajectories(f"{episode.name} (unknown forces)", [course], episode.recording)]
 
 
 class _SingleJsonFileRefitStore:

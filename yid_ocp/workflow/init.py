@@ -220,7 +220,8 @@ def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -
     scene = recording_animation(recording.name, system, system.parameters.vector(), recording, has_straight_object=True)
     if scene is None:
         return None
-    data = ReportData(f"{out.stem}: what init guessed", run.description, result, animations=[scene])
+    known: dict[str, Any] = {"animations": [scene], "robot": run.model.robot}
+    data = ReportData(f"{out.stem}: what init guessed", run.description, result, **known)
     return str(page) if write_report(page, data) else None
 
 

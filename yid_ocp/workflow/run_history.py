@@ -31,6 +31,7 @@ from yid_ocp.problem.predictions import ChannelPrediction
 from yid_ocp.report.animation import Animation, ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
+from yid_ocp.workflow.import_recording import has_native_recording_suffix
 from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_recording_path
@@ -297,11 +298,8 @@ def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
 
 def _have_same_recordings(folders: Sequence[Path]) -> bool:
     """Whether two runs are of the same recordings; `ConfigError` where they share some but not all."""
-    known = []
-    for folder in folders:
-        there, inputs = _settings(folder), read_result_file(folder / "result.json").get("inputs", {})
-        paths = () if there is None else (*there.recordings.estimate, *there.recordings.held_out)
-        known.append({inputs[path]: path for path in paths if path in inputs})
+    inputs = [read_result_file(folder / "result.json").get("inputs", {}) for folder in folders]
+    known = [{digest: path for path, digest in own.items() if has_native_recording_suffix(path)} for own in inputs]
     if not known[0].keys() & known[1].keys():
         return False
     lacking = [

@@ -26,7 +26,7 @@ class ReportData:
     """Input data of a report: `result` as in result.json, and problem, solution and further objects of one run.
 
     `animations` are what moves where that does not follow from `problem`, `solution` and `held_out`; `section_data` is
-    whatever else a command's own sections need.
+    whatever else a command's own sections need; `robot` is the URDF file whose meshes arms wear.
     """
 
     name: str
@@ -36,6 +36,7 @@ class ReportData:
     solution: Solution | None = None
     held_out: Sequence[tuple[Episode, EpisodePrediction | str]] = ()
     animations: Sequence[Animation] = ()
+    robot: str | None = None
     section_data: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -19,7 +19,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.predictions import ChannelPrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
-from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
+from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, scenes_to_dict
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import interval_and_p_value_calibration_rates
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
@@ -262,7 +262,7 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
             told = ConfigurationTrajectory("predicted", system, own.theta, grid.node_times, q)
             scenes.append(animation_of_trajectories(f"{own.episode.name} ({own.role})", [told], own.episode.recording))
     scenes = [entry for entry in scenes if len(entry.t) > 1]
-    text = json.dumps([entry.to_dict() for entry in scenes[:_MAX_ANIMATIONS]], separators=(",", ":"))
+    text = json.dumps(scenes_to_dict(scenes[:_MAX_ANIMATIONS], findings.robot), separators=(",", ":"))
     both = any(
         motion.name == "measured" and motion.point_indices and len(entry.motions) > 1
         for entry in scenes

@@ -3,7 +3,10 @@ const PALETTE = { measured: ["#6b7783", "#98a5b0"], other: [["#0b6e99", "#4fb3dc
 
 class Viewer {
   constructor(box) {
-    this.scenes = JSON.parse(box.querySelector("script").textContent);
+    const { scenes, meshes } = JSON.parse(box.querySelector("script").textContent);
+    this.scenes = scenes;
+    this.meshes = meshes;
+    this.dressed = Object.keys(meshes).length > 0;
     this.canvas = box.querySelector("canvas");
     this.slider = box.querySelector("input[type=range]");
     this.output = box.querySelector("output");
@@ -48,6 +51,15 @@ class Viewer {
       bar.append(label);
       this.marks[name] = mark;
     }
+    const choice = (text, key) => {
+      const label = document.createElement("label"), check = document.createElement("input");
+      Object.assign(check, { type: "checkbox", checked: this[key] });
+      check.addEventListener("change", () => { this[key] = check.checked; this.paint(); });
+      label.append(check, text);
+      bar.append(label);
+    };
+    if (this.dressed) choice("meshes", "dressed");
+    if ((this.marked = motions.some((motion) => motion.acting.length))) choice("what acts", "marked");
     this.swatches();
   }
 
@@ -71,6 +83,8 @@ class Viewer {
         if (x !== null) { low[c] = Math.min(low[c], x / this.scene.scale); high[c] = Math.max(high[c], x / this.scene.scale); }
       }
     }
+    const [still = []] = (this.scene.motions.some((motion) => motion.poses) && this.meshes[""]) || [];
+    still.forEach((value, k) => { const x = value / this.scene.scale; low[k % 3] = Math.min(low[k % 3], x); high[k % 3] = Math.max(high[k % 3], x); });
     this.middle = low.map((x, c) => (x + high[c]) / 2);
     this.reach = Math.max(0.05, Math.hypot(...high.map((x, c) => x - low[c])) / 2);
     this.floor = low[2];
@@ -123,7 +137,7 @@ class Viewer {
   // where a place is on the canvas: x and y in pixels, how near, and pixels a metre there
   eye(width, height) {
     const { yaw, tilt, zoom } = this.turn, [cy, sy, ct, st] = [Math.cos(yaw), Math.sin(yaw), Math.cos(tilt), Math.sin(tilt)];
-    const away = 4 * this.reach, size = (0.46 * Math.min(width, height) * zoom * away) / this.reach;
+    const away = 4 * this.reach, size = (0.54 * Math.min(width, height) * zoom * away) / this.reach;
     return (place) => {
       const [x, y, z] = place.map((value, c) => value - this.middle[c]);
       const right = cy * x + sy * y, into = -sy * x + cy * y, up = ct * z + st * into, far = away + ct * into - st * z;
@@ -133,10 +147,7 @@ class Viewer {
   }
 
   places(motion) {
-    const { t, scale } = this.scene;
-    let i = t.findIndex((value) => value > this.time);
-    i = i < 0 ? t.length - 1 : Math.max(i, 1);
-    const part = (this.time - t[i - 1]) / (t[i] - t[i - 1]), [a, b] = [motion.places[i - 1], motion.places[i]];
+    const { scale } = this.scene, [i, part] = this.moment(), [a, b] = [motion.places[i - 1], motion.places[i]];
     const near = part < 0.5 ? a : b, fresh = motion.fresh ? motion.fresh[part < 0.5 ? i - 1 : i] : null;
     const at = (k) => {
       const found = [0, 1, 2].map((c) => (a[3 * k + c] === null || b[3 * k + c] === null ? near[3 * k + c] : a[3 * k + c] + part * (b[3 * k + c] - a[3 * k + c])));
@@ -157,14 +168,19 @@ class Viewer {
     this.ground(pen, see, pale);
     const shown = this.scene.motions.filter((motion) => !this.hidden.has(motion.name));
     const strokes = [];
+    const clothed = this.dressed && shown.some((motion) => motion.poses);
     const predicted = shown.filter((motion) => motion.name !== "measured");
     for (const motion of shown) {
       const at = this.places(motion), color = this.color(motion.name), ghost = predicted.length && (motion.name === "measured" || motion !== predicted[predicted.length - 1]);
+      if (this.dressed && motion.poses) strokes.push(...this.clothes(pen, see, motion, darkness.matches ? [104, 118, 130] : [196, 204, 211]));
       for (const [a, b, radius, own] of motion.sticks) {
+        if (!own && this.dressed && motion.poses) continue;
         const [from, to] = [at(a), at(b)];
         if (!from || !to) continue;
-        const [p, q] = [see(from), see(to)], wide = Math.max(own ? 2 : 1.5, (own ? radius : Math.min(radius, 0.08 * this.reach)) * (p[3] + q[3]));
-        strokes.push([(p[2] + q[2]) / 2, () => this.stick(pen, p, q, wide, own || ghost ? color : this.softer(color, card), ghost)]);
+        const [p, q] = [see(from), see(to)], wide = clothed && !own ? 3 : Math.max(own ? 2 : 1.5, (own ? radius : Math.min(radius, 0.08 * this.reach)) * (p[3] + q[3]));
+        // the recorded arm is seen through the meshes of the predicted one
+        const near = clothed && !own ? 10 * this.reach : 0;
+        strokes.push([(p[2] + q[2]) / 2 - near, () => this.stick(pen, p, q, wide, own || ghost ? color : this.softer(color, card), ghost)]);
       }
     }
     const measured = shown.find((motion) => motion.name === "measured");
@@ -174,6 +190,98 @@ class Viewer {
       for (const k of Object.values(motion.points)) { const p = see(at(k)); strokes.push([p[2] - 0.05 * this.reach, () => this.dot(pen, p, 4, this.color(motion.name), true, card)]); }
     }
     strokes.sort((a, b) => b[0] - a[0]).forEach(([, stroke]) => stroke());
+    if (this.marked) this.acting(pen, see, shown, style, card);
+  }
+
+  // between which two moments the time is, and where
+  moment() {
+    const { t } = this.scene;
+    let i = t.findIndex((value) => value > this.time);
+    i = i < 0 ? t.length - 1 : Math.max(i, 1);
+    return [i, (this.time - t[i - 1]) / (t[i] - t[i - 1])];
+  }
+
+  // triangles of the robot's links: two-sided, lit from where one looks
+  clothes(pen, see, motion, rgb) {
+    const { scale } = this.scene, [i, part] = this.moment(), found = [];
+    const names = Object.keys(this.meshes).filter((name) => name);
+    for (const [name, [flat, faces]] of Object.entries(this.meshes)) {
+      let move = (x, y, z) => [x / scale, y / scale, z / scale];
+      if (name) {
+        const k = 7 * names.indexOf(name), [a, b] = [motion.poses[i - 1], motion.poses[i]].map((row) => row.slice(k, k + 7));
+        const sign = a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6] < 0 ? -1 : 1;
+        const pose = a.map((x, c) => x + part * ((c < 3 ? 1 : sign) * b[c] - x)), long = Math.hypot(...pose.slice(3));
+        const [px, py, pz] = pose, [qx, qy, qz, qw] = pose.slice(3).map((x) => x / long);
+        const m = [
+          [1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qz * qw), 2 * (qx * qz + qy * qw)],
+          [2 * (qx * qy + qz * qw), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qx * qw)],
+          [2 * (qx * qz - qy * qw), 2 * (qy * qz + qx * qw), 1 - 2 * (qx * qx + qy * qy)],
+        ];
+        move = (x, y, z) => [px, py, pz].map((at, c) => (at + m[c][0] * x + m[c][1] * y + m[c][2] * z) / scale);
+      }
+      const seen = [];
+      for (let v = 0; v < flat.length; v += 3) { const at = move(flat[v], flat[v + 1], flat[v + 2]); seen.push([...see(at), at]); }
+      for (let f = 0; f < faces.length; f += 3) {
+        const [a, b, c] = [seen[faces[f]], seen[faces[f + 1]], seen[faces[f + 2]]];
+        const [u, w] = [b, c].map((corner) => corner[4].map((x, k) => x - a[4][k]));
+        const n = [u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0]], size = Math.hypot(...n) || 1;
+        const { yaw, tilt } = this.turn, into = [-Math.sin(yaw) * Math.cos(tilt), Math.cos(yaw) * Math.cos(tilt), -Math.sin(tilt)];
+        const light = 0.55 + 0.45 * Math.abs(n[0] * into[0] + n[1] * into[1] + n[2] * into[2]) / size;
+        const paint = `rgb(${rgb.map((x) => Math.round(x * light)).join(",")})`;
+        found.push([(a[2] + b[2] + c[2]) / 3, () => {
+          pen.fillStyle = pen.strokeStyle = paint;
+          pen.lineWidth = 0.7;
+          pen.beginPath();
+          pen.moveTo(a[0], a[1]); pen.lineTo(b[0], b[1]); pen.lineTo(c[0], c[1]);
+          pen.closePath();
+          pen.fill();
+          pen.stroke();
+        }]);
+      }
+    }
+    return found;
+  }
+
+  // effects as marks, unknown forces as arrows and, about a joint, as rings: the largest of a unit is the longest
+  acting(pen, see, shown, style, card) {
+    const [i, part] = this.moment(), color = darkness.matches ? "#d9a6f0" : "#7a2f96", ink = style.getPropertyValue("--ink").trim();
+    const elsewhere = [], used = [];
+    const write = (text, x, y) => {
+      while (used.some(([a, b]) => Math.abs(a - x) < 150 && Math.abs(b - y) < 15)) y += 15;
+      used.push([x, y]);
+      pen.font = "12px system-ui, sans-serif";
+      const wide = pen.measureText(text).width, left = Math.max(4, Math.min(x, this.canvas.clientWidth - wide - 4));
+      pen.globalAlpha = 0.8;
+      pen.fillStyle = card;
+      pen.fillRect(left - 2, y - 11, wide + 4, 15);
+      pen.globalAlpha = 1;
+      pen.fillStyle = ink;
+      pen.fillText(text, left, y);
+    };
+    for (const motion of shown) {
+      const at = this.places(motion), largest = {};
+      for (const [, , unit, values] of motion.acting) for (const row of values) largest[unit] = Math.max(largest[unit] || 0, Math.hypot(...row));
+      for (const [label, k, unit, values] of motion.acting) {
+        const row = values[part < 0.5 ? i - 1 : i], place = k < 0 ? null : at(k), size = Math.hypot(...row);
+        const text = row.length ? `${label} ${Number(size.toPrecision(2))} ${unit}` : label;
+        if (!place) { elsewhere.push(text); continue; }
+        const p = see(place), share = row.length ? size / (largest[unit] || 1) : 0;
+        if (row.length === 3) {
+          const q = see(place.map((x, c) => x + (0.35 * this.reach * row[c]) / (largest[unit] || 1)));
+          const [dx, dy] = [q[0] - p[0], q[1] - p[1]], long = Math.hypot(dx, dy) || 1, head = Math.min(9, long / 2);
+          this.line(pen, p, q, color, 2.5);
+          for (const side of [-0.5, 0.5]) this.line(pen, q, [q[0] - (head * (dx - side * dy)) / long, q[1] - (head * (dy + side * dx)) / long], color, 2.5);
+        } else {
+          pen.beginPath();
+          pen.arc(p[0], p[1], row.length ? 4 + 20 * share : 7, 0, 2 * Math.PI);
+          pen.strokeStyle = color;
+          pen.lineWidth = 2.5;
+          pen.stroke();
+        }
+        write(text, p[0] + 12, p[1] - 8);
+      }
+    }
+    elsewhere.forEach((text) => write(text, 8, 18));
   }
 
   points(pen, see, measured, predicted, ink) {
