@@ -183,7 +183,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     )
     for flag, key, shape, text in listed:
         group.add_argument(flag, dest=key, metavar=f"{shape},...", action="append", default=[], help=text)
-    text = "of a bag: topic of joint states whose positions were asked for"
+    text = "of a bag: topic of joint states whose positions are commands"
     group.add_argument("--command-topic", metavar="TOPIC", help=text)
     text = "of a bag: make points so far along the axes of every pose [m]"
     group.add_argument("--pose-axis-point-distance", type=float, metavar="METRES", help=text)
@@ -230,7 +230,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", metavar="FORMAT", help=text)
     text = "folder for CSV or MCAP files, or file for the model; its manifest is written next to it"
     parser.add_argument("--out", metavar="PATH", required=True, help=text)
-    text = "write a model although the format cannot hold all of it; the manifest says what is left out"
+    text = "write a model although the format cannot hold all of it; the manifest lists what is omitted"
     parser.add_argument("--lossy", action="store_true", help=text)
     _printing(parser, "files' paths")
 

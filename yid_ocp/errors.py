@@ -60,7 +60,7 @@ class ModelError(YidError):
 
 
 class SolverError(YidError):
-    """A solver cannot do what was asked: the method does not support it, or no usable solution was found."""
+    """A solver cannot do the task: the method does not support it, or no usable solution was found."""
 
 
 class OutputError(YidError):

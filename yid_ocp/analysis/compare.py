@@ -130,7 +130,7 @@ def compare_methods(
 
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
-    """Where a method is not where the best one is, of the parameters that are found."""
+    """Sentences on found parameters in which a method differs from the best one."""
     sentences = []
     for name, reference in best.solution.parameters.items():
         if judged[name].verdict != "identifiable":
@@ -155,7 +155,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
 def _explanations(
     runs: Sequence[_MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> list[str]:
-    """Where methods sent the parameters that are not found, and where steepest descent as published went wrong."""
+    """Sentences on parameters that are not found, and on those in which steepest descent as published is wrong."""
     sentences = []
     for name, reference in judged.items():
         if not reference.free or reference.verdict == "identifiable":

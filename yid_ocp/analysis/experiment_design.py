@@ -457,7 +457,7 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
 
 
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
-    """Largest distance of a gripper from where it starts [m]."""
+    """Largest distance of a gripper from its start [m]."""
     whole = np.zeros((len(episode.measured_driven_angles), system.n_coordinates))
     whole[:, list(system.driven_coordinate_indices)] = episode.measured_driven_angles
     paths = _frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)

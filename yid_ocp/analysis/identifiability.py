@@ -276,7 +276,7 @@ def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationP
 
 @dataclass(frozen=True)
 class _Sensitivities:
-    """What the sensors see of the named parameters at one point."""
+    """Sensitivities of the data to the named parameters at one point."""
 
     problem: EstimationProblem
     x: Array
@@ -432,7 +432,7 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
 
 
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
-    """How far the data move when parameters take other values, beyond what nuisances explain [standard deviations]."""
+    """Change of the data with other parameter values, beyond the part that nuisances explain [standard deviations]."""
     problem, x = view.problem, view.x.copy()
     for name, value in changes.items():
         x[problem.unknown_names.index(name)] = value

@@ -326,7 +326,7 @@ class _Data:
 
 
 class _Fit(NamedTuple):
-    """What a fit of each joint's effort says, shape (k,)."""
+    """Results of a fit of each joint's effort, shape (k,)."""
 
     inverse: Array  # 1/g
     std: Array

@@ -41,7 +41,7 @@ _LENGTH_RTOL = 0.2  # part by which lengths that cannot change may seem to
 
 
 class _Change(NamedTuple):
-    """What would have to be done to measured points, and how far they then are from the model [m]."""
+    """A correction of measured points, and their remaining distance from the model [m]."""
 
     cause: str
     words: str

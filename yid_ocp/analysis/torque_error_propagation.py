@@ -135,7 +135,7 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorMod
 
 
 class _Motion:
-    """How errors of unit standard deviation move the state: of the start, of samples, of steps, the constant one."""
+    """Changes of the state by errors of unit standard deviation: of the start, of samples, of steps, and constant."""
 
     def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback

@@ -203,7 +203,7 @@ def _words(changes: Sequence[ExperimentChange]) -> str:
 
 
 class _Outcomes:
-    """What sets of changes would tell, each worked out once."""
+    """Outcomes of sets of changes, each computed once."""
 
     def __init__(
         self,

@@ -92,7 +92,7 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
 
 
 def _loaded(text: str, origin: str) -> Any:
-    """What the YAML reader makes of a text that is not too deep and asks for no types of its own."""
+    """Data of a YAML text that is not too deep and has no custom types."""
     sizes: dict[str, int] = {}  # of what aliases stand for
     begun: list[tuple[str | None, int]] = []  # anchors of the collections that are open, and counts before them
     count = 0
@@ -195,7 +195,7 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
 
 
 def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
-    """What stands at a key once a value is set there: sections of one kind merge, all else is replaced."""
+    """Value of a key after setting it: sections of one kind merge, other values are replaced."""
     sections = schema.section_variants_from_annotation(hint)
     merges = bool(value) and isinstance(before, dict) and isinstance(value, dict)
     if merges and sections is not None and sections.selector_key in value:

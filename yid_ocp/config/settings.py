@@ -213,13 +213,13 @@ class RecordingsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
-    """How `import` converts a file of another tool; a command-line flag overrides its key here."""
+    """Conversion of another tool's file by `import`; a command-line flag overrides its key here."""
 
     joint_topics: Annotated[
         _Names | None, OptionInfo("of a bag: topics of joint states, put on one clock; all when absent")
     ] = None
     command_topic: Annotated[
-        str | None, OptionInfo("of a bag: topic of joint states whose positions were asked for, not measured")
+        str | None, OptionInfo("of a bag: topic of joint states whose positions are commands, not measurements")
     ] = None
     fields: Annotated[
         _Texts, OptionInfo("of a bag: joint channel, and /TOPIC.FIELD of an array in messages of any type")
@@ -384,7 +384,7 @@ class _VirtualFramesSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class _TrackSettings:
-    """How points are tracked in the frames of a depth camera."""
+    """Tracking of points in the frames of a depth camera."""
 
     frames_path: Annotated[
         _FilePath | None,

@@ -216,7 +216,7 @@ def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array
 
 
 def _velocities(recording: Recording) -> Iterator[Issue]:
-    """Angles differentiated beside recorded velocities."""
+    """Issues from comparing differentiated angles with recorded velocities."""
     joints = recording.joints
     if joints is None or joints.velocity is None or len(joints.t) < 50:
         return

@@ -1,4 +1,4 @@
-"""What columns, tables and messages of other tools mean: loggers, motion capture exports, drivers of robots."""
+"""Meaning of columns, tables and messages of other tools: loggers, motion capture exports, robot drivers."""
 
 from __future__ import annotations
 

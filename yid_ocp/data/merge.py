@@ -27,7 +27,7 @@ _LARGEST_START = 1e6  # from which on times are counted from the first sample [s
 
 
 class _MotionLag(NamedTuple):
-    """How much later points move than joints [s], and the share of their motion that angles explain there."""
+    """Delay of points relative to joints [s], and the share of their motion that angles explain with it."""
 
     lag: float
     explained: float
@@ -156,7 +156,7 @@ def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
 
 
 def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) -> float:
-    """How much later one speed on an even clock goes as another [s], from values and times of the first samples."""
+    """Delay of one speed relative to another on an even clock [s], from values and times of the first samples."""
     (x, x_start), (y, y_start) = a, b
     lags = signal.correlation_lags(len(y), len(x))
     ones_x, ones_y = np.ones(len(x)), np.ones(len(y))

@@ -291,7 +291,7 @@ def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.Fi
 
 
 def _complaint(path: Path) -> str:
-    """What stands against reading a file; nothing where all of it can be read."""
+    """Reason why a file cannot be read; nothing where all of it can be read."""
     try:
         with h5py.File(path, "r") as file:
             complaint = _foreign(file) or _excess(file)
@@ -310,7 +310,7 @@ def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
 
 
 def _foreign(group: h5py.Group, depth: int = 0) -> str:
-    """Which entry stands in another file."""
+    """Name of an entry that links into another file."""
     for name in group:
         link = group.get(name, getlink=True)
         item = None if isinstance(link, h5py.ExternalLink) else group.get(name)

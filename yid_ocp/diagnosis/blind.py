@@ -337,7 +337,7 @@ class BlindCaseGenerator:
         return tuple(e for i, (e, _) in enumerate(drawn) if e.label not in labels[:i]), drawn[0][1]
 
     def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
-        """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
+        """An effect of the library at a multiple of its detectable size, or as near to it as its range allows."""
         groups: dict[str, dict[str, list[_Detectable]]] = {}
         for entry in self._detectable:
             if entry[0].kind in INJECTABLE_EFFECT_KINDS:
@@ -355,7 +355,7 @@ class BlindCaseGenerator:
     def _sized(
         self, entry: _Detectable, rng: np.random.Generator, wanted: float
     ) -> tuple[InjectedEffect, float] | None:
-        """Amplitudes in a random proportion at so many times the detectable size, as far as the range allows."""
+        """Amplitudes in a random proportion at a multiple of the detectable size, as far as the range allows."""
         (effect, shape, factor), names = entry, entry[0].amplitude_names
         neutral = np.array([effect.neutral_values[n] for n in names])
         low, high = np.array([effect.prior_ranges[n] for n in names]).T - neutral

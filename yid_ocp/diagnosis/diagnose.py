@@ -131,7 +131,7 @@ def diagnose(
 
 @dataclass(frozen=True)
 class _Examined:
-    """The nominal model beside all that is no event: fit, null tests, screening, and whether there is a gap."""
+    """The nominal model on data without events: fit, null tests, screening, and whether there is a gap."""
 
     search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefittedModel
@@ -490,7 +490,7 @@ def _after(
 
 
 def _changes(before: RefittedModel, after: RefittedModel) -> tuple[NominalParameterChange, ...]:
-    """How each nominal parameter changes from one model to another."""
+    """Change of each nominal parameter from one model to another."""
     names, parameters = before.problem.shared_parameters, before.problem.system.parameters
     pairs = ((name, (before.values[name], after.values[name], after.std[name])) for name in names)
     return tuple(NominalParameterChange(name, parameters[name].unit, *values) for name, values in pairs)
@@ -537,7 +537,7 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 
 
 def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
-    """The null test of a residual from which so many fitted parameters took their part."""
+    """The null test of a residual after a fit of the given number of parameters."""
     samples = residual_channel_indices(problem)
     return residual_chi2_null_test(samples, residual, fitted, limits.significance_level, limits.residual_window)
 

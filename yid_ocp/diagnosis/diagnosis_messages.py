@@ -268,7 +268,7 @@ def _out_of_range(effect: EffectBase, fit: RefitStatistics) -> list[str]:
 
 
 def _since(found: EarlierRunsComparison, effects: bool) -> list[str]:
-    """What has moved since the baseline, and what a baseline that explained little is worth."""
+    """Sentences on changes since the baseline, and on a baseline that explained little."""
     several, p_value = len(found.baseline_runs), found.between_runs_p_value
     moved = [
         f"{e.name} is {e.current_value:.3g} ± {e.current_std:.2g} {e.unit} where it was "

@@ -228,7 +228,7 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
 
 
 def _behind(fit: RefitStatistics, first: RefitStatistics) -> dict[str, float]:
-    """How much worse a refit is than the first."""
+    """Difference of a refit's loss to that of the first."""
     lost, error = held_out_improvement(fit.held_out_loss, first.held_out_loss)
     left, squares = fit.held_out_loss.chi2_per_sample, penalized_chi2_difference(fit, first)
     return {"left": left, "chi2_per_dof": lost, "error": error, "squares": squares}

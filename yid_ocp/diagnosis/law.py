@@ -65,7 +65,7 @@ class GapLaw:
 
     @property
     def sentence(self) -> str:
-        """What is said of the law: where, of what, how large, and how far it closes the gap."""
+        """Sentence on the law: place, quantity, size, and the closed part of the gap."""
         if self.depends_on == "time":
             head = f"{self.location} carries a torque that depends on nothing the model knows better than on time"
         else:

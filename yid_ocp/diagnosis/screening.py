@@ -216,7 +216,7 @@ def bonferroni_min_p_value(ranked: Sequence[CandidateScore]) -> float:
 
 
 def _room(effect: EffectBase) -> tuple[Array, Array]:
-    """How far amplitudes may go from neutral, to either side."""
+    """Largest changes of amplitudes from neutral, to either side."""
     own = [q for q in effect.definitions if not q.is_shape_parameter]
     return np.array([q.lower - q.neutral_value for q in own]), np.array([q.upper - q.neutral_value for q in own])
 

@@ -376,7 +376,7 @@ def _is_there(without: RefitStatistics, full: RefitStatistics, effect: EffectBas
 def _reconsidered(
     search: RefitContext, nominal: RefitStatistics, added: Sequence[SelectedEffect], paired: bool
 ) -> tuple[SelectedEffect, ...]:
-    """Every effect tried for its place again beside the others: without it, and others instead of it."""
+    """Effects after testing each with the others: without it, and with others instead of it."""
     kept = tuple(added)
     seen = {_labels(kept)}
     tried = set() if paired else {_labels(kept[:-1])}

@@ -66,7 +66,7 @@ class EffectAmplitudeTransferCheck:
 
 @dataclass(frozen=True)
 class LocatedGap:
-    """What the smoother says of the nominal model's gap."""
+    """Location of the nominal model's gap by the smoother."""
 
     locations: tuple[GapLocation, ...]
     origin: str  # see `SmoothedUnknownsResult.plant_or_sensor_origin`
@@ -75,7 +75,7 @@ class LocatedGap:
 
 @dataclass(frozen=True)
 class NominalEvidence:
-    """What is known of a gap before effects are searched for."""
+    """Evidence on a gap before the search for effects."""
 
     nominal_model: RefitStatistics
     nominal_test: NullTestResult  # on the recordings to estimate on
@@ -114,7 +114,7 @@ class Judgement:
 
     @property
     def closure_by_location(self) -> dict[str, float]:
-        """What the accepted effects at each location close beyond those added before."""
+        """Part of the gap that the accepted effects at each location close beyond those added before."""
         closed: dict[str, float] = {}
         most = 0.0
         for entry in self.accepted:

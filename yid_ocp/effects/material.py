@@ -40,7 +40,7 @@ class _SegmentEffect(EffectBase):
 
 
 class _SegmentMemory(_SegmentEffect):
-    """An effect with an internal coordinate beside every elastic joint of a segment."""
+    """An effect with an internal coordinate for every elastic joint of a segment."""
 
     required_excitation = "how long it is held"
 

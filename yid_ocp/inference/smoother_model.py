@@ -107,12 +107,12 @@ class _SmootherUnknowns(NamedTuple):
 
     @property
     def loading(self) -> int:
-        """How many of them add the same to every step."""
+        """Number of unknowns with the same contribution to every step."""
         return len(self.forced) + len(self.grasped)
 
     @property
     def driving(self) -> int:
-        """How many of them move the state."""
+        """Number of unknowns that move the state."""
         return self.loading + 3 * len(self.pushed)
 
 
@@ -294,7 +294,7 @@ def recording_models_with_unknown_forces(
 
 
 def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> tuple[Array, Array]:
-    """What unknown forces and grasp offsets of their reference size add to every step's equations and momentum."""
+    """Contributions of unknown forces and grasp offsets of reference size to every step's equations and momentum."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
     forces, loading = len(unknowns.forced), unknowns.loading

@@ -124,13 +124,13 @@ def _pairs(e: DiscreteEquations) -> ca.SX:
 
 
 def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """What the pairs leave out, sparse: rows and p1 by (unknowns, old, input), the constraint by unknowns."""
+    """Sparse derivatives besides the pairs: rows and p1 by (unknowns, old, input), the constraint by unknowns."""
     unknown, old = ca.vertcat(e.q1, e.z1, e.lam), ca.vertcat(e.q0, e.z0)
     inputs = ca.vertcat(unknown, old, e.u)
     m, n = e.lam.numel(), e.q0.numel()
 
     def by_internal(expression: ca.SX) -> ca.SX:
-        """What the closed form leaves out: placements and masses may depend on internal coordinates."""
+        """Terms besides the closed form: placements and masses may depend on internal coordinates."""
         blocks = [ca.jacobian(expression, z) for z in (e.z1, e.z0)]
         gaps = [ca.SX(expression.numel(), count) for count in (n, m + n, e.u.numel())]
         return ca.horzcat(gaps[0], blocks[0], gaps[1], blocks[1], gaps[2])
@@ -418,7 +418,7 @@ def _source(function: ca.Function) -> str | None:
 
 
 def _instructions(function: ca.Function) -> list[_Instruction]:
-    """What a function does, in order; of an operation without a form no input is looked up."""
+    """Instructions of a function, in order; of an operation without a form no input is looked up."""
     held: dict[int, int] = {}  # the instruction whose value stands in a place now
     found = []
     for k in range(function.n_instructions()):

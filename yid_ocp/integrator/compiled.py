@@ -283,7 +283,7 @@ def _check(code: int, outcome: Any) -> None:
 
 
 def _batch_key(member: RolloutInputs) -> Hashable:
-    """What members of one batch have in common."""
+    """Properties shared by the members of one batch."""
     feedback, wanted = member.feedback, member.directions
     return None if feedback is None else tuple(np.asarray(feedback.state_indices).tolist()), wanted is None
 

@@ -81,7 +81,7 @@ class InterpretedKernel:
         return np.concatenate([*parts, [self._model.time_step]])
 
     def _columns(self, names: Sequence[str]) -> IntArray:
-        """Where parameters stand in a point."""
+        """Columns of parameters in a point."""
         return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 
     def _newton(

@@ -347,7 +347,7 @@ class _Hold:
     by_hand: Array  # stiffness of what holds joints whose motor is off, (nu,) [N m/rad]
 
     def give(self, q: Any, system: System) -> Any:
-        """By how much the driven joints are away from where they should be."""
+        """Distance of the driven joints from their targets."""
         return self.given[: len(self.held)] - q[list(system.driven_coordinate_indices)]
 
 

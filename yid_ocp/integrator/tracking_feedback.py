@@ -263,7 +263,7 @@ class EffectMomentumShift:
     def _remembered(
         self, motion: JointMotionWithSensitivities, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
-        """What joints remember at every node but the last, (N, nk), and its derivatives, (N, nk, d), or None."""
+        """Memory of joints at every node but the last, (N, nk), and its derivatives, (N, nk, d), or None."""
         steps = len(motion.torque)
         z, total = np.zeros((steps, len(self._kept))), np.zeros((steps, len(self._kept), width))
         freed, away = {own for _, own in wanted}, theta[self._columns] != self._neutral

@@ -254,7 +254,7 @@ def _check_seen(
 
 
 def _would_see(experiment: ParameterizedExperiment, name: str, w: Array) -> str:
-    """What would see a parameter, in words."""
+    """Sentence on a sensor that would observe a parameter."""
     mover, n = experiment.simulator, experiment.simulator.step.system.n_coordinates
     wide, seen = extended_step_and_observable_frames(mover.step)
     w = _PROBE_AMPLITUDE * w / max(float(np.abs(w).max()), _PROBE_AMPLITUDE)

@@ -195,7 +195,7 @@ def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
 
 
 def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array) -> bool:
-    """Whether half the time step moves the point neither from where it arrives nor from rest."""
+    """Whether half the time step changes neither the final position of the point nor its rest."""
     pairs = ((rows.simulator, 1), (finer, 2))
     own, other = (
         mover.frame_positions_along_states(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs

@@ -251,7 +251,7 @@ class EpisodePredictor:
     def _prepared(
         self, episode: Episode, theta: Array, offset: Array, guess: Array | None, derivatives: bool
     ) -> _Prepared | str:
-        """What an episode's rollout starts from and is driven by."""
+        """Start and inputs of an episode's rollout."""
         wanted = self.unknowns.free_parameters if derivatives else ()
         theta = self.theta_with_episode_values(episode, theta)
         start = self.initial_state_of_episode(episode, theta, offset, wanted, guess)

@@ -264,7 +264,7 @@ def _channel_groups(
     theta: Array,
     rng: np.random.Generator | None,
 ) -> tuple[SensorChannelGroup, ...]:
-    """What sensors of declared channels read at every node."""
+    """Readings of declared channels at every node."""
     made: dict[str, SensorChannelGroup] = {}
     for sensor in (samples.sensor for samples in episode.measurements):
         name, _, quantity = sensor.group_name.rpartition(".")
@@ -309,7 +309,7 @@ def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recordi
 
 
 def _straight(made: Recording, source: Recording) -> Array | None:
-    """Where the points of the first group were while the object was held straight, where the source says it."""
+    """Positions of the first group's points while the object was held straight, if the source has them."""
     if source.marker_reference_pose is None or not made.points or made.points[0].name != source.points[0].name:
         return None
     return source.marker_reference_pose[[source.points[0].names.index(name) for name in made.points[0].names]]

@@ -109,7 +109,7 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
 def _courses(
     joints: JointGroup, driven: tuple[str, ...], where: str, servos: Mapping[str, PositionServo]
 ) -> list[scipy.interpolate.PPoly]:
-    """What moves each joint over time, between the first sample and the end of the last one's interval."""
+    """Input of each joint over time, between the first sample and the end of the last one's interval."""
     t = joints.t
     # the last sample lasts as long as the one before it
     edges = np.append(t, 2 * t[-1] - t[-2])

@@ -1,1 +1,1 @@
-"""What people read and look at: figures, report sections and the page; a new section is one file in `sections`."""
+"""Output for people: figures, report sections and the page; a new section is one file in `sections`."""

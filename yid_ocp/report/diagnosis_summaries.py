@@ -300,7 +300,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with the methods' answers; nothing where they agree and that means something."""
+    """Sentences on errors of the methods' answers; nothing where they agree and that means something."""
     methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
     free = {name: entry for name, entry in own.items() if entry["free"]}
     found = {name: entry for name, entry in free.items() if entry["verdict"] == "identifiable"}

@@ -77,7 +77,7 @@ def _plotly_script() -> tuple[str, str]:
 
 
 def _shared_script(path: Path) -> str:
-    """Where a page finds a script that it shares, relative to itself; empty where there is none."""
+    """Relative path of a page's shared script; empty where there is none."""
     scripts = [folder / _plotly_script()[0] for folder in (path.parent, *path.parent.parents)]
     found = next(filter(_is_plotly_script, scripts[: _SHARED_SCRIPT_LEVELS + 1]), None)
     return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()

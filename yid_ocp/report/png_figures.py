@@ -178,7 +178,7 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
 
 
 def _ticks(labels: Sequence[str], spans: Sequence[NamedIndexRange]) -> tuple[list[float], list[str]]:
-    """Where labels go: every one, or one for all of the same owner (a tube, an arm) in a block."""
+    """Positions of labels: all of them, or one for each owner (a tube, an arm) in a block."""
     if len(labels) <= _MAX_SINGLE_LABELS:
         return [float(i) for i in range(len(labels))], list(labels)
     places, names = [], []

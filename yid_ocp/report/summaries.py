@@ -109,7 +109,7 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
 
 
 def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    """How well each group of held-out channels is predicted, beside the best guess without a model and the noise.
+    """Prediction error of each group of held-out channels, compared with the best guess without a model and the noise.
 
     Said where the model does not explain what it was fitted to, and where noise does not explain its prediction.
     """

@@ -1,4 +1,4 @@
-"""Where a search begins: free effects off their neutral values, and node states for solvers with states as unknowns."""
+"""Initial guesses: free effects off their neutral values, and node states for solvers with states as unknowns."""
 
 from __future__ import annotations
 

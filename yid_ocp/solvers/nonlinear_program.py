@@ -309,7 +309,7 @@ class NonlinearProgram(ReprMixin):
     """Nonlinear program min f(w, p) subject to bounds and constraints, in CasADi.
 
     `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
-    stands for `nlp["q[NAME]"]`.
+    is short for `nlp["q[NAME]"]`.
     """
 
     variables: Mapping[str, _VectorBlock]  # what the column `w` of unknowns is made of

@@ -377,7 +377,7 @@ class _Maker:
         return np.hstack(per_step), first, priors
 
     def _begun(self, episode: Episode, places: _Places) -> tuple[MappedFunctionTerm, list[ResidualTerm]]:
-        """What fixes the first state, and the prior of what is free of it."""
+        """Constraints of the first state, and the prior of its free part."""
         problem, name, nx = self._problem, episode.name, self._sizes["nx"]
         loose = list(problem.predictor.estimated_initial_state_indices)
         fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_coordinate_indices, *loose}]
@@ -461,7 +461,7 @@ class _Maker:
         return ResidualTerm(term, _constant(between), weight.T[seen], value.T[seen], threshold)
 
     def _reading(self, sensor: Sensor, episode: Episode) -> tuple[LocalVariableFunction, bool]:
-        """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
+        """Reading of a sensor at a node, and whether it depends on efforts, that is, on the next step."""
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
             function = sensor_reading_function(self._problem.system, sensor, self._names)
@@ -548,7 +548,7 @@ def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
 
 
 def _between(samples: SensorMeasurements, nodes: IntArray) -> scipy.sparse.csc_matrix:
-    """What makes predictions of samples, those that count, from readings at nodes, node by node."""
+    """Interpolation of the used samples from readings at nodes, node by node."""
     width = samples.value.shape[1]
     sample, column = np.nonzero(samples.positive_weight_mask)
     row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])

@@ -291,7 +291,7 @@ class _UntoldError(Exception):
 
 @dataclass
 class _Calibrator:
-    """What one call of `calibrate_camera` needs."""
+    """Data of one call of `calibrate_camera`."""
 
     arm: ArmSurface
     told: CameraState
@@ -383,7 +383,7 @@ class _Calibrator:
     def _rounds(
         self, state: CameraState, frames: Sequence[CalibrationFrame], reach: float, along: bool, most: int, rounds: int
     ) -> tuple[CameraState, RobustCostDerivatives, list[CalibrationFrame]]:
-        """The state after some steps on at most so many points of each frame, the sum there, and those points."""
+        """The state after some steps on a limited number of points of each frame, the sum there, and these points."""
         chosen = []
         for glimpse in frames:
             points = state.measured_to_world_points(glimpse.points)
@@ -411,7 +411,7 @@ class _Calibrator:
         return state, cost(state), chosen
 
     def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
-        """What the arm says of camera and clock in the middle of the recording, in words."""
+        """Message on camera and clock in the middle of the recording, as estimated from the arm."""
         stds = np.sqrt(np.diag(covariance))
         known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms (stamp minus joint time)"
         searched = self.clock.search_half_width > 0

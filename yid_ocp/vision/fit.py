@@ -305,7 +305,7 @@ class ShapeFitter:
         return nodes_first, points_then
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
-        """One pass after the other, each from where the one before ended."""
+        """Minimum after several passes, each starting at the end of the one before."""
         end, most = start, self.options.max_iterations
         for task in tasks:
 
@@ -469,7 +469,7 @@ class ShapeFitter:
 
 
 class _Minimum(NamedTuple):
-    """Where passes ended: configuration, Hessian by the free bends and cost there."""
+    """Minimum of the passes: configuration, Hessian by the free bends, and cost."""
 
     q: Array
     hessian: Array

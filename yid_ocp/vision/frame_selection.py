@@ -234,12 +234,12 @@ def _none_good(
 
 
 def _because(sizes: TubeDimensionEstimates, matters: bool) -> str:
-    """What begins a refusal where the sizes of the object are the likely cause."""
+    """Beginning of a refusal if the sizes of the object are the likely cause."""
     return f"{sizes.contradiction_message}: " if matters and sizes.contradiction_message else ""
 
 
 def _hint(sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], otherwise: str) -> str:
-    """What is known to be wrong with the object or stands about it comes before general advice."""
+    """Advice of a refusal: known errors of the object and things near it first, then general advice."""
     notes = [*sizes.messages, *(thing.text for thing in things)]
     return "; ".join([*notes[:_MAX_NOTES], otherwise])
 
@@ -305,7 +305,7 @@ def _apart(one: FrameShapeFit | None, other: FrameShapeFit | None) -> float:
 
 
 def _ends(fits: Iterable[FrameShapeFit | None]) -> tuple[Array, Array]:
-    """Where roots and tips are."""
+    """Positions of roots and tips."""
     lines = np.array([fit.link_ends for fit in fits if fit is not None])
     return lines[:, 0, 0], lines[:, -1, 1]
 

@@ -123,7 +123,7 @@ def _rays(lens: CameraIntrinsics) -> Array:
 
 
 def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[Array, Array]:
-    """Where  distort(x, y) = aim, by Newton's method; NaN where the lens's formula does not reach."""
+    """Solution of distort(x, y) = aim by Newton's method; NaN where the lens's formula does not reach."""
     x, y, h = aim_x, aim_y, 1e-6
     if lens.model == "equidistant":  # the aim is an angle, which is nearer to the answer as one
         bent = np.maximum(np.hypot(aim_x, aim_y), 1e-9)
@@ -318,7 +318,7 @@ class OcclusionMap:
 
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
-        """Whether something nearer stands where the other eye would have to look through it."""
+        """Whether a nearer surface hides the point from the other camera of the pair."""
         widest = (
             _MAX_STEREO_BASELINE * (1.0 / max(float(distance.min()), _MIN_DEPTH) - 1.0 / limit) if limit > 0 else 0.0
         )
@@ -331,7 +331,7 @@ class OcclusionMap:
 
 
 def _picture(points: Array, pose: Array) -> tuple[Array, Array]:
-    """Where points stand in the picture, x/z and y/z, shape (2, N), and their depth z [m]."""
+    """Image coordinates of points, x/z and y/z, shape (2, N), and their depth z [m]."""
     local = pose[:3, :3].T @ points.T
     local -= (pose[:3, :3].T @ pose[:3, 3])[:, None]
     local[:2] /= np.maximum(local[2], _MIN_DEPTH)

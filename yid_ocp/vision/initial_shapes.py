@@ -134,7 +134,7 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
 
 
 def _renumbered(kept: IntArray, count: int) -> IntArray:
-    """Number of each of so many entries among those that are kept, -1 for the others."""
+    """New index of each entry among the kept ones, -1 for the others."""
     numbers = np.full(count, -1)
     numbers[kept] = np.arange(len(kept))
     return numbers

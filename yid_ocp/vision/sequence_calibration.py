@@ -290,7 +290,7 @@ def estimate_and_check_dimensions(
 
 
 def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
-    """Fits whose free ends stand where those of the others do, as seen from the shape's."""
+    """Fits whose free ends agree with those of the others, relative to the shape."""
     if not fits:
         return []
     ends, noise = np.array([fit.end_offsets for fit in fits]), float(np.median([fit.noise_std for fit in fits]))

@@ -365,7 +365,7 @@ def _load_mesh_file(file: Path) -> TriangleMesh:
 
 
 def _resolve_mesh_path(name: str, urdf: Path) -> Path:
-    """Path of a mesh file named in a URDF: `package://`, `file://`, absolute or beside the URDF."""
+    """Path of a mesh file named in a URDF: `package://`, `file://`, absolute or relative to the URDF."""
     bare = name.removeprefix("file://")
     package = bare.removeprefix("package://")
     candidates = [Path(bare), urdf.parent / bare]

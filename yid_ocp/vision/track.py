@@ -82,7 +82,7 @@ def track_object(
 
 @dataclass(eq=False)
 class _Work:
-    """A frame while it is worked on: its report so far and what is left of its cloud."""
+    """A frame in processing: its report so far and its remaining cloud."""
 
     report: FrameReport
     filtered: WeightedCloud | None = None
@@ -93,7 +93,7 @@ class _Work:
 
 
 class _Look(NamedTuple):
-    """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
+    """Views of a frame under each hypothesis, the robot's configuration, and starts of searches."""
 
     sights: Sequence[ProcessedFrameCloud]
     q: Array
@@ -376,7 +376,7 @@ class FrameTracker:
     def _look(
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
-        """What a frame shows of the object, None with the reason in its report."""
+        """The object's part of a frame; None with the reason in its report."""
         work = _Work(self.unprocessed_frame_report(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
@@ -385,7 +385,7 @@ class FrameTracker:
             return work, None
 
     def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
-        """What a frame shows of the object; `DataError` with the reason why it is dropped."""
+        """The object's part of a frame; `DataError` with the reason why it is dropped."""
         index, stamp, t = work.report.index, work.report.stamp, work.report.joint_time
         options, state = self.options, calibration.camera_state
         cloud, raw = self._read(index, calibration)
@@ -426,7 +426,7 @@ class FrameTracker:
         return look
 
     def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
-        """What is seen of an object whose root is where the model has it."""
+        """View of an object whose root is known from the model."""
         found = point_cloud.extract_skeleton(cloud, rng, self.options.skeleton)
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
@@ -438,7 +438,7 @@ class FrameTracker:
     def _anywhere(
         self, starts: ShapeFitInitialGuesses, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
     ) -> _Look:
-        """What is seen of an object whose root is sought, with the ends that it may have where."""
+        """Views of an object with an unknown root, with its possible ends."""
         diameter, options = 2.0 * self._widest, self.options
         course = cloud_centerline_tree(cloud, diameter, options.skeleton.max_edge_length, rng)
         work.skeleton = course.to_skeleton

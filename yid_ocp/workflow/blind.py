@@ -193,7 +193,7 @@ def rescore_blind(
 
 
 def _stored_values(folder: Path) -> dict[str, Any]:
-    """What the tasks of a folder returned, by their names, whatever version of the package they ran."""
+    """Results of a folder's tasks by their names, from any version of the package."""
     files = sorted(folder.glob("*.json"), key=lambda file: file.stat().st_mtime)
     entries = [read_input_json(file) for file in files if not file.name.endswith(".error.json")]
     return {str(entry["name"]): entry["value"] for entry in entries}
@@ -284,7 +284,7 @@ class _Proof:
         return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
     def done(self, function: Callable[..., Any], tasks: Sequence[Task], results: str) -> list[Any]:
-        """What a function finds for each task; one experiment after the other, so that a worker builds each once."""
+        """Results of a function for each task; one experiment after the other, so that a worker builds each once."""
         order = sorted(range(len(tasks)), key=lambda i: str(tasks[i].arguments["experiment"]))
         folder, report = self.folder / results, self.progress.report_parts_done
         found = run_tasks(function, [tasks[i] for i in order], folder, self.workers, report)
@@ -377,7 +377,7 @@ def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> blin
 
 @dataclass(frozen=True)
 class _ExperimentVariation:
-    """How an experiment of a blind validation differs from its configuration."""
+    """Changes of an experiment of a blind validation relative to its configuration."""
 
     case_fraction: float
     description: str

@@ -169,7 +169,7 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
 
 
 def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
-    """What the initial parameters make of every recording that is estimated on, or what was recorded alone."""
+    """Animations of every estimation recording with the initial parameters, or of the recording alone."""
     scenes = []
     for i, episode in enumerate(problem.episodes):
         shared = problem.theta_and_initial_state_deviation(problem.initial_unknowns, i)[0]

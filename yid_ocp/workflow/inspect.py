@@ -131,7 +131,7 @@ run_from_arguments = command_with_settings(_run_inspect, "entries", "export")
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint:
-    """Where the first recording starts: at rest at its first posture, or as fitted to its first points."""
+    """Start of the first recording: at rest in its first configuration, or fitted to its first points."""
     system, sizes = step.system, step.sizes
     theta = system.parameters.vector()
     known = np.zeros(len(system.driven) + len(system.prescribed))

@@ -157,7 +157,7 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
 
 
 def _name_requested_folder(error: YidError, target: Path, *hidden: Path) -> None:
-    """Let an error name the folder that was asked for, where it names a hidden one, which its reader does not know."""
+    """Let an error name the requested folder instead of the hidden one."""
     for path in map(str, hidden):
         if path in error.what + error.where:
             error.what, error.where = (text.replace(path, str(target)) for text in (error.what, error.where))

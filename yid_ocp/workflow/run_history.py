@@ -400,7 +400,7 @@ def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple
 def _overlaid_motions(
     folders: Sequence[Path], labels: Sequence[str], found: Sequence[Mapping[str, Any]]
 ) -> list[Animation]:
-    """Motions of both runs' models beside what was measured; none where a model or recording can no longer be read."""
+    """Motions of both runs' models and the measured one; none where a model or recording can no longer be read."""
     told: dict[str, list[ConfigurationTrajectory]] = {}
     try:
         runs = [load_config(folder / "config.yaml") for folder in folders]

@@ -1,4 +1,4 @@
-"""What a run reads: its files, recordings and plug-ins, and where its settings stand in messages."""
+"""Inputs of a run: files, recordings and plug-ins, and the place of its settings in messages."""
 
 from __future__ import annotations
 

@@ -214,7 +214,7 @@ def read_bag(
 
 
 def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> base.FilePreview:
-    """What a bag holds: its topics, what they would become, and units that their values look like."""
+    """Preview of a bag: topics, the channels that they become, and likely units."""
     path = Path(path)
     file_sha256(path)
     bag = _contents(path, None, progress)
@@ -313,7 +313,7 @@ def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
-    """What is needed of a message, in Python's types: a bag brings definitions of its own, which may be damaged."""
+    """The needed fields of a message as Python types; a bag's own definitions may be damaged."""
     if kind in JOINT_MESSAGE_TYPES:
         return joint_values_of_message(content, kind)
     frame = str(content.header.frame_id)

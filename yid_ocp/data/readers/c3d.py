@@ -67,7 +67,7 @@ def read_c3d(
 
 @base.FILE_PREVIEWERS.register(".c3d")
 def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
-    """What a C3D file holds; errors as `read_c3d`."""
+    """Preview of a C3D file; errors as `read_c3d`."""
     path = Path(path)
     file_sha256(path)
     found = _markers(path)
@@ -126,7 +126,7 @@ def _markers(path: Path) -> _Markers:
 
 
 def _complaint(path: Path) -> str:
-    """What the library says against a file; it may end its process, too."""
+    """Error of the library for a file; it may end its process, too."""
     import ezc3d
 
     try:

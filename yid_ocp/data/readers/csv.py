@@ -107,7 +107,7 @@ def _mocap_table(path: Path) -> tuple[PointGroup, str, tuple[str, ...]] | None:
 
 
 def _delimiter(path: Path) -> str:
-    """What stands between the cells of the first line that has several; a comma where nothing does."""
+    """Delimiter of the first line with several cells; a comma where nothing does."""
     _, first = next(_rows(path, ","), (1, []))
     return next((mark for mark in "\t; " if mark in first[0].strip()), ",") if len(first) == 1 else ","
 
@@ -163,7 +163,7 @@ def _mounted_sensors(
 
 
 def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
-    """What a table holds: columns, what their names say, and units that its values look like."""
+    """Preview of a table: columns, their meanings, and likely units."""
     path = Path(path)
     file_sha256(path)
     if (capture := _mocap_table(path)) is not None:

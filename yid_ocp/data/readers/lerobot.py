@@ -42,7 +42,7 @@ class _Feature(BaseModel):
 
 
 class _Info(BaseModel):
-    """What is read of `meta/info.json`."""
+    """The used fields of `meta/info.json`."""
 
     codebase_version: str
     fps: float = Field(gt=0, allow_inf_nan=False)
@@ -54,7 +54,7 @@ class _Info(BaseModel):
 
 
 class _Dataset(NamedTuple):
-    """A dataset's folder and what its `meta/info.json` says."""
+    """A dataset's folder and its `meta/info.json`."""
 
     folder: Path
     info: _Info
@@ -100,7 +100,7 @@ def read_lerobot_episode(
 
 @base.FILE_PREVIEWERS.register("LeRobot dataset")
 def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
-    """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot_episode`."""
+    """Preview of a LeRobot dataset, by its first episode; errors as `read_lerobot_episode`."""
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
     names, channels, left = _channels(dataset, table)

@@ -1,4 +1,4 @@
-"""What a kind of flexible object says about itself: settings, geometry, refinement, clamps and `init` templates."""
+"""Interface of a kind of flexible object: settings, geometry, refinement, clamps and `init` templates."""
 
 from __future__ import annotations
 
