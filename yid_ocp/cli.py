@@ -20,7 +20,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
@@ -85,6 +84,12 @@ def _working(parser: argparse.ArgumentParser, absent: str = "as many as there ar
     parser.add_argument("--workers", metavar="N", type=int, help=text)
     text = "HOST:PORT of a Dask scheduler, or its scheduler file, whose workers do the work instead"
     parser.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
+
+
+def _solve(parser: argparse.ArgumentParser) -> None:
+    _doubting(parser, optional=True)
+    text = "show cost and parameters in a table that the terminal renews while it fits; without a terminal nothing"
+    _switch(parser, "--live", text)
 
 
 def _diagnose(parser: argparse.ArgumentParser) -> None:
@@ -321,7 +326,7 @@ COMMANDS = tuple(
     _CliCommand(*row)
     for row in (
         ("init", "write a commented configuration from a robot and recordings of it", "init", _init),
-        ("solve", "estimate the free parameters from recordings", "solve", partial(_doubting, optional=True)),
+        ("solve", "estimate the free parameters from recordings", "solve", _solve),
         ("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
         ("identifiability", _SAID_IDENTIFIABILITY, "identifiability", _identifiability),
         ("friction", "say which law of friction the recordings warrant", "friction", _doubting),

@@ -7,15 +7,20 @@ import io
 import math
 import re
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from heard import Heard
 from rich.progress import Progress as Bars
 
+from yid_ocp.cli import main
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.report.terminal import SummaryStatement
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow import command_runner
+from yid_ocp.workflow.solve import _iterate_logger
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
 
@@ -158,6 +163,41 @@ def test_a_terminal_renews_one_line_of_iterations_and_a_table_of_results(monkeyp
     assert "effects" in said
     assert "a9@x" in said
     assert "a10@x" not in said
+
+
+def fake_problem(*names: str) -> SimpleNamespace:
+    parameters = {name: SimpleNamespace(unit="N m/rad") for name in names}
+    return SimpleNamespace(shared_parameters=names, system=SimpleNamespace(parameters=parameters))
+
+
+def test_a_live_fit_shows_cost_and_the_courses_of_parameters_those_that_move_first(tmp_path):
+    heard, folder = Heard(), SimpleNamespace(log_event=lambda *_, **__: None)
+    for is_live in (False, True):
+        iterate = _iterate_logger(fake_problem("still", "moving"), folder, heard, is_live)
+        for k, (cost, value) in enumerate([(100.0, 1.0), (10.0, 4.0), (1.0, 5.0)]):
+            iterate(replace(ENTRY, iteration=k, cost=cost, x=np.array([2.0, value, 99.0])))
+        if not is_live:
+            assert heard.table == []
+    head, *rows = heard.table
+    assert head[1:4] == ("start", "now", "last step")
+    assert rows[0] == ("cost", "100", "1", "-9", "", "█▂▁")
+    assert rows[1] == ("moving", "1", "5", "+1", "N m/rad", "▁▆█")
+    assert rows[2] == ("still", "2", "2", "+0", "N m/rad", "▁▁▁")
+
+
+def test_a_live_solve_is_shown_on_a_terminal_and_nowhere_else(pendulum, monkeypatch, capsys, tmp_path):
+    settings = ["--set", "output={write_report: false}", "--set", "output.discretisation_check_mode=none"]
+    assert main(["solve", str(pendulum), "--live", *settings, "--out", str(tmp_path / "lines")]) == 0
+    assert "last step" not in capsys.readouterr().err
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(command_runner, "_MAX_TABLE_ROWS", 2)
+    update = Bars.update
+    monkeypatch.setattr(Bars, "update", lambda self, task, **what: update(self, task, refresh=True, **what))
+    assert main(["solve", str(pendulum), "--live", *settings, "--out", str(tmp_path / "bars")]) == 0
+    said = sys.stderr.getvalue()
+    assert "last step" in said
+    assert "\ncost " in said
 
 
 def test_lines_have_no_control_characters(capsys, clock):

@@ -30,20 +30,23 @@ from yid_ocp.workflow.command_runner import CommandOutcome, command_with_setting
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
 _RESULT_FORMAT = "yid-solve/1"
+_BARS, _SPARKLINE_WIDTH = "▁▂▃▄▅▆▇█", 24
 
 
 def run_solve(
-    run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
+    run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS, is_live: bool = False
 ) -> CommandOutcome[Solution]:
     """Estimate, validate and write the run folder; successful where the solver converged.
 
-    Where it failed the run folder holds the reason and the best point.
+    Where it failed the run folder holds the reason and the best point. `is_live`: report a table of cost and parameters
+    at every iterate, which a terminal renews.
     """
     with atomic_run_folder(run, out) as folder:
         folder.record_run_start(run, "solve")
         progress.begin_stage("building the model and its compiled step", ahead=20.0)
         problem = build_problem(run)
-        solution = solve(problem, run.solver, callback=_iterate_logger(problem, folder, progress), progress=progress)
+        log_iterate = _iterate_logger(problem, folder, progress, is_live)
+        solution = solve(problem, run.solver, callback=log_iterate, progress=progress)
         problem, checks = solution.problem or problem, solution.checks or EstimateChecks()
         held_out = checks.held_out_predictions
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
@@ -66,7 +69,7 @@ def run_solve(
     return CommandOutcome(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 
-run_from_arguments = command_with_settings(run_solve)
+run_from_arguments = command_with_settings(run_solve, "live")
 
 
 def solve_and_decide_cable_memory(
@@ -79,15 +82,42 @@ def solve_and_decide_cable_memory(
     return choose_cable_memory_fit(problem, run.solver, found, limits)
 
 
-def _iterate_logger(problem: EstimationProblem, folder: RunFolder, progress: Progress) -> IterationCallback:
-    """Callback that writes every iterate to the run folder's log and reports it."""
+def _iterate_logger(
+    problem: EstimationProblem, folder: RunFolder, progress: Progress, is_live: bool = False
+) -> IterationCallback:
+    """Callback that writes every iterate to the run folder's log and reports it, with a table if `is_live`."""
+    iterates: list[Iterate] = []
 
     def iterate(entry: Iterate) -> None:
         values = {name: float(value) for name, value in zip(problem.shared_parameters, entry.x, strict=False)}
         folder.log_event("iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient_norm, x=values)
         progress.report_iterate(entry)
+        if is_live:
+            iterates.append(entry)
+            progress.report_table(_iterate_table(problem, iterates))
 
     return iterate
+
+
+def _iterate_table(problem: EstimationProblem, iterates: Sequence[Iterate]) -> list[Sequence[str]]:
+    """Cost and parameters: start, now, last step and course; parameters that moved most in the last step come first."""
+    courses = {name: [float(entry.x[i]) for entry in iterates] for i, name in enumerate(problem.shared_parameters)}
+    steps = {name: own[-1] - own[-2] if len(own) > 1 else 0.0 for name, own in courses.items()}
+    ordered = sorted(courses, key=lambda name: -abs(steps[name]) / max(abs(courses[name][-1]), 1e-12))
+    costs = [entry.cost for entry in iterates]
+    last = costs[-1] - costs[-2] if len(costs) > 1 else 0.0
+    rows = [("cost", "", costs, last), *((n, problem.system.parameters[n].unit, courses[n], steps[n]) for n in ordered)]
+    table: list[Sequence[str]] = [("moves most first", "start", "now", "last step", "unit", "course")]
+    for name, unit, own, step in rows:
+        table.append((name, f"{own[0]:.5g}", f"{own[-1]:.5g}", f"{step:+.2g}", unit, _sparkline(own)))
+    return table
+
+
+def _sparkline(values: Sequence[float]) -> str:
+    """The last values as a row of bars between their least and largest."""
+    shown = values[-_SPARKLINE_WIDTH:]
+    low, high = min(shown), max(shown)
+    return "".join(_BARS[round((len(_BARS) - 1) * (value - low) / ((high - low) or 1.0))] for value in shown)
 
 
 def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
