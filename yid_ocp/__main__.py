@@ -1,4 +1,4 @@
-"""`python -m yid_ocp` is `yid-ocp`."""
+"""Run `yid-ocp` as `python -m yid_ocp`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""NumPy arrays by what they hold: numbers, whole numbers or truth values."""
+"""Types of NumPy arrays of numbers, whole numbers or truth values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line: the table of commands, their arguments and their completion by a shell.
+"""The command line: commands, their arguments and shell completion.
 
 `workflow` implements the commands. A command's module is imported when it runs, so that help needs none of the
 libraries for numbers.
@@ -378,7 +378,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_argument_parser() -> argparse.ArgumentParser:
-    """Return the argument parser of all commands; invalid arguments raise `ConfigError`."""
+    """Build the argument parser of all commands. Invalid arguments raise `ConfigError`."""
     from yid_ocp import __version__
 
     top = _Parser(prog="yid-ocp", description="Stiffness of flexible objects from robot recordings.")

@@ -1,4 +1,4 @@
-"""Display of objects in one line and in notebooks, and progress reports of long computations"""
+"""Show objects in one line and in notebooks, and report progress of long computations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ReprLineAndTableRows:
 
 
 class ReprMixin:
-    """Mixin that makes `__repr__` and a notebook table from the method `_summary`; a dataclass needs `repr=False`."""
+    """Mixin that makes `__repr__` and a notebook table from `_summary`. A dataclass requires `repr=False`."""
 
     def _summary(self) -> ReprLineAndTableRows:
         raise NotImplementedError
@@ -47,12 +47,12 @@ def _row(cells: Sequence[str], kind: str) -> str:
 
 
 def count_with_noun(number: int, noun: str) -> str:
-    """A number with its noun, such as `1 joint` and `2 joints`."""
+    """Format a number with its noun, such as `1 joint` and `2 joints`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 class Progress:
-    """Base class of receivers of progress reports, called by one thread at a time; it ignores all reports."""
+    """Base class of receivers of progress reports, called by one thread at a time. It ignores all reports."""
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Report that a new stage of the work begins.
@@ -62,13 +62,13 @@ class Progress:
         """
 
     def report_iterate(self, entry: Any) -> None:
-        """Report the point that a search accepted, a `solvers.base.Iterate`."""
+        """Report the iterate that a search accepted, a `solvers.base.Iterate`."""
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
+        """Report that `done` of `total` parts of the stage are finished. `text` names the last or next one."""
 
     def report_table(self, rows: Sequence[Sequence[str]]) -> None:
-        """Report a table of all results so far, header first, then best first; it replaces the previous table."""
+        """Report a table of all results so far, header first, then best first. It replaces the previous table."""
 
 
 NULL_PROGRESS = Progress()
@@ -90,14 +90,14 @@ class LoggingProgress(Progress):
 
 
 class PartsDoneCounter:
-    """Thread-safe counter of a stage's `total` parallel parts; reports every count, the first with the text `first`."""
+    """Thread-safe counter of a stage's `total` parallel parts. It reports every count, the first one with `first`."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()
         progress.report_parts_done(0, total, first)
 
     def count_done(self, text: str, table: Callable[[], Sequence[Sequence[str]]] | None = None) -> None:
-        """Report one more finished part, with the table of results if there is one; may be called from any thread."""
+        """Report one more finished part, and the table of results if given. Any thread may call it."""
         with self._lock:
             self._count += 1
             self._progress.report_parts_done(self._count, self._total, text)

@@ -1,4 +1,4 @@
-"""Exceptions of the package: each states what is wrong, where, what is allowed and what to do."""
+"""Exceptions of the package. Each states what is wrong, where, what is allowed and what to do."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 
 class YidError(Exception):
-    """An error that the user can correct: what is wrong in one clause, where, what is allowed, and what to do next.
+    """An error that the user can correct. It states what is wrong, where, what is allowed and what to do next.
 
     As text it has all four parts, at most 600 characters together, with control characters as escapes.
     """
@@ -20,7 +20,7 @@ class YidError(Exception):
         super().__init__(what)
 
     def four_parts(self) -> dict[str, str]:
-        """The error's what, where, allowed and hint as the user sees them; missing parts have general texts."""
+        """What, where, allowed and hint of the error as the user sees them. Missing parts have general texts."""
         said = {
             "what": self.what,
             "where": self.where or "the command as it was given",
@@ -40,20 +40,20 @@ class YidError(Exception):
 
 
 class ConfigError(YidError):
-    """The configuration file, or a value set on top of it, is invalid."""
+    """Raised when the configuration file, or a value set on top of it, is invalid."""
 
     _usual_allowed = "keys and values as docs/reference/settings.md lists them"
 
 
 class DataError(YidError):
-    """A recording or another input file is missing, malformed or does not fit the model."""
+    """Raised when a recording or another input file is missing, malformed or does not fit the model."""
 
     _usual_allowed = "a whole file as docs/reference/recordings.md describes it"
     _usual_hint = "correct the file, or record it again"
 
 
 class ModelError(YidError):
-    """The mechanical model cannot be built as described."""
+    """Raised when the mechanical model cannot be built as described."""
 
     _usual_allowed = "a model as docs/howto/choosing.md describes it"
     _usual_hint = "correct the robot's file, or the section `model`"
@@ -64,18 +64,18 @@ class SolverError(YidError):
 
 
 class OutputError(YidError):
-    """A result cannot be written to its destination."""
+    """Raised when a result cannot be written to its destination."""
 
     _usual_allowed = "a place of your own on a disk with room"
     _usual_hint = "choose another place with --out"
 
 
 class WorkerError(YidError):
-    """Workers cannot be reached, or cannot do their tasks."""
+    """Raised when workers cannot be reached or cannot do their tasks."""
 
 
 class InsufficientMemoryError(YidError):
-    """The machine has too little memory."""
+    """Raised when the machine has too little memory."""
 
 
 _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
@@ -96,7 +96,7 @@ _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none i
 
 
 def nearest_name_hint(name: str, known: Iterable[str]) -> str:
-    """Hint for an error about an unknown name: the most similar known name, or a list of known names.
+    """Hint for an error about an unknown name. It is the most similar known name, or a list of known names.
 
     It is for errors that do not say what is allowed; beside a list, see `unknown_name_error_arguments`.
     """
@@ -105,7 +105,7 @@ def nearest_name_hint(name: str, known: Iterable[str]) -> str:
 
 
 def unknown_name_error_arguments(name: str, known: Iterable[str]) -> dict[str, str]:
-    """Arguments `allowed` and `hint` for an error about an unknown name; a long list of names is shortened."""
+    """Arguments `allowed` and `hint` for an error about an unknown name. Long lists of names are shortened."""
     names = [str(entry) for entry in known]
     return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}
 

@@ -1,4 +1,4 @@
-"""Reading of files from outside, atomic file writing, hashes of files and data, conversion to JSON and back."""
+"""Safe reading of input files, atomic writing, hashes, and conversion to and from JSON."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MEMORY_OF_READING = 7 << 28  # address space that a library may take to read a 
 
 
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
-    """Return `path` after checks; `DataError` unless it is a regular file of at most `max_bytes` bytes.
+    """Check an input file and return its path. `DataError` unless it is a regular file of at most `max_bytes` bytes.
 
     Pipes, devices and what never ends are refused before anything is read. Every file that the package did not write or
     ship is opened after this check.
@@ -58,7 +58,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 @contextlib.contextmanager
 def limited_memory() -> Iterator[None]:
-    """Context manager that limits this process to 1.75 GiB of memory beyond its present use; on Linux only.
+    """Limit this process to 1.75 GiB of memory beyond its present use (context manager, Linux only).
 
     It is for libraries that unpack what a file from outside holds; what is more becomes a MemoryError.
     """
@@ -87,7 +87,7 @@ def check_max_input_numbers(count: int, where: str) -> None:
 
 
 def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Text of an input file; `DataError` as in `check_input_file`, or if the file is not UTF-8 text."""
+    """Read an input file as text. `DataError` as in `check_input_file`, or if it is not UTF-8 text."""
     check_input_file(path, max_bytes)
     try:
         return path.read_text(encoding="utf-8")
@@ -98,7 +98,7 @@ def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_input_json(path: Path) -> Any:
-    """Data of a JSON input file; `DataError` as in `read_input_text`, or if the text is not valid JSON."""
+    """Read a JSON input file. `DataError` as in `read_input_text`, or if it is not valid JSON."""
     text = read_input_text(path)
     try:
         return json.loads(text)
@@ -109,7 +109,7 @@ def read_input_json(path: Path) -> Any:
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Context manager that writes a file atomically: the yielded temporary file replaces `path` on success.
+    """Write a file atomically (context manager). The yielded temporary file replaces `path` on success.
 
     `OutputError` where the folder is missing or the file cannot be written.
     """
@@ -132,18 +132,18 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically; errors as `atomic_write`."""
+    """Write a UTF-8 text file atomically. Errors are as in `atomic_write`."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_strict_json(path: Path, data: Any) -> None:
-    """Write plain data as a JSON file, atomically; ValueError for infinity and NaN, else errors as `atomic_write`."""
+    """Write plain data as JSON atomically. ValueError for infinity and NaN, else errors as in `atomic_write`."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Path:
-    """Make a folder and its missing parents and return its path; `OutputError` if that fails."""
+    """Make a folder with its missing parents. `OutputError` if that fails."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -153,12 +153,12 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
 
 
 def is_file(path: Path) -> bool:
-    """Whether the path is an existing file; False also for names that are too long or invalid."""
+    """Whether the path is an existing file. False also for names that are too long or invalid."""
     return os.path.isfile(path)
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, or of all files in a folder by name, in hexadecimal; `DataError` if unreadable."""
+    """SHA-256 of a file, or of a folder's files by name, in hexadecimal digits. `DataError` if unreadable."""
     digest = hashlib.sha256()
     for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
         with check_input_file(entry).open("rb") as file:
@@ -168,12 +168,12 @@ def file_sha256(path: Path) -> str:
 
 
 def json_sha256(data: Any) -> str:
-    """SHA-256 of plain data as JSON, independent of key order; 64 hexadecimal digits."""
+    """SHA-256 of plain data as JSON, 64 hexadecimal digits. The order of keys does not matter."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def to_json_types(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
-    """A value converted to JSON types; numbers that are not finite become None, with a line in `notes`."""
+    """Convert a value to JSON types. Numbers that are not finite become None, with a line in `notes`."""
     if isinstance(value, Mapping):
         return {str(k): to_json_types(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
@@ -188,7 +188,7 @@ def to_json_types(value: Any, notes: list[str] | None = None, path: str = "") ->
 
 
 def to_lossless_plain_data(value: Any) -> Any:
-    """Nested dataclasses, containers and arrays as JSON data without loss; NaN and infinities become text."""
+    """Convert nested dataclasses, containers and arrays to JSON data. NaN and infinities become text."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {entry.name: to_lossless_plain_data(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
@@ -203,18 +203,18 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 
 def named_attributes(value: Any, names: str) -> dict[str, Any]:
-    """Dict of the attributes in the blank-separated list `names`; `key=name` stores an attribute under `key`."""
+    """Collect the attributes in the blank-separated list `names`. `key=name` stores one under `key`."""
     pairs = [name.partition("=") for name in names.split()]
     return {key: getattr(value, name or key) for key, _, name in pairs}
 
 
 def object_attributes_to_json_dict(value: Any, names: str) -> dict[str, Any]:
-    """Dict of an object's attributes as JSON data; `names` as for `named_attributes`."""
+    """Collect an object's attributes as JSON data. `names` is as for `named_attributes`."""
     return dict(to_json_types(named_attributes(value, names)))
 
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
-    """Dataclass instance restored from the data that `to_lossless_plain_data` returned."""
+    """Restore a dataclass instance from the data that `to_lossless_plain_data` returned."""
     return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})
 
 
@@ -244,6 +244,6 @@ def _value(hint: Any, value: Any) -> Any:
 
 
 def os_error_reason(error: Exception) -> str:
-    """Text with the reason of an operating system's or HDF5 error."""
+    """Text of the reason of an operating system's or HDF5 error."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error).strip("'\"")

@@ -1,4 +1,4 @@
-"""Signals that end a command: re-raise those that libraries suppress, and finally kill the process."""
+"""Handle signals that end a command: re-raise those that libraries suppress, and finally kill the process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TERMINATION_SIGNALS = [number for number in signal.Signals if number.name in ("
 
 
 class InterruptedBySignal(KeyboardInterrupt):
-    """Exception raised when a signal ends the command."""
+    """Raised when a signal ends the command."""
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(signal.Signals(signal_number).name)
@@ -39,19 +39,19 @@ _STATE = _State()
 
 
 def received_signal_number() -> int | None:
-    """Number of the signal that requested the command's end; None if there was none."""
+    """Number of the signal that requested the command's end. None if there was none."""
     return _STATE.asked
 
 
 def raise_if_requested() -> None:
-    """Raise `InterruptedBySignal` if a signal requested the command's end, for libraries that suppressed it."""
+    """Raise `InterruptedBySignal` if a signal requested the command's end but a library suppressed it."""
     if _STATE.asked is not None:
         raise InterruptedBySignal(_STATE.asked)
 
 
 @contextlib.contextmanager
 def defer_interruption() -> Iterator[None]:
-    """Context manager that delays the handling of termination signals until its short block has ended."""
+    """Delay the handling of termination signals until a short block has ended (context manager)."""
     _STATE.deferring += 1
     before = _STATE.asked
     try:
@@ -64,7 +64,7 @@ def defer_interruption() -> Iterator[None]:
 
 @contextlib.contextmanager
 def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
-    """Context manager that removes a folder if the process is killed during its block."""
+    """Remove a folder if the process is killed during a block (context manager)."""
     _STATE.unfinished.add(folder)
     try:
         yield
@@ -74,7 +74,7 @@ def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def raise_on_signals() -> Iterator[None]:
-    """Context manager that raises `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during its block.
+    """Raise `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during a block (context manager).
 
     An exception can get lost: in what collects garbage, in callbacks of libraries, in a call that does not come back.
     So it is raised again every `_RERAISE_INTERVAL` seconds, and after `_FORCED_EXIT_DELAY` seconds the process is ended

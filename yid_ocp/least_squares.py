@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for dense least-squares problems of some dozen coordinates: initial states and shapes of chains.
+"""Levenberg-Marquardt method for dense least-squares problems of some dozen coordinates, such as chain shapes.
 
 Measured against SciPy's: docs/design/solvers.md.
 """
@@ -19,14 +19,14 @@ _MAX_STEP = 0.5  # by which a component moves at most in one step
 
 @dataclass(frozen=True)
 class LocalQuadraticModel:
-    """Quadratic model of a cost about one point: value, gradient (n,), positive definite Hessian (n, n) there."""
+    """Quadratic model of a cost about one point: value, gradient (n,), positive definite Hessian (n, n)."""
 
     cost: float
     gradient: Array
     hessian: Array
 
     def damped_step(self, damping: float) -> Array:
-        """The step that minimises the model with Levenberg-Marquardt damping, shape (n,)."""
+        """Step that minimises the model with Levenberg-Marquardt damping, shape (n,)."""
         damped = self.hessian + damping * np.diag(np.diag(self.hessian))
         return np.asarray(-np.linalg.solve(damped, self.gradient))
 
@@ -62,7 +62,7 @@ def levenberg_marquardt(
     initial_guess: Array,
     projection: Callable[[Array], Array] = lambda x: x,
 ) -> _Minimum[_SumOfSquares]:
-    """Return the minimum of |r(x)|^2 by Gauss-Newton steps; the damping is scaled by the Jacobian's column norms.
+    """Minimise |r(x)|^2 by Gauss-Newton steps. The damping is scaled by the Jacobian's column norms.
 
     The residual function gives r (m,) and its Jacobian (m, n); a projection brings a trial point back to where it may
     be.
@@ -88,7 +88,7 @@ def minimize_by_damped_newton(
     cost_tolerance: float = 1e-10,
     min_damping: float = 1e-9,
 ) -> _Minimum[_Model]:
-    """Return the minimum of a cost by damped Newton steps on the local models that `model_at` returns.
+    """Minimise a cost by damped Newton steps on the local models that `model_at` returns.
 
     It has converged when no component would move by more than `step_tolerance`, or when the cost falls by less than the
     part `cost_tolerance`. No step is damped less than `min_damping`: some damping keeps a search on a robust cost from

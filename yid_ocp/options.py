@@ -1,4 +1,4 @@
-"""Annotations of options (dataclass fields that users may set), from which keys, descriptions and checks follow.
+"""Annotations of options that users may set. Keys, descriptions and checks follow from them.
 
 An option is a field of a frozen dataclass, annotated with its bounds and with `OptionInfo`:
 
@@ -35,7 +35,7 @@ _TYPE_WORDS = {float: "a number", int: "a whole number", bool: "true or false", 
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """Annotation of an option: its meaning and SI unit; `is_path` for files, relative to the configuration."""
+    """Meaning and SI unit of an option, as its annotation. `is_path` is for files, relative to the configuration."""
 
     description: str = ""
     unit: str = ""
@@ -44,7 +44,7 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """Annotation of a type: the setting names a registered class, under `selector_key` or as a mapping entry's key."""
+    """Annotation of a type whose setting names a registered class, under `selector_key` or as a mapping entry's key."""
 
     registry: Registry[Any]
     default_name: str = ""
@@ -53,7 +53,7 @@ class RegistryChoice:
 
 @dataclass(frozen=True)
 class Option:
-    """An option's annotated type, default (`MISSING` where there is none) and dataclass field name."""
+    """Annotated type, default (`MISSING` where there is none) and dataclass field name of an option."""
 
     type_hint: Any
     default_value: Any
@@ -62,7 +62,7 @@ class Option:
 
 @functools.cache
 def dataclass_options(kind: type) -> Mapping[str, Option]:
-    """Options of a dataclass by key, which is the field's name without a trailing `_`."""
+    """Options of a dataclass by key. A key is the field's name without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
     found = {}
     for entry in dataclasses.fields(kind):
@@ -74,7 +74,7 @@ def dataclass_options(kind: type) -> Mapping[str, Option]:
 
 
 def split_annotated(hint: Any) -> tuple[Any, list[Any]]:
-    """A type without its `Annotated` metadata, and the metadata."""
+    """Split a type into the type without `Annotated` metadata and the metadata."""
     markers: list[Any] = []
     while get_origin(hint) is Annotated:
         markers += hint.__metadata__
@@ -83,7 +83,7 @@ def split_annotated(hint: Any) -> tuple[Any, list[Any]]:
 
 
 def union_members(hint: Any) -> tuple[Any, ...]:
-    """Member types of a union, without None; the type itself where it is not a union."""
+    """Member types of a union, without None. Another type is its own only member."""
     bare, _ = split_annotated(hint)
     if get_origin(bare) in (Union, types.UnionType):
         return tuple(member for member in get_args(bare) if member is not type(None))
@@ -91,20 +91,20 @@ def union_members(hint: Any) -> tuple[Any, ...]:
 
 
 def mapping_value_type(hint: Any) -> Any:
-    """Value type of a mapping; None for other types."""
+    """Value type of a mapping. None for other types."""
     found = (split_annotated(member)[0] for member in union_members(hint))
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
 def variadic_tuple_entry_type(hint: Any) -> Any:
-    """Entry type of a tuple of any length; None for other types."""
+    """Entry type of a tuple of any length. None for other types."""
     bare, _ = split_annotated(hint)
     arguments = get_args(bare)
     return arguments[0] if get_origin(bare) is tuple and arguments[-1] is Ellipsis else None
 
 
 def describe_type(hint: Any) -> str:
-    """Description of a type with its range and unit, for messages."""
+    """Describe a type with its range and unit for messages."""
     bare, markers = split_annotated(hint)
     unit = next((marker.unit for marker in markers if isinstance(marker, OptionInfo) and marker.unit), "")
     limits = [
@@ -136,7 +136,7 @@ def _words(hint: Any) -> str:
 
 
 def check_option_bounds(options: Any, where: str) -> None:
-    """Raise `ConfigError` if a number in an options dataclass is outside its annotated bounds."""
+    """Raise `ConfigError` if a number in an options dataclass is out of its annotated bounds."""
     kind: Any = type(options)
     for name, option in dataclass_options(kind).items():
         value = getattr(options, option.field_name)

@@ -11,14 +11,14 @@ _Entry = TypeVar("_Entry")
 
 
 class Registry(Generic[_Entry]):
-    """A table from name to implementation, filled by decorators; `entry_noun` names an entry in error messages."""
+    """A table from name to implementation, filled by decorators. `entry_noun` names an entry in error messages."""
 
     def __init__(self, entry_noun: str) -> None:
         self.entry_noun = entry_noun
         self._entries: dict[str, _Entry] = {}
 
     def register(self, name: str) -> Callable[[_Entry], _Entry]:
-        """A decorator that registers its argument under `name`."""
+        """Make a decorator that registers its argument under `name`."""
 
         def enter(entry: _Entry) -> _Entry:
             if name in self._entries:

@@ -14,7 +14,7 @@ _NUMERICAL_PACKAGES = ("casadi", "numpy", "scipy", "h5py")  # whose versions are
 
 
 def package_version() -> str:
-    """Version of this package; `0+unknown` where it is not installed."""
+    """Version of this package. It is `0+unknown` where the package is not installed."""
     return _version("yid-ocp", "0+unknown")
 
 
@@ -25,7 +25,7 @@ def installed_versions() -> dict[str, str]:
 
 
 def folder_source_hash(folder: Path) -> str:
-    """SHA-256 of all source files in a folder and its subfolders; 64 hexadecimal digits."""
+    """SHA-256 of all source files in a folder and its subfolders, 64 hexadecimal digits."""
     digest = hashlib.sha256()
     for file in sorted(path for path in folder.rglob("*") if path.suffix in _SOURCE_SUFFIXES):
         content = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -35,7 +35,7 @@ def folder_source_hash(folder: Path) -> str:
 
 @functools.cache
 def package_source_hash() -> str:
-    """SHA-256 of this package's source files as they were at the first call in this process; 64 hexadecimal digits."""
+    """SHA-256 of this package's source files at the first call in this process, 64 hexadecimal digits."""
     return folder_source_hash(Path(__file__).parent)
 
 
@@ -47,7 +47,7 @@ def software_fingerprint() -> dict[str, str]:
 
 
 def software_fingerprint_differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
-    """Descriptions of the entries in which two fingerprints differ."""
+    """Describe the entries in which two fingerprints differ."""
     length = {"code": 12}
     return [
         f"{name} {there.get(name, 'unknown')[: length.get(name)]} instead of {value[: length.get(name)]}"

@@ -1,4 +1,4 @@
-"""Offset and drift of point clocks relative to the joint clock, and checks of a fit's residuals.
+"""Check point clocks for offset and drift relative to the joint clock, also by a fit's residuals.
 
 A point that is seen at the stamp t is where it was at t - late - drift (t - middle), so that to first order
 
@@ -172,14 +172,14 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severit
 
 
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
-    """Advice on how to correct time stamps t that are `late` [s] at t = `middle` and drift by the fraction `drift`."""
+    """Advise how to correct time stamps t that are `late` [s] at t = `middle` and drift by the fraction `drift`."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
 def search_clock_offset_and_drift(
     path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
-    """Clock offset [s] and relative drift at which points lie nearest to a path, found by a coarse-to-fine search.
+    """Search, coarse to fine, the clock offset [s] and relative drift at which points lie nearest to a path.
 
     The path is known from the first to the last of `knots` [s]; points `seen` (N, np, 3) [m] at the times `t` (N,).
     With `drifts` the clock may run apart as well, by up to `_MAX_DRIFT`.
@@ -211,7 +211,7 @@ def search_clock_offset_and_drift(
 
 
 def drift_and_overstated_noise_issues(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
-    """New data-quality issues found in the residuals of a fit: drifting clocks and overstated noise.
+    """Find drifting clocks and overstated noise in the residuals of a fit.
 
     A constant offset of a camera's clock looks like damping that the model lacks; to tell the two is a diagnosis's task
     (effect `camera_latency`). One that grows over a recording is a clock's.

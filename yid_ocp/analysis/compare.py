@@ -1,4 +1,4 @@
-"""Comparison of estimation methods on one problem, and with the source paper."""
+"""Compare estimation methods on one problem, and with the results of Caldwell et al. (2014)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class _MethodResult:
 
 @dataclass(frozen=True)
 class MethodComparison:
-    """Results of all estimation methods on one problem, and their disagreements on identifiable parameters."""
+    """Results of all estimation methods on one problem, with disagreements on identifiable parameters."""
 
     method_results: tuple[_MethodResult, ...]
     reference_method: str  # of the lowest cost, with which the others are compared
@@ -259,7 +259,7 @@ def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[f
 def explain_paper_estimates(
     experiment: str, estimates: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """One sentence for each published estimate of an experiment (`PAPER_ESTIMATES`) on why it differs from ours.
+    """Explain in a sentence why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours.
 
     `estimates` are those of the parameters from recordings of such an experiment, `truth` their values where known.
     Empty where the model does not explain the recordings. The reason, judged by synthetic recordings, is the first of
@@ -308,7 +308,7 @@ def _discrepancy(experiment: str, name: str, entry: ParameterEstimate, truth: fl
 
 
 def is_within_ensemble_range(published: float, values: Sequence[float]) -> bool:
-    """Whether a published estimate lies in the range of an ensemble's estimates, with a margin at a zero bound."""
+    """Whether a published estimate lies in an ensemble's range of estimates. A zero bound has a margin."""
     return min(values) - _ZERO_BOUND_FRACTION * max(values) <= published <= max(values)
 
 

@@ -1,4 +1,4 @@
-"""Errors of links and time steps: shift of estimates, natural frequencies, gaps of open grasps, numerical stability."""
+"""Errors from links and time steps: shifted estimates, natural frequencies, open grasps and numerical stability."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _gauss_newton_step_in_finer_model(
 def refitted_residual_at_finer_step(
     fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> Array | None:
-    """Whitened residual at a finer time step after one Gauss-Newton step from the coarse fit x (nx,); None if unknown.
+    """Whitened residual at a finer time step, one Gauss-Newton step from the coarse fit x (nx,). None if unknown.
 
     `at_x` is the coarse evaluation with Jacobian. Beside process noise the weights are the coarse ones.
     """
@@ -143,7 +143,7 @@ def refitted_residual_at_finer_step(
 
 
 def time_step_for_motion(problem: EstimationProblem) -> float:
-    """Return the longest time step [s] whose error is small beside what a prediction at the initial unknowns leaves.
+    """Find the longest time step [s] whose error is small beside the prediction residual at the initial unknowns.
 
     From 20 ms on it is halved, at most five times, until half of it changes the prediction of the recordings to
     estimate on by at most 3 % of its residual or of the noise, whichever is more (root mean squares, whitened). A guess
@@ -211,7 +211,7 @@ def measure_discretisation_shifts(
     *,
     model_difference_only: bool = False,
 ) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
-    """Shifts of the estimates when every link is divided in two and when the time step is halved.
+    """Measure how estimates shift when every link is divided in two and when the time step is halved.
 
     Of every shared free parameter, none where nothing was tried; and why something that was asked for is not known.
     `x`, shape (nx,), is the estimate, `at_x` its evaluation with Jacobian; `model_difference_only` for other points.
@@ -263,7 +263,7 @@ def inflate_estimates_by_discretisation(
     found: Mapping[str, EstimateShiftByLinksAndTimeStep],
     sizes: Mapping[str, float],
 ) -> dict[str, ParameterEstimate]:
-    """Estimates whose standard deviation, interval and verdict include their discretisation shift.
+    """Include the discretisation shift of estimates in their standard deviations, intervals and verdicts.
 
     A verdict is only ever lowered. `sizes` are typical ones, as in `inference.uncertainty.parameter_verdict`.
     """
@@ -312,7 +312,7 @@ def step_map_natural_frequencies(
     constraint_force: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
 ) -> NaturalFrequencies:
-    """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
+    """Natural frequencies of a system's step map about an equilibrium, from the undamped eigenvalues of A_k.
 
     The driven and prescribed coordinates `configuration` [rad or m] are held still; rest is sought from `guess` (n,).
     The midpoint rule lowers a frequency f to atan(pi f h)/(pi h); the force split affects growth alone.
@@ -346,7 +346,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 
 
 def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
-    """Smallest possible gap [m] of each grasp, by name, with the robot's joints fixed and the object free to bend.
+    """Smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
     `configuration` holds driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
     """
@@ -409,12 +409,12 @@ class AlternatingErrorGrowth:
 
     @property
     def keeps_errors_below_resolution(self) -> bool:
-        """Whether alternating errors grow by at most six decades, so that rounding stays below sensor resolution."""
+        """Whether alternating errors grow by at most six decades. Rounding then stays below sensor resolution."""
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
     @property
     def description(self) -> str:
-        """Sentence that states whether the time step is stable and, if it is not, the remedy."""
+        """State in a sentence whether the time step is stable, with a remedy if it is not."""
         step = f"{self.recording_name}: the step of {self.time_step:g} s is"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along the motion"
@@ -468,7 +468,7 @@ def _alternating_mode_magnitude(
 
 
 def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
-    """Largest alternating error growth of all recordings at x (nx,), up to a failed step; None if none can start."""
+    """Largest alternating error growth of all recordings at x (nx,), up to a failed step. None if none can start."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)

@@ -1,4 +1,4 @@
-"""Estimates of one model from several runs: pooled mean, drift of parameters, and outlier runs.
+"""Compare estimates of one model from several runs: pooled mean, drifting parameters and outlier runs.
 
 For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. Where
 nothing changed, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the
@@ -44,7 +44,7 @@ class RunEstimates(ReprMixin):
 
     @property
     def std(self) -> Array:
-        """Standard deviations of the n parameters, shape (n,)."""
+        """Standard deviations of the parameters, shape (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def _only(self, names: Sequence[str]) -> RunEstimates:
@@ -85,7 +85,7 @@ class _RunOutlierTest:
 
 @dataclass(frozen=True)
 class DriftAndOutlierTests:
-    """Tests of several runs of one model for parameter drift and outlier runs; chi2 is of all differences together."""
+    """Tests of several runs of one model for parameter drift and outlier runs. chi2 is of all differences."""
 
     run_names: tuple[str, ...]
     parameter_drifts: tuple[_ParameterDrift, ...]
@@ -97,7 +97,7 @@ class DriftAndOutlierTests:
 
 
 def nearby_positive_definite_covariance(covariance: Array) -> Array:
-    """A nearby invertible covariance with the same standard deviations; small correlation eigenvalues are raised."""
+    """Raise small correlation eigenvalues until a covariance is invertible. Standard deviations stay the same."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     clipped = (vectors * np.maximum(values, _MIN_CORRELATION_EIGENVALUE)) @ vectors.T
@@ -106,7 +106,7 @@ def nearby_positive_definite_covariance(covariance: Array) -> Array:
 
 
 def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
-    """Pool several runs' estimates; return them, chi2 of the differences between runs, and its degrees of freedom.
+    """Pool several runs' estimates. Also return chi2 of the differences between runs, and its degrees of freedom.
 
     Each run may lack some of the parameters. The pooled estimates are of all parameters of any run, widened by Birge's
     ratio where the runs differ by more than they state.
@@ -136,7 +136,7 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
 
 
 def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
-    """Test which parameters drifted between runs, given in order of time, and which run is an outlier.
+    """Test which parameters drifted between runs, in order of time, and which run is an outlier.
 
     Each parameter is tested by its marginal variances, each run by its whole covariance; the significance level is
     divided by the number of parameters, and by that of runs. A run is an outlier where it disagrees with the others and

@@ -1,4 +1,4 @@
-"""Estimate of a problem's parameters as `solve` reports it: solution, all that its uncertainty includes, and checks."""
+"""Parameter estimation as `solve` reports it, with complete uncertainty and checks."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def solve(
 
 
 def checked_solution(problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS) -> Solution:
-    """The solution of a fit with profile intervals, the discretisation's error, and its `checks`; see `solve`."""
+    """Complete a fit with profile intervals, the discretisation's error and `checks`. See `solve`."""
     start, problem = problem, solution.problem or problem
     if solution.evaluation is not None:
         problem = _with_equilibrium_guesses(problem, solution.evaluation.episode_predictions, ())
@@ -186,7 +186,7 @@ _MIN_MOVING_RECORDINGS = 2  # that start in motion, of which one is left out at 
 
 @dataclass(frozen=True)
 class ChosenCableMemoryFit:
-    """Problem and solution with or without cable memory, and the reason as a message, empty if nothing was decided."""
+    """Problem and solution with or without cable memory. The message gives the reason, empty if nothing was decided."""
 
     problem: EstimationProblem
     solution: Solution
@@ -199,7 +199,7 @@ def choose_cable_memory_fit(
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> ChosenCableMemoryFit:
-    """Return the fit, refitted without cable memory if recordings that start in motion do not support the memory.
+    """Refit without cable memory if recordings that start in motion do not support the memory.
 
     Where a cable moves when its recording begins, the load that it bears there is not known, and what it seems to
     remember may be that motion. Each recording that starts so is predicted from the others alone (one Gauss-Newton
@@ -225,7 +225,7 @@ def choose_cable_memory_fit(
 
 
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
-    """The problem with the cable's memory parameters fixed at zero."""
+    """Fix the cable's memory parameters of a problem at zero."""
     memory = _memory_parameters(problem)
     free = tuple(name for name in problem.free if name not in (*memory, MEMORY_HALVING_SPEED_PARAMETER_NAME))
     return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))
@@ -271,14 +271,14 @@ _START_FRAMES = 2  # frames from which the baselines of a cable start, as its ow
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
-    """Unit of a channel, or of the first member of a group; an empty text if it is unknown."""
+    """Unit of a channel, or of the first member of a group. Empty if unknown."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
 def prediction_errors_and_units(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodePrediction | str]]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
-    """Errors and baselines of held-out, then fitted recordings, units, and errors of fitted channels."""
+    """Errors and baselines of held-out, then fitted recordings, with units and errors of fitted channels."""
     residuals: Mapping[str, Any] = {}
     pairs = list(held_out)
     if solution.evaluation is not None:
@@ -388,7 +388,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
 def channels_worse_than_naive_guess(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Channels of prediction error entries that a baseline without a model predicts clearly better."""
+    """Find channels that a baseline without a model predicts clearly better."""
     worse = []
     for entry in entries:
         for channel in entry["rmse"]:

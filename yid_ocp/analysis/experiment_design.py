@@ -1,4 +1,4 @@
-"""Hypothetical variants of a recorded experiment: grasps, arms, motions and sensors, with their Fisher information."""
+"""Fisher information of hypothetical variants of a recorded experiment: grasps, arms, motions and sensors."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 @dataclass(frozen=True)
 class FrameObservationSchedule:
-    """Observation of one frame by a point group: sample times and standard deviations."""
+    """Sample times and standard deviations of one frame that a point group observes."""
 
     point_group: str
     frame: str
@@ -59,7 +59,7 @@ class FrameObservationSchedule:
 
 @dataclass(frozen=True)
 class RecordedExperiment:
-    """The recorded experiment to be varied: its problem, the unknowns, prior knowledge and an optional second arm."""
+    """A recorded experiment to be varied, with its problem, unknowns and prior knowledge."""
 
     problem: EstimationProblem
     x: Array  # unknowns at which the information is evaluated, shape (nx,)
@@ -69,17 +69,17 @@ class RecordedExperiment:
 
     @property
     def parameter_values(self) -> dict[str, float]:
-        """Values of all model parameters at `x`, by name."""
+        """Values of all model parameters at `x`."""
         theta, _ = self.problem.theta_and_initial_state_deviation(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The camera's point group (None: defaults are used), frame times since the start [s] and typical std [m]."""
+        """The camera's point group (None: defaults are used), frame times since the start [s], typical std [m]."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group that the arms measure (None: defaults are used), its sample times [s] and typical std [m]."""
+        """The arms' point group (None: defaults are used), its sample times [s] and typical std [m]."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
 
@@ -91,7 +91,7 @@ class RecordedExperiment:
         return None, times, std
 
     def existing_point_observation_schedules(self, episode: Episode) -> list[FrameObservationSchedule]:
-        """Observation schedules of the points measured in a recording, one for each point."""
+        """Observation schedule of every point measured in a recording."""
         found = []
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
@@ -120,7 +120,7 @@ def _used_point_groups(problem: EstimationProblem, episode: Episode) -> list[Poi
 
 
 def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
-    """Evenly spaced sample times [s] at `rate` [Hz], from zero to the end of a recording."""
+    """Evenly spaced sample times from zero to the end of a recording [s], at `rate` [Hz]."""
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
@@ -134,7 +134,7 @@ class _ObservableFrame(NamedTuple):
 
 
 def observable_frames(system: System) -> list[_ObservableFrame]:
-    """Measurable frames: segment tips, midpoints and markers near the tips, or links and markers without segments."""
+    """Measurable frames: segment tips, midpoints and markers near the tips. Without segments, links and markers."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[_ObservableFrame] = []
@@ -166,7 +166,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 
 
 def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_ObservableFrame]]:
-    """The step with all measurable frames added to its mechanism, and those frames; its equations stay the same."""
+    """Add all measurable frames to a step's mechanism, and return them too. The equations stay the same."""
     mechanism, seen = step.system.mechanism, observable_frames(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
@@ -192,7 +192,7 @@ class CandidateExperimentSensitivities:
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def fisher_information_with_prior(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
-        """Fisher information (nx, nx) of observations (one list for each recording) plus the prior information."""
+        """Fisher information of observations (one list per recording) plus the prior's, (nx, nx)."""
         total = self.prior_information.copy()
         nx = len(total)
         for i, episode in enumerate(self.problem.episodes):
@@ -228,7 +228,7 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 
 
 class CandidateExperimentSensitivityBuilder:
-    """Builder of experiment variants from sets of mechanical changes; results are cached."""
+    """Builds and caches experiment variants from sets of mechanical changes."""
 
     def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
@@ -236,7 +236,7 @@ class CandidateExperimentSensitivityBuilder:
         self._layouts: dict[frozenset[str], CandidateExperimentSensitivities | str] = {}
 
     def build_sensitivities(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
-        """Sensitivities of the experiment with a set of mechanical changes, or a message why it cannot be built."""
+        """Compute the sensitivities for a set of mechanical changes. A message says why they cannot be computed."""
         if mechanics not in self._layouts:
             if mechanics:
                 words = " and ".join(MECHANICAL_CHANGE_DESCRIPTIONS[name] for name in sorted(mechanics))
@@ -248,7 +248,7 @@ class CandidateExperimentSensitivityBuilder:
         return self._layouts[mechanics]
 
     def applicable_mechanical_changes(self) -> list[str]:
-        """Names of the mechanical changes that are possible for the experiment's system."""
+        """Names of the mechanical changes that the experiment's system allows."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos
         measured = any(s.sensor.effort_joints for e in episodes for s in e.measurements)

@@ -1,4 +1,4 @@
-"""The ladder of friction laws: which predicts motions it was not fitted to, and friction torque in the data."""
+"""Cross-validate friction laws of increasing complexity, and extract friction torques from data."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class FrictionLawFit:
 
 
 def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Recording names grouped by name without number, or singly if groups are few; motors-off ones are omitted."""
+    """Group recording names by name without number, or singly if groups are few. Motors-off ones are omitted."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
@@ -55,7 +55,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 def cross_validate_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
-    """A friction law's fit to all recordings, with errors of refits that leave out one kind of motion in turn."""
+    """Fit a friction law to all recordings, and refit without one kind of motion in turn to get errors."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
@@ -87,7 +87,7 @@ def mean_and_std_error_over_motion_kinds(
 
 
 def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
-    """The first friction law of the ladder whose error is within one standard error of the smallest error.
+    """Choose the first friction law whose error is within one standard error of the smallest error.
 
     Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
     """
@@ -110,7 +110,7 @@ class _FrictionTorqueCloud:
 def friction_torque_clouds(
     problem: EstimationProblem, solution: Solution, friction_parameters: Sequence[str]
 ) -> tuple[_FrictionTorqueCloud, ...]:
-    """Friction torque data of driven joints with friction; empty for models with constraints or internal coordinates.
+    """Friction torques of driven joints from data. Empty for models with constraints or internal coordinates.
 
     What the discrete equations lack along the smoothed measured angles with the friction at zero, and what the fitted
     law adds there.
@@ -173,7 +173,7 @@ def _load_function(problem: EstimationProblem) -> ca.Function:
 
 
 def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
-    """The problem with its held-out recordings moved to the recordings for estimation."""
+    """Move a problem's held-out recordings to the recordings for estimation."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)
     return problem.with_episodes((*problem.episodes, *added), (), filters, ())

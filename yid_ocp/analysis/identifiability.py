@@ -95,7 +95,7 @@ class _ParameterDirection:
 
 @dataclass(frozen=True, repr=False)
 class IdentifiabilityResult(ReprMixin):
-    """Identifiability of p free parameters: verdicts, correlations, Fisher information and uncertain directions."""
+    """Identifiability of p free parameters, with correlations, Fisher information and uncertain directions."""
 
     parameters: Mapping[str, ParameterIdentifiability]
     parameter_names: tuple[str, ...]  # in the order of the matrices
@@ -130,7 +130,7 @@ def identifiability(
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     progress: Progress = NULL_PROGRESS,
 ) -> IdentifiabilityResult:
-    """Fisher-information analysis of which free parameters the problem's recordings determine.
+    """Analyse by Fisher information which free parameters the problem's recordings determine.
 
     The Fisher information of independent Gaussian noise is I = J' J, J = d r/d x the whitened sensitivities; the
     standard deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it (Ljung 1999,
@@ -216,14 +216,14 @@ def _profiles(
 
 
 def system_with_grasp_offset_effects(system: System) -> System:
-    """The system with a `grasp_offset` effect, at its neutral value, on every grasp that has none."""
+    """Add a neutral `grasp_offset` effect to every grasp that has none."""
     there = {effect.location for effect in system.effects if effect.kind == _GRASP_OFFSET_KIND}
     places = [grasp.name for grasp in system.grasps if grasp.name not in there]
     return system.with_effects([make_effect(_GRASP_OFFSET_KIND, place, system) for place in places])
 
 
 def unknowns_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
-    """A problem's unknown vector from a solution, an array or, when absent, its initial values.
+    """Get a problem's unknown vector from a solution, an array or, when absent, its initial values.
 
     Raises `SolverError` for a wrong shape or a value that is not finite.
     """
@@ -243,7 +243,7 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
 def with_nuisance_unknowns(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
-    """The problem with initial states (if `start` is "unknown") and grasp offsets (if a prior is given) as unknowns."""
+    """Add unknown initial states (if `start` is "unknown") and grasp offsets (if a prior is given) to a problem."""
     options, grasps, priors = problem.options, [], dict(problem.options.prior_stds)
     initial = "estimated" if start == "unknown" else options.initial_state
     if grasp_std is not None:
@@ -269,7 +269,7 @@ def with_nuisance_unknowns(
 
 
 def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Unknown vector of another problem: values from `x` for the same names, its own initial values for the rest."""
+    """Transfer values of `x` by name to another problem's unknown vector. The rest keep its initial values."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])
 

@@ -1,4 +1,4 @@
-"""Kinematics and dynamics of the joints with recorded angles, and checks of limits, excitation and efforts."""
+"""Check limits, excitation and efforts of joints with recorded angles by their kinematics and dynamics."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class RecordedJointsModel:
 
     @staticmethod
     def from_system(system: System, theta: Array) -> RecordedJointsModel | None:
-        """The model of a system's driven and prescribed joints; None where it has none."""
+        """Make the model of a system's driven and prescribed joints. None where it has none."""
         names = (*system.driven, *system.prescribed)
         return RecordedJointsModel(system, theta, names) if names else None
 
     def has_all_angles_recorded(self, recording: Recording) -> bool:
-        """Whether a recording has the angles of all joints; clamps that follow measured points have none recorded."""
+        """Whether a recording has all joint angles. Clamps that follow measured points have none recorded."""
         return all(name in recording.joint_names for name in self.joint_names)
 
     @property
@@ -83,7 +83,7 @@ class RecordedJointsModel:
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
-        """Positions (N, nf, 3) [m] of frames and their Jacobian (N, nf, 3, k) in the recorded angles `q` (N, k).
+        """Positions of frames, (N, nf, 3) [m], and their Jacobian (N, nf, 3, k) at recorded angles `q` (N, k).
 
         The frames are such that `is_frame_determined_by_angles`.
         """
@@ -207,7 +207,7 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
 
 
 def known_effect_config_line(kind: str, location: str, quantity: str, value: float) -> str:
-    """Configuration line that adds an effect of a kind at a location with a known parameter value."""
+    """Configuration line that adds an effect with a known parameter value at a location."""
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
 
@@ -339,7 +339,7 @@ class _Fit(NamedTuple):
 
 
 def check_efforts_by_inverse_dynamics(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
-    """Issues about recorded efforts that disagree with the inverse dynamics of the recorded motion."""
+    """Find recorded efforts that disagree with the inverse dynamics of the recorded motion."""
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:

@@ -1,4 +1,4 @@
-"""Comparison of a built model with Pinocchio: mass matrix, gravity forces and inverse dynamics.
+"""Compare a built model with Pinocchio in mass matrix, gravity forces and inverse dynamics.
 
 Pinocchio gets the robot in two ways: from the URDF file, which it reads itself, and joint by joint from the built
 system, object and effects included. The first detects errors in reading the file, the second errors in the mechanics.

@@ -1,4 +1,4 @@
-"""Checks of measured points against a model: mirrored, exchanged, scaled, delayed or out of reach."""
+"""Check measured points against a model: mirrored, exchanged, scaled, delayed or out of reach."""
 
 from __future__ import annotations
 
@@ -237,7 +237,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 def check_point_distances(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, choice: _SensorChoices
 ) -> Iterator[Issue]:
-    """Yield issues about points farther from the root or each other than the length along the object between them."""
+    """Yield issues about points farther apart or from the root than the object's length between them allows."""
     mechanism = system.mechanism
     for group in recording.points:
         frames = _point_frames(system, group, choice(group.name))
@@ -314,7 +314,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 
 
 def check_cable_point_geometry(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
-    """Yield issues about cable points with edge lengths unlike the undeformed shape or positions above the clamps."""
+    """Yield issues about cable points above the clamps, or with edge lengths unlike the undeformed shape."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertex_names if name in group.names}
         edges = [edge for edge in cable.edges if edge[0] in at and edge[1] in at]

@@ -1,4 +1,4 @@
-"""Profile likelihood of one unknown: the others refitted at fixed values of it, and the resulting interval."""
+"""Profile likelihood and confidence interval of one unknown."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 @dataclass(frozen=True)
 class ParameterProfileLikelihood:
-    """Profile likelihood of one unknown: chi2 rise at fixed values, the others refitted, and the 95 % interval."""
+    """Rise of chi2 at fixed values of one unknown with the others refitted, and the 95 % interval."""
 
     name: str
     value: float
@@ -61,14 +61,14 @@ class ParameterProfileLikelihood:
 
     @property
     def interval(self) -> ConfidenceInterval:
-        """Lower and upper end of the 95 % interval; None is an open end."""
+        """Lower and upper end of the 95 % interval. None is an open end."""
         return self.lower, self.upper
 
 
 def compute_profile_likelihood_interval(
     problem: EstimationProblem, x: Array, index: int, std: float, evaluation: Evaluation
 ) -> ParameterProfileLikelihood:
-    """Profile likelihood of one unknown and its 95 % interval, within which chi2 rises by less than 3.84.
+    """Compute the profile likelihood of one unknown and its 95 % interval, where chi2 rises by less than 3.84.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
     Unknowns that are positive by nature move in their logarithm. The weak prior does not count. An end is open where
@@ -92,7 +92,7 @@ def compute_profile_likelihood_interval(
 def solution_with_profile_intervals(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
-    """The solution with profile-likelihood intervals and consistent verdicts for weakly determined parameters.
+    """Add profile-likelihood intervals and consistent verdicts for weakly determined parameters to a solution.
 
     There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
     (`mark_unidentifiable_near_zero_estimate`). Unchanged where the problem is too large for profiles.
@@ -131,7 +131,7 @@ def results_by_parameter_at_optimum(
     names: Sequence[str],
     progress: Progress,
 ) -> dict[str, _Found]:
-    """Results of `judged(name, unknowns, evaluation)` at the optimum near `x` for each name, computed in parallel."""
+    """Evaluate `judged(name, unknowns, evaluation)` at the optimum near `x` for each name, in parallel."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 
@@ -146,7 +146,7 @@ def results_by_parameter_at_optimum(
 def mark_unidentifiable_near_zero_estimate(
     problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
 ) -> ParameterEstimate:
-    """The estimate, marked `not_identifiable` if it is small and the data do not exclude its typical size (99.9 %).
+    """Mark a small estimate `not_identifiable` if the data do not exclude its typical size (99.9 %).
 
     A branch's twist that no sensor sees swings only where its stiffness is near zero. There it follows the noise: the
     cost has a narrow minimum, below what it is for all large values by what one more parameter takes from the noise.
@@ -162,7 +162,7 @@ def mark_unidentifiable_near_zero_estimate(
 
 
 def is_small_enough_for_profiles(problem: EstimationProblem) -> bool:
-    """Whether a problem is small enough for its profile intervals to be computed by default."""
+    """Whether a problem is small enough for profile intervals by default."""
     few = len(parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
     return few and len(problem.unknown_names) <= _MAX_UNKNOWNS
 

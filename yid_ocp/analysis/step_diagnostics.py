@@ -1,4 +1,4 @@
-"""Diagnostics of a compiled step: sizes, linearisation against differences, what parameters enter, sparsity."""
+"""Diagnostics of a compiled step, such as sizes, sparsity, and linearisation errors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CheckedStepLinearisation:
 
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
-    """Sizes of a step: vector lengths, number of unknowns, Jacobian nonzeros, and operations of its functions.
+    """Sizes of a step: vector lengths, unknowns, Jacobian nonzeros, and operations of its functions.
 
     `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
     """
@@ -52,7 +52,7 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
 def checked_step_linearisation(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> CheckedStepLinearisation:
-    """Linearise a step at a state (nx,) (A_k, B_k) and compare it with central finite differences.
+    """Linearise a step at a state (nx,) and compare A_k and B_k with central finite differences.
 
     The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
     """
@@ -78,7 +78,7 @@ def checked_step_linearisation(
 def linearise_step_equations(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepEquationLinearizations:
-    """Linearised step equations at a state (nx,), torque (nu,) [N m] and path (nc,), with parameter derivatives."""
+    """Linearise the step equations at a state (nx,), torque (nu,) [N m] and path (nc,), also by parameters."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
@@ -88,7 +88,7 @@ def linearise_step_equations(
 
 
 def system_with_numeric_parameters(system: System, theta: Array) -> System:
-    """The system with numeric parameter values in place of symbols, and internal coordinates at zero."""
+    """Replace a system's parameters by numbers, and set internal coordinates to zero."""
     inner = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])
@@ -124,7 +124,7 @@ _RESPONSE_STEPS = 100
 
 @dataclass(frozen=True)
 class ParameterDetectability:
-    """Rows of a step's equations that contain one parameter, and how strongly sensors respond to the parameter."""
+    """Step equations that contain one parameter, and the sensors' response to the parameter."""
 
     parameter: str
     unit: str
@@ -145,7 +145,7 @@ def parameter_detectabilities(
     theta: Array,
     stages: StepEquationLinearizations,
 ) -> tuple[ParameterDetectability, ...]:
-    """For each parameter, the step equations that contain it and the sensors' response to it about a state (nx,).
+    """Find the step equations that contain each parameter, and the sensors' response about a state (nx,).
 
     A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
     tracking filter's first gain. The row is seen to first order where a reading answers within `_RESPONSE_STEPS` steps.
@@ -243,7 +243,7 @@ _ZERO_RTOL = 1e-14  # of the largest entry: rounding
 
 
 class NamedIndexRange(NamedTuple):
-    """Name of a block of matrix rows or columns, with its first index and the index after its last."""
+    """Name, first index and end index of a block of matrix rows or columns."""
 
     name: str
     start: int
@@ -252,7 +252,7 @@ class NamedIndexRange(NamedTuple):
 
 @dataclass(frozen=True)
 class SparsityPattern:
-    """Structural nonzeros of a matrix, with names of its blocks, rows and columns."""
+    """Structural nonzeros of a matrix with named blocks, rows and columns."""
 
     name: str  # for files; the title is for people
     title: str
@@ -265,13 +265,13 @@ class SparsityPattern:
     mark_label: str = ""  # what that means
 
     def with_numerical_nonzeros_marked(self, values: Array, where: str) -> SparsityPattern:
-        """Copy of the pattern in which the numerically nonzero entries of the matrix `values` are marked."""
+        """Copy the pattern and mark the numerically nonzero entries of the matrix `values`."""
         marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
         return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
 
     @property
     def n_nonzeros(self) -> int:
-        """Number of structurally nonzero entries."""
+        """Number of structural nonzeros."""
         return int(np.count_nonzero(self.nonzero_mask))
 
 
@@ -408,7 +408,7 @@ def nlp_stage_sparsity(
     followed: Sequence[int],
     loose: Sequence[int],
 ) -> _NlpStage:
-    """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.symbolic_transcription`.
+    """Sparsity of one stage of the NLP with a node at every step. The order is `solvers.symbolic_transcription`'s.
 
     The parameters `free` are unknowns, `sensors` read nodes, the tracking filter feeds the rows `followed` of the state
     back to the torques, and the rows `loose` of the first node's state are estimated, with a prior; the start fixes the
@@ -492,7 +492,7 @@ def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[BoolArray, BoolAr
 
 
 def kkt_sparsity_pattern(stage: _NlpStage, steps: int) -> SparsityPattern:
-    """Sparsity of the KKT matrix [[H, J'], [J, 0]] of a recording's first steps, with a measurement at every node."""
+    """Sparsity of the KKT matrix [[H, J'], [J, 0]] of a recording's first steps, with measurements at every node."""
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
     blank = np.zeros((len(jacobian), len(jacobian)), bool)
     mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])

@@ -1,4 +1,4 @@
-"""Equations of one step with named rows and columns, and any entry of them as text or LaTeX."""
+"""Equations of one step with named rows and columns, and their entries as text or LaTeX."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class _FormulaText:
 
 
 def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
-    """Number of operations that evaluate all expressions; shared subexpressions count once."""
+    """Count the operations that evaluate all expressions. Shared subexpressions count once."""
     function = _function(expressions, variables)
     skipped = (*_LEAF_OPERATIONS, ca.OP_OUTPUT, ca.OP_PARAMETER)
     return sum(function.instruction_id(i) not in skipped for i in range(function.n_instructions()))
@@ -92,7 +92,7 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 def format_expressions(
     expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[_SymbolName], latex: bool = False
 ) -> _FormulaText:
-    """Scalar expressions as text or LaTeX; `names` are those of the variables (k, 1), the only symbols in them."""
+    """Format scalar expressions as text or LaTeX. `names` are those of their only symbols, the variables (k, 1)."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
     for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
@@ -183,13 +183,13 @@ class SymbolBlock:
 
     @property
     def full_names(self) -> tuple[str, ...]:
-        """Full names such as `q1[T1_0_x]`; parameters and the time step have the label alone."""
+        """Full names such as `q1[T1_0_x]`. Parameters and the time step have the label alone."""
         return tuple(label if self.name in ("theta", "time_step") else f"{self.name}[{label}]" for label in self.labels)
 
 
 @dataclass(frozen=True)
 class EquationOrDerivativeFormula:
-    """Formula of one step equation or, if a column is named, of its derivative with respect to that variable."""
+    """Formula of one step equation or, if a column is named, of its derivative by that variable."""
 
     row_name: str
     column_name: str
@@ -223,7 +223,7 @@ class EquationOrDerivativeFormula:
 
 @dataclass(frozen=True, repr=False)
 class NamedStepEquations(ReprMixin):
-    """Symbolic equations of one time step, with named rows (equations) and columns (variables).
+    """Symbolic equations of one time step with named rows (equations) and columns (variables).
 
     Rows are in the blocks `del` (DEL equations; at a prescribed coordinate the residual is -h times its effort),
     `internal`, `constraint`, and `p1`, the momentum after the step; columns in `q0`, `p0`, `z0`, `u`, `theta`,
@@ -287,7 +287,7 @@ class NamedStepEquations(ReprMixin):
 
     @cached_property
     def full_jacobian_sparsity_pattern(self) -> ca.Sparsity:
-        """Sparsity of the Jacobian of all rows (equations) with respect to all columns (variables)."""
+        """Sparsity of the Jacobian of all rows (equations) by all columns (variables)."""
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
         return found
 
@@ -301,7 +301,7 @@ class NamedStepEquations(ReprMixin):
         )
 
     def block_slice(self, block: str) -> slice:
-        """Index range of a block among all rows or among all columns."""
+        """Index range of a block among all rows or columns."""
         blocks = self.row_blocks if any(entry.name == block for entry in self.row_blocks) else self.column_blocks
         names = [entry.name for entry in blocks]
         ends = list(itertools.accumulate((len(entry.labels) for entry in blocks), initial=0))
@@ -309,7 +309,7 @@ class NamedStepEquations(ReprMixin):
         return slice(ends[at], ends[at + 1])
 
     def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:
-        """The equation with a given name or, for `ROW, COLUMN`, its derivative with respect to a variable.
+        """Find an equation by name or, for `ROW, COLUMN`, its derivative by a variable.
 
         `text` is such as `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]` or `constraint[left.x], T2.length`. Raises
         `ConfigError` for neither one name nor two, or one that does not exist.
@@ -338,7 +338,7 @@ class NamedStepEquations(ReprMixin):
         return tuple(words)
 
     def text_lines(self) -> list[str]:
-        """Text lines of all equations, short ones in full, then the names of all variables."""
+        """Text lines of all equations (short ones in full), then the names of all variables."""
         said = []
         place = {self.column_symbols[i].element_hash(): i for i in range(self.column_symbols.numel())}
         for at, name in enumerate(self.row_names):
@@ -361,7 +361,7 @@ class NamedStepEquations(ReprMixin):
 
 
 def escape_latex(name: str) -> str:
-    """A name with LaTeX's special characters escaped."""
+    """Escape LaTeX's special characters in a name."""
     return "".join("\\" + letter if letter in "_%#&${}" else letter for letter in name)
 
 

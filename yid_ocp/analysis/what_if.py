@@ -1,4 +1,4 @@
-"""Ranking of changes of an experiment by the parameters they make identifiable, and smallest sufficient sets."""
+"""Rank changes of an experiment by the parameters that they make identifiable."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ExperimentChange:
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
-    """Predicted identifiability of an experiment with some changes; no verdicts if it could not be evaluated.
+    """Predicted identifiability of an experiment with some changes. No verdicts if it could not be evaluated.
 
     The gain is information gain, 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation
     of 400 % of each parameter.
@@ -75,7 +75,7 @@ class ChangedExperimentResult:
 
 @dataclass(frozen=True, repr=False)
 class ExperimentRanking(ReprMixin):
-    """Changes of an experiment, ranked by the parameters they make identifiable.
+    """Changes of an experiment, ranked by the parameters that they make identifiable.
 
     Single changes come with most identifiable parameters first, then by gain; those that could not be evaluated last.
     `smallest_sufficient_sets` are all sets of fewest changes with which every parameter is identifiable, largest gain
@@ -149,7 +149,7 @@ def what_if(
 def evaluate_experiment_change_sets(
     setting: RecordedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
-    """Predicted result of each set of named changes, with stated variances multiplied by `inflation`."""
+    """Predict the result of each set of named changes. `inflation` multiplies the stated variances."""
     outcomes = _Outcomes(setting, inflation)
     known = {change.name: change for change in outcomes.possible}
     return outcomes.of_all([[known[name] for name in names] for names in sets])

@@ -1,1 +1,1 @@
-"""Configuration files: the settings of a run, the reader that checks them, the schema for editors."""
+"""Configuration files: settings of a run, a reader that checks them, and a schema for editors."""

@@ -1,4 +1,4 @@
-"""Configuration files: reads YAML with line numbers and validates it against the settings classes."""
+"""Read YAML configuration files with line numbers and check them against the settings classes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
 def load_config(
     path: str | Path | None = None, overrides: Sequence[str] = (), default: str = EMBEDDED_CONFIG_FILE_NAME
 ) -> RunSettings:
-    """Return the checked settings of a configuration file; without `path`, of the embedded file `default`.
+    """Read and check the settings of a configuration file. Without `path`, the embedded file `default` is read.
 
     Overrides are `a.b=c` each: the key and a value in YAML that replaces or adds to the file's. A section merges with
     the one that stands there, key by key, unless it chooses another kind or method, or is empty.
@@ -61,7 +61,7 @@ def load_config(
 
 
 def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
-    """Dotted setting keys that begin with `prefix`, with the entries of file `path`; `ConfigError` if unreadable."""
+    """List dotted setting keys that begin with `prefix`, with those of file `path`. `ConfigError` if unreadable."""
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
     return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
 

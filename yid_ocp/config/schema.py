@@ -1,4 +1,4 @@
-"""Allowed keys of each configuration section, from the settings classes: for reader, `--set`, and JSON Schema."""
+"""Derive the allowed keys of configuration sections from settings classes, for reader, `--set` and JSON Schema."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 
 @dataclass(frozen=True)
 class SectionVariants:
-    """Alternative settings classes of one configuration section, and the key that selects one."""
+    """Alternative settings classes of a configuration section, and the key that selects one."""
 
     classes: Mapping[str, type]  # by the word that chooses one; a single one under the empty word
     selector_key: str = ""  # holds the word, empty where there is no choice
@@ -26,12 +26,12 @@ class SectionVariants:
     is_nullable: bool = False
 
     def selected_variant_name(self, raw: Any) -> Any:
-        """Value of the selector key in an unchecked section; `default_variant` where the key is absent."""
+        """Value of the selector key in an unchecked section. Without the key it is `default_variant`."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
     def variant_options(self, word: Any = "") -> Mapping[str, options.Option]:
-        """Options, by key, of the settings class that `word` selects, or of the first class if it selects none."""
+        """Options of the settings class that `word` selects, by key. Default: the first class."""
         known = isinstance(word, str) and word in self.classes
         own = options.dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
         if self.selector_key in ("", *own):
@@ -39,7 +39,7 @@ class SectionVariants:
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
     def variants_for_mapping_key(self, name: str, where: str) -> SectionVariants:
-        """Settings classes allowed for a mapping's entry `name`: the class registered by that name, or all classes."""
+        """Settings classes for a mapping's entry `name`. They are the class of that name, or all classes."""
         if self.selector_key != "name":
             return self
         if name not in self.classes:
@@ -47,7 +47,7 @@ class SectionVariants:
         return SectionVariants({"": self.classes[name]})
 
     def unknown_variant_error(self, word: object, where: str) -> ConfigError:
-        """The error for a missing or unknown value of the selector key."""
+        """Make the error for a missing or unknown value of the selector key."""
         if not word:
             what = f"the key '{self.selector_key}' is missing"
             return ConfigError(what, where=where, allowed=", ".join(self.classes))
@@ -56,7 +56,7 @@ class SectionVariants:
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
-    """Alternative settings classes that a type annotation allows; None for other types."""
+    """Alternative settings classes that a type annotation allows. None for other types."""
     bare, markers = options.split_annotated(hint)
     nullable = type(None) in get_args(bare)
     among = next((marker for marker in markers if isinstance(marker, options.RegistryChoice)), None)
@@ -71,7 +71,7 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
 
 
 def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
-    """The error for an unknown key, with the nearest allowed key and the sections that have this key."""
+    """Make the error for an unknown key, with the nearest allowed key and the sections that have this key."""
     said = unknown_name_error_arguments(name, known)
     homes = list(dict.fromkeys(_sections_with_key(RunSettings, name)))
     hints = [said["hint"]] if said["hint"] else []
@@ -127,7 +127,7 @@ def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
 
 
 def config_json_schema() -> dict[str, Any]:
-    """JSON Schema of a configuration file, as plain data."""
+    """Build the JSON Schema of a configuration file as plain data."""
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "yid-ocp configuration"}
     return head | _described_schema(RunSettings)
 
@@ -178,6 +178,6 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
 
 
 def option_info_from_annotation(hint: Any) -> options.OptionInfo:
-    """`OptionInfo` (meaning and unit) in a type annotation; an empty one if the annotation has none."""
+    """Find the `OptionInfo` (meaning and unit) in a type annotation. Without one it is empty."""
     markers = reversed(options.split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())

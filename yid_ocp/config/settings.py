@@ -1,4 +1,4 @@
-"""Settings of one run: dataclasses for the sections of a configuration file.
+"""Settings of one run, with a dataclass for each section of a configuration file.
 
 Plain frozen dataclasses, filled by `reader`. Options of solvers, problem, sensors, cables, tracking and diagnosis are
 defined where they are used (`yid_ocp.options`); the sections here hold those classes.
@@ -74,7 +74,7 @@ class _MeasuredClampSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class GraspSettings:
-    """A grasp: a constraint between a frame of the robot and a frame of the object."""
+    """A grasp, which constrains a frame of the object to a frame of the robot."""
 
     holder_frame: Annotated[str, OptionInfo("frame of the robot, or a clamp")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
@@ -95,7 +95,7 @@ class _JointSpringSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class EffectSettings:
-    """An effect beyond the nominal model; its parameters are named kind@location.quantity."""
+    """An effect beyond the nominal model. Its parameters are named kind@location.quantity."""
 
     kind: Annotated[str, OptionInfo("kelvin_voigt, joint_coulomb, ..., or law")]
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
@@ -131,7 +131,7 @@ class JointActuationSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionLawSettings:
-    """Friction law of the robot's joints; the amount of friction is estimated."""
+    """Friction law of the robot's joints. The amount of friction is estimated."""
 
     law: Annotated[
         FrictionLawName,
@@ -145,7 +145,7 @@ class FrictionLawSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings:
-    """Mechanical model: robot, flexible object, grasps, clamps, frames and effects."""
+    """Mechanical model of robot and flexible object, with grasps, clamps, frames and effects."""
 
     robot: Annotated[
         _FilePath | None,
@@ -198,7 +198,7 @@ class ModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingsSettings:
-    """Recordings for estimation, for held-out prediction and for reference."""
+    """Recordings for estimation, held-out prediction and reference."""
 
     estimate: Annotated[_Recordings, OptionInfo("to estimate on")] = ()
     held_out: Annotated[_Recordings, OptionInfo("only predicted, never touched by the fit")] = ()
@@ -286,7 +286,7 @@ class ParameterSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSettings(ProblemOptions):
-    """Estimation problem: residuals, initial state and time discretisation."""
+    """Settings of the estimation problem for residuals, initial state and time discretisation."""
 
     time_step: Annotated[
         Annotated[float, Gt(0), Le(0.1)] | Literal["auto"],
@@ -300,7 +300,7 @@ class ProblemSettings(ProblemOptions):
 
     @property
     def time_step_or_default(self) -> float:
-        """Time step [s] as it is set; 10 ms for `auto` where there is no recording to choose by."""
+        """Configured time step [s]. It is 10 ms for `auto` without a recording to choose by."""
         return 0.01 if self.time_step == "auto" else self.time_step
 
 
@@ -433,7 +433,7 @@ class _PlanSettings(PlanOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class OutputSettings:
-    """Output: run folders, the report and the discretisation check."""
+    """Settings of run folders, the report and the discretisation check."""
 
     runs_folder: Annotated[
         _FilePath | None, OptionInfo("in which run folders are made; `runs` in the working folder")
@@ -450,7 +450,7 @@ class OutputSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """Resolved settings of one run: all sections of its configuration file."""
+    """Resolved settings of one run, with all sections of its configuration file."""
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
     plugins: Annotated[
@@ -481,7 +481,7 @@ class RunSettings:
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def describe_location(self, *path: str | int) -> str:
-        """Text with file, line and key of a setting, for the `where` of an error."""
+        """Describe where a setting stands by file, line and key, for the `where` of an error."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
             if path[:count] in self.key_locations:
@@ -489,12 +489,12 @@ class RunSettings:
         return f"{self.config_file}: {key}" if self.config_file else key
 
     def config_error(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
-        """A `ConfigError` (not raised here) that names file, line and key of a setting."""
+        """Make a `ConfigError` that names file, line and key of a setting. It is not raised here."""
         return ConfigError(what, where=self.describe_location(*path), allowed=allowed, hint=hint)
 
 
 def config_yaml_with_defaults(run: RunSettings) -> str:
-    """YAML text of a run's settings with every default; `load_config` reads the same run back from it."""
+    """Write a run's settings as YAML with every default. `load_config` reads the same run back from it."""
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 120

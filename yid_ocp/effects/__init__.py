@@ -1,4 +1,4 @@
-"""The library of unmodelled effects: kinds, their possible locations, and `make_effect`; a new kind is one file.
+"""The library of unmodelled effects and their possible locations. A new kind is one file.
 
 A kind's equation, quantities, units, bounds and ranges stand at its class; `docs/howto/extending.md` shows a new one.
 """
@@ -26,7 +26,7 @@ for _family in iter_modules(__path__):
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """Make an effect of the given kind at a location; `System.with_effects` adds it to a system.
+    """Make an effect of the given kind at a location. `System.with_effects` adds it to a system.
 
     Its parameters are named `kind@location.parameter`. `values` holds what is not neutral, by parameter; a compliance
     may be given as its `stiffness`. `ConfigError` of no such kind or parameter or a value outside its bounds,
@@ -42,12 +42,12 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
 
 def signal_kinds_required_by_any_effect() -> frozenset[str]:
-    """Kinds of recorded signals, such as `joints.effort`, that registered effects can require, plug-ins included."""
+    """Kinds of recorded signals that registered effects can require, such as `joints.effort`. Plug-ins are included."""
     return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
 
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
-    """All pairs (effect kind, location) that the system allows and the recorded signals can reveal, ordered by kind.
+    """List all pairs (effect kind, location) that the system allows and the recorded signals can reveal.
 
     The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`, or a
     sensor on a frame such as `wrist:FRAME`, or `points:GROUP`, points with a clock of their own. What works only on

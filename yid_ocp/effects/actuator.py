@@ -1,4 +1,4 @@
-"""Effects between a motor and its recorded signals: gears, encoders, effort sensing, late torque, position servos.
+"""Effects between a motor and its recorded signals, such as backlash, encoder offsets and delays.
 
 Recorded torques drive the model and recorded angles prescribe or guide it, so that these effects reach a driven joint,
 or the angle of a prescribed one, through `corrected_reading`; the effort that a prescribed joint needs is compared with
@@ -87,7 +87,7 @@ class _DistortedReading(EffectBase):
 
 @EFFECTS.register("encoder_offset")
 class EncoderOffset(_DistortedReading):
-    """Encoder offset: measured angle = true angle + offset; path, start and tracked angles are corrected for it."""
+    """Constant encoder offset: measured = true angle + offset. Path, start and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
     required_excitation = "its orientation to gravity"
@@ -130,7 +130,7 @@ class Backlash(_DistortedReading):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """`play`, the taken-up backlash, for a joint with a servo; an empty tuple otherwise."""
+        """The taken-up backlash `play` of a joint with a servo. Other joints have none."""
         return ("play",) if location in system.servos else ()
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -203,7 +203,7 @@ class _EffortGain(_DistortedEffort):
 
 @EFFECTS.register("effort_offset")
 class EffortOffset(_DistortedEffort):
-    """Constant offset of a joint's recorded effort: measured effort = true effort + offset."""
+    """Constant offset of a joint's recorded effort."""
 
     equation = "measured effort = true + offset"
     is_torque_offset = True
@@ -232,7 +232,7 @@ class _LateTorque(EffectBase):
 
 @EFFECTS.register("effort_delay")
 class EffortDelay(_LateTorque):
-    """Delay of a joint's torque: the torque that acts at t was recorded at t - delay, interpolated between samples.
+    """Delay of a joint's torque. The torque that acts at t was recorded at t - delay.
 
     For a prescribed arm the recorded effort at t is what the motion needs at t + delay; a negative delay means that the
     effort is recorded late.
@@ -262,7 +262,7 @@ class EffortLag(_LateTorque):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the parameter `time_constant` [s]; it may be negative for prescribed joints only."""
+        """Definition of the parameter `time_constant` [s]. Only prescribed joints allow negative values."""
         least, text = -0.5 if location in system.prescribed else 0.0, "with which torque follows its command"
         return (ParameterDefinition("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
@@ -287,7 +287,7 @@ class _ServoChange(EffectBase):
 
 @EFFECTS.register("servo_gain")
 class ServoGain(_ServoChange):
-    """Scale factor on a servo's demanded torque, as from another gain, supply voltage or motor."""
+    """Scale factor on the torque that a servo demands. Gain, supply voltage or motor may differ from the model's."""
 
     equation = "demand = scale (gain (u - q) - damping v)"
     declared_parameters = (
@@ -302,7 +302,7 @@ class ServoGain(_ServoChange):
 
 @EFFECTS.register("supply_voltage")
 class SupplyVoltage(_ServoChange):
-    """Scale factor on a direct-current motor's supply voltage: scales the torque per duty cycle and its limit."""
+    """Scale factor on a dc motor's supply voltage. It scales the torque per duty cycle and its limit."""
 
     equation = "torque = clip(scale gain (u - q), scale limit) - damping v"
     possible_locations = _dc_motor_joints
@@ -333,7 +333,7 @@ class _BackEmf(_ServoChange):
 
 @EFFECTS.register("current_limit")
 class CurrentLimit(_ServoChange):
-    """Current limit of a direct-current motor; current = motor torque / published torque constant kt.
+    """Current limit of a dc motor. The current is motor torque / published torque constant kt.
 
     Kept inside as limit^-16, as `ServoSaturation` has it; beyond the duty's limit it also takes from braking.
     """
@@ -343,7 +343,7 @@ class CurrentLimit(_ServoChange):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the parameter tightness = limit^-16, reported as `limit` [A], at least `_MIN_LIMIT_CURRENT`."""
+        """Definition of the internal parameter limit^-16. Reports show `limit` [A], at least `_MIN_LIMIT_CURRENT`."""
         return (_limit_definition(_MIN_LIMIT_CURRENT, "A", "largest current"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
@@ -352,7 +352,7 @@ class CurrentLimit(_ServoChange):
 
 @EFFECTS.register("servo_delay")
 class ServoDelay(_ServoChange):
-    """Delay of a servo's commands in addition to the nominal servo delay."""
+    """Delay of a servo's commands, added to its nominal delay."""
 
     equation = "the command that acts at t was given at t - servo_delay - delay"
     required_excitation = "when it is read"
@@ -375,7 +375,7 @@ class ServoSaturation(_ServoChange):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of tightness = limit^-16, reported as `limit`, at least `_MIN_LIMIT_FRACTION` x effort limit."""
+        """Definition of limit^-16. Reports show `limit`, at least `_MIN_LIMIT_FRACTION` x effort limit."""
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
         torque = "N m" if joint.coordinate_unit == "rad" else "N"

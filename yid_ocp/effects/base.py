@@ -1,4 +1,4 @@
-"""The base class of all effects, their parameter definitions, and the places in a system where effects can act."""
+"""Base class of all effects, their parameter definitions, and the places in a system where effects can act."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class ParameterDefinition:
-    """Definition of one parameter of an effect: name, unit, neutral value, bounds, prior range and reported form."""
+    """Definition of one effect parameter with unit, neutral value, bounds, prior range and reported form."""
 
     name: str
     unit: str
@@ -59,18 +59,18 @@ class ParameterDefinition:
 
     @property
     def reported_name_and_unit(self) -> tuple[str, str]:
-        """Name and unit of the parameter in reports, for example those of the stiffness for a compliance."""
+        """Name and unit of the parameter in reports. A compliance has those of its stiffness."""
         name, _, unit = self.reported_reciprocal.partition(" ")
         return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
 
     def to_internal(self, value: float) -> float:
-        """Internal value of a nonzero reported value: its reciprocal power, or the value itself if reported as is."""
+        """Convert a nonzero reported value to the internal value. It is a reciprocal power if reports invert it."""
         return value**-self.reciprocal_power if self.reported_reciprocal else value
 
 
 @dataclass(frozen=True)
 class ReportedParameterValue:
-    """An effect's parameter as reported to users: value, standard deviation and unit."""
+    """Value, standard deviation and unit of an effect's parameter in reports."""
 
     value: float
     std: float
@@ -79,7 +79,7 @@ class ReportedParameterValue:
 
 @dataclass(frozen=True)
 class EffectBase(Effect):
-    """Base class of all effects: kind, location and parameters; a subclass overrides methods for what it changes."""
+    """Base class of all effects. A subclass overrides methods for what it changes."""
 
     definitions: tuple[ParameterDefinition, ...] = ()  # definitions of `parameters`, scaled for the location
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
@@ -105,21 +105,21 @@ class EffectBase(Effect):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of the effect's parameters, with bounds and prior ranges scaled for the location."""
+        """Define the effect's parameters, with bounds and prior ranges scaled for the location."""
         return tuple(definition._at_location(system, location) for definition in cls.declared_parameters)
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Names of the effect's internal coordinates, its states besides the joints' motion; empty by default."""
+        """Names of the effect's own states besides the joints' motion. There are none by default."""
         return ()
 
     @property
     def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
-        """Largest absolute initial value of each internal coordinate whose initial value is estimated, by name."""
+        """Largest absolute initial value of each internal coordinate whose initial value is estimated."""
         return {}
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Parameter values of a second starting point for an estimation from `start`; None if one start is enough."""
+        """Parameter values of a second starting point, in addition to `start`. None if one start is enough."""
         return None
 
     def __getitem__(self, parameter: str) -> ca.SX:
@@ -127,33 +127,33 @@ class EffectBase(Effect):
 
     @property
     def label(self) -> str:
-        """The effect's name, `kind@location`."""
+        """Label `kind@location` of the effect."""
         return f"{self.kind}@{self.location}"
 
     @property
     def neutral_values(self) -> dict[str, float]:
-        """Parameter values at which the effect is absent, by parameter name."""
+        """Parameter values at which the effect vanishes, by parameter name."""
         return {f"{self.label}.{q.name}": q.neutral_value for q in self.definitions}
 
     @property
     def amplitude_names(self) -> tuple[str, ...]:
-        """Names of the amplitudes, the parameters whose neutral values suffice to make the effect vanish."""
+        """Names of the amplitude parameters. The effect vanishes when they are neutral."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if not q.is_shape_parameter)
 
     @property
     def shape_parameter_names(self) -> tuple[str, ...]:
-        """Names of shape parameters, such as a relaxation time; they have no influence at neutral amplitudes."""
+        """Names of shape parameters, such as a relaxation time. Neutral amplitudes make them irrelevant."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
     @property
     def prior_ranges(self) -> dict[str, tuple[float, float]]:
-        """Expected range (low, high) of every parameter, by parameter name, in the parameter's unit."""
+        """Expected range (low, high) of every parameter in its unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
     def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
-        """The parameters as reported to users, by reported name; for example, a compliance is reported as a stiffness.
+        """Convert the parameters to their reported form. For example, a compliance is reported as a stiffness.
 
         Values and standard deviations are nominal and NaN where absent; that of C^(-1/p) is C^(-1/p) std(C)/(p C).
         """
@@ -170,7 +170,7 @@ class EffectBase(Effect):
         return result
 
     def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> EffectBase:
-        """The effect with prior ranges adapted to the largest joint angle of each segment in the data [rad]."""
+        """Adapt prior ranges to the largest joint angle of each segment in the data [rad]."""
         return self
 
 
@@ -178,7 +178,7 @@ EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
 def build_effect(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
-    """Build an effect of a registered kind at a location that the caller has checked (`make_effect` checks it)."""
+    """Build an effect of a registered kind at a location that `make_effect` has checked."""
     cls, label = EFFECTS[kind], f"{kind}@{location}"
     definitions = cls.parameter_definitions(location, system)
     names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
@@ -218,14 +218,14 @@ def object_joint_names(system: System) -> tuple[str, ...]:
 
 
 def clamp_names(system: System) -> tuple[str, ...]:
-    """Names of the floating clamps; a clamp NAME has the six joints NAME_x ... NAME_rz."""
+    """Names of the floating clamps. A clamp NAME has the six joints `NAME_x` to `NAME_rz`."""
     names = set(system.mechanism.joint_names)
     found = [name.removesuffix("_rz") for name in system.mechanism.joint_names if name.endswith("_rz")]
     return tuple(clamp for clamp in found if all(f"{clamp}_{axis}" in names for axis in _CLAMP_AXES))
 
 
 def arm_joint_names(system: System) -> tuple[str, ...]:
-    """Names of the arms' joints: all joints except those of the object, the clamps and compliant mounts."""
+    """Names of all joints except those of the object, the clamps and compliant mounts."""
     clamps = {f"{clamp}_{axis}" for clamp in clamp_names(system) for axis in _CLAMP_AXES}
     other = {*object_joint_names(system), *system.joint_compliances, *clamps}
     return tuple(name for name in system.mechanism.joint_names if name not in other)
@@ -242,7 +242,7 @@ def grasp_names(system: System) -> tuple[str, ...]:
 
 
 def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
-    """Joint names by arm; an arm's name is that of its grasp, else its joints' prefix left or right, else `gripper`."""
+    """Joint names by arm. An arm is named by its grasp, else its joints' prefix (left, right), else `gripper`."""
     joints, tree = arm_joint_names(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
@@ -276,13 +276,13 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
 
 
 def effort_limit_over_baxter(system: System, joint: str) -> float:
-    """A joint's effort limit divided by that of Baxter's joints, at least 1; also 1 for an unlimited joint."""
+    """Ratio of a joint's effort limit to that of Baxter's joints, at least 1. Unlimited joints have 1."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
 
 
 def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
-    """Names of frames at the ends of the arms' links (next joint or tip); fixed or coincident points are omitted."""
+    """Names of frames at the ends of the arms' links, except fixed or coincident points."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
     if not own:
@@ -304,7 +304,7 @@ def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
 
 
 def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
-    """One frame name for every arm link with mass: that of a grasp, else of a gripper, else the link's first frame.
+    """Choose one frame for every arm link with mass. Grasps go first, then grippers, then the link's first frame.
 
     A finger, what slides on a link and carries nothing else, counts as part of that link.
     """
@@ -334,7 +334,7 @@ def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def segment_name_of_frame(system: System, frame: str) -> str | None:
-    """Name of the segment whose link carries the frame; None if no segment does."""
+    """Name of the segment whose link carries the frame. None if no segment does."""
     index = system.mechanism.frame(frame).joint_index
     if index < 0:
         return None
@@ -343,14 +343,14 @@ def segment_name_of_frame(system: System, frame: str) -> str | None:
 
 
 def elastic_joints_within_segment(system: System, segment: str) -> tuple[ElasticJoint, ...]:
-    """The elastic joints (spring and damper) that belong to a segment."""
+    """The elastic joints of one segment."""
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
 def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
-    """Definition of an arm joint's parameter: neutral at zero, with bound and range that grow with the effort limit."""
+    """Define an arm joint's parameter, neutral at zero. Bound and range grow with the effort limit."""
     prior, scale = (0.0, expected), effort_limit_over_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
@@ -358,13 +358,13 @@ def effort_limit_scaled_parameter_definition(
 def compliance_parameter_definition(
     unit: str, upper: float, prior: tuple[float, float], place: str, reported: str
 ) -> ParameterDefinition:
-    """Definition of a compliance parameter, neutral at zero; `reported` is the unit of the stiffness in reports."""
+    """Define a compliance parameter, neutral at zero. `reported` is the stiffness unit in reports."""
     text, said = f"compliance of the {place}", f"stiffness {reported}"
     return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 
 
 def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
-    """Generalized force (n, 1) with the entry `value` at one joint and zeros elsewhere."""
+    """Generalized force (n, 1) with one nonzero entry, `value` at the joint."""
     force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force
@@ -373,7 +373,7 @@ def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.S
 def with_changed_joint_bodies(
     system: System, joints: Collection[str], change: Callable[[tuple[Inertia, ...]], Iterable[Inertia]]
 ) -> System:
-    """The system with `change` applied to the rigid bodies of the named joints."""
+    """Apply `change` to the rigid bodies of the named joints."""
     tree = system.mechanism
     changed = tuple(replace(j, bodies=tuple(change(j.bodies))) if j.name in joints else j for j in tree.joints)
     return replace(system, mechanism=replace(tree, joints=changed))

@@ -1,4 +1,4 @@
-"""Bodies whose masses, inertias, lengths or weight differ from their nominal values, and the drag of the air."""
+"""Effects on mass, inertia, length and weight of bodies, and air drag."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _tips_and_link_ends(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("point_mass")
 class PointMass(EffectBase):
-    """Point mass fixed to a frame; it adds kinetic energy T += 1/2 mass |v|^2 and potential energy V += -mass g.x."""
+    """Point mass fixed to a frame. It adds the energies T += 1/2 mass |v|^2 and V += -mass g.x."""
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
     required_excitation = "how hard it accelerates"
@@ -112,7 +112,7 @@ class PointMass(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of `mass` [kg]; its upper bound is the object's mass, or on an arm the arm's payload."""
+        """Definition of `mass` [kg]. Its upper bound is the object's mass, or on an arm the arm's payload."""
         upper, expected = _bearable(system, location)
         return (ParameterDefinition("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
 
@@ -125,7 +125,7 @@ class PointMass(EffectBase):
 
 @EFFECTS.register("payload")
 class Payload(EffectBase):
-    """Payload fixed to a frame at (mx, my, mz)/mass; a negative mass removes excess mass of the model.
+    """Payload fixed to a frame at (mx, my, mz)/mass. A negative mass removes excess mass of the model.
 
     The place is within `_MAX_PAYLOAD_DISTANCE` of the frame: moments beyond L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 +
     (`_MAX_COM_SHIFT` M)^2) do not grow any more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is
@@ -151,7 +151,7 @@ class Payload(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of mass [kg], at least -`_MAX_REMOVED_MASS_FRACTION` of the link's, and first moments [kg m]."""
+        """Definitions of mass [kg] and first moments [kg m]; mass >= -`_MAX_REMOVED_MASS_FRACTION` x link mass."""
         upper, expected = _bearable(system, location)
         lower = -_MAX_REMOVED_MASS_FRACTION * _carried_body(system, system.mechanism.frame(location).joint_index).mass
         far, near = (_MAX_PAYLOAD_DISTANCE * mass for mass in (upper, expected))
@@ -172,7 +172,7 @@ class Payload(EffectBase):
     def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
-        """Reported mass and acting first moments; moments beyond the position limit have no standard deviation."""
+        """Reported mass and acting first moments. Beyond the position limit, moments have no standard deviation."""
         found = super().parameters_as_reported(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
@@ -240,7 +240,7 @@ def _segments_with_length(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("length_scale")
 class LengthScale(EffectBase):
-    """Scale factor on the link lengths of a segment; its mass is unchanged."""
+    """Scale factor on the link lengths of a segment. Its mass is unchanged."""
 
     equation = "link lengths times scale"
     required_excitation = "how long it is"
@@ -254,7 +254,7 @@ class LengthScale(EffectBase):
 
 @EFFECTS.register("rotor_inertia")
 class RotorInertia(EffectBase):
-    """Rotor inertia of a motor, reflected to its joint; it adds kinetic energy T += 1/2 armature v^2."""
+    """Rotor inertia of a motor, reflected to its joint. It adds the kinetic energy 1/2 armature v^2."""
 
     equation = "T += 1/2 armature v^2"
     required_excitation = "how hard it accelerates"
@@ -317,7 +317,7 @@ def _world(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("gravity_scale")
 class GravityScale(EffectBase):
-    """Additional weight of the object, as a fraction of its full weight; its inertia is unchanged."""
+    """Additional weight of the object as a fraction of its full weight. Its inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
     required_excitation = "its orientation to gravity"
@@ -338,7 +338,7 @@ class GravityScale(EffectBase):
 
 @EFFECTS.register("gravity_tilt")
 class GravityTilt(EffectBase):
-    """Rotation of the gravity vector by rx about the world's x axis, then by ry about the world's y axis."""
+    """Rotation of gravity by rx about the world's x axis, then by ry about its y axis."""
 
     equation = "g = Ry(ry) Rx(rx) g_0"
     required_excitation = "its orientation to gravity"

@@ -149,12 +149,12 @@ class _JointPresliding(EffectBase):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """`s`, the fraction of tau_c that acts, from -1 to 1."""
+        """The fraction `s` of tau_c that acts, from -1 to 1."""
         return ("s",)
 
     @property
     def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
-        """Bound 1 on the initial |s|; the value of `s` at the start of a recording is estimated."""
+        """Bound 1 on the initial |s|. The initial `s` of every recording is estimated."""
         return dict.fromkeys(self.internal_coordinate_symbols, 1.0)
 
     def step_terms(self, state: MidpointState) -> StepTerms:

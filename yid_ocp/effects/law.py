@@ -1,4 +1,4 @@
-"""A law that has no name: a torque at a joint or segment as a smooth function of what the model knows there."""
+"""Laws without a name: a torque at a joint or segment as a smooth function of known quantities."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _SPACING_RTOL = 1e-3  # by which knots that are read may be apart unevenly
 
 @dataclass(frozen=True)
 class LawTable:
-    """Torque as a function of one quantity: values at equally spaced knots, shape (k,), and their standard deviations.
+    """Torque as a function of one quantity, with values and their standard deviations at equally spaced knots (k,).
 
     Between the knots runs the natural cubic spline through them, beyond them the torque stays what it is at the end.
     """
@@ -49,7 +49,7 @@ class LawTable:
     torque_std: Array  # [N m]; NaN where it is not known
 
     def torque_at(self, x: Array) -> Array:
-        """Torque [N m] at values of the quantity, shape (m,)."""
+        """Torque at values of the quantity, shape (m,) [N m]."""
         spline = scipy.interpolate.CubicSpline(self.knots, self.torque, bc_type="natural")
         return np.asarray(spline(np.clip(x, self.knots[0], self.knots[-1])), float)
 
@@ -74,18 +74,18 @@ class Law(EffectBase):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """The quantities that the torque depends on."""
+        """Quantities on which the torque depends."""
         return tuple(self.knots or ())
 
     def restricted_to(self, quantities: Sequence[str]) -> Law:
-        """The same law as far as it depends on some quantities; the others' parameters are not part of it."""
+        """Restrict the law to some quantities. The others' parameters are removed."""
         kept = {name: own for name, own in (self.knots or {}).items() if name in quantities}
         definitions = [d for d in self.definitions if d.name.rstrip("0123456789") in kept]
         entries = Parameters(self.parameters[f"{self.label}.{d.name}"] for d in definitions)
         return replace(self, parameters=entries, definitions=tuple(definitions), knots=kept)
 
     def parameter_names_of(self, quantity: str) -> tuple[str, ...]:
-        """Names of the parameters that are values at the knots of one quantity."""
+        """Names of the parameters at the knots of one quantity."""
         return tuple(f"{self.label}.{quantity}{k}" for k in range(len((self.knots or {})[quantity])))
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -160,7 +160,7 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
 
 
 def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
-    """Quantities that a law may depend on at a location: no load where nothing drives, commands of servos only.
+    """Quantities on which a law at a location may depend. Load needs a drive, command a servo.
 
     Empty where no law is possible.
     """
@@ -175,7 +175,7 @@ def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]
 def quantity_values_along(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
-    """Values of a quantity at a location at all midpoints of a rollout, shape (N, joints); NaN for no command.
+    """Values of a quantity at a location at all midpoints of a rollout, shape (N, joints). NaN for no command.
 
     `nodes` holds `state` (N + 1, nx), `torque` (N, nu), `multipliers` (N, m) and the `time_step` [s] as an array.
     """
@@ -219,7 +219,7 @@ def quantity_values_along(
 
 
 def make_law(location: str, system: System, tables: Sequence[LawTable], torque_scale: float = math.inf) -> Law:
-    """Make a law at a joint or segment from its tables; `torque_scale` [N m] is the size that is expected of it.
+    """Make a law at a joint or segment from its tables. `torque_scale` is its expected size [N m].
 
     `ConfigError` where no law is possible at the location, or not of the quantities.
     """
@@ -245,7 +245,7 @@ def make_law(location: str, system: System, tables: Sequence[LawTable], torque_s
 
 
 def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ...]:
-    """Read a law's tables from a CSV file, as `write_law_tables` writes it.
+    """Read a law's tables from a CSV file with text from `law_tables_csv`.
 
     `DataError` where the file cannot be read as such, its knots are not evenly spaced and increasing, or it is not of
     the quantities of `depends_on`.
@@ -280,7 +280,7 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
 
 
 def law_tables_csv(tables: Sequence[LawTable]) -> str:
-    """Text of a CSV file of a law's tables, which `read_law_tables` reads."""
+    """Write a law's tables as CSV text that `read_law_tables` reads."""
     lines = [",".join(_TABLE_COLUMNS)]
     for table in tables:
         unit = LAW_QUANTITY_UNITS[table.quantity]

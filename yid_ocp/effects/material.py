@@ -1,4 +1,4 @@
-"""Material of the object's segments: losses, stress relaxation, hysteresis, and errors of the nominal springs."""
+"""Effects of the object's material: losses, stress relaxation, hysteresis, and errors of the nominal springs."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class _SpringChange(_SegmentEffect):
 
 @EFFECTS.register("kelvin_voigt")
 class KelvinVoigt(_SegmentEffect):
-    """Kelvin-Voigt damping F = -tau kappa v, proportional to stiffness kappa, on all joints of a segment."""
+    """Kelvin-Voigt damping on all joints of a segment: F = -tau kappa v with stiffness kappa."""
 
     equation = "F = -tau kappa v"
     required_excitation = "how fast it moves"
@@ -79,7 +79,7 @@ class KelvinVoigt(_SegmentEffect):
 
 @EFFECTS.register("standard_linear_solid")
 class StandardLinearSolid(_SegmentMemory):
-    """Standard linear solid: a spring and a damper in series, parallel to every bend and twist spring of a segment.
+    """Standard linear solid of a segment. A spring and a damper in series are parallel to every bend and twist spring.
 
     V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt.
     """
@@ -105,7 +105,7 @@ class StandardLinearSolid(_SegmentMemory):
 
 @EFFECTS.register("hysteresis")
 class Hysteresis(_SegmentMemory):
-    """Hysteresis of a segment: a Dahl friction element parallel to every bend and twist spring.
+    """Hysteresis of a segment. A Dahl friction element is parallel to every bend and twist spring.
 
     F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start
     of a recording z = 0: what came before is not known. From Dahl (1968), as in `joint_presliding`.
@@ -141,7 +141,7 @@ class Hysteresis(_SegmentMemory):
 
 @EFFECTS.register("cubic_stiffness")
 class CubicStiffness(_SegmentEffect):
-    """Springs that stiffen (k3 > 0) or soften (k3 < 0) with angle: V += 1/4 k3 q^4 on every joint of a segment.
+    """Springs of a segment that stiffen (k3 > 0) or soften (k3 < 0) with angle. Each joint adds V += 1/4 k3 q^4.
 
     k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
     `with_prior_ranges_scaled_to_angles` is given the one in the data.
@@ -157,7 +157,7 @@ class CubicStiffness(_SegmentEffect):
     )
 
     def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> CubicStiffness:
-        """The effect with the prior range of k3 scaled to the segment's largest joint angle in the data."""
+        """Scale the prior range of k3 to the segment's largest joint angle in the data."""
         if self.location not in largest:
             return self
         factor = (_REFERENCE_ANGLE / max(largest[self.location], _MIN_LARGEST_ANGLE)) ** 2
@@ -171,13 +171,13 @@ class CubicStiffness(_SegmentEffect):
 
 @EFFECTS.register("rest_curvature")
 class RestCurvature(_SpringChange):
-    """Rest curvature of a segment: V = 1/2 kappa (q - q_rest)^2 with equal rest angles at all its joints."""
+    """Rest curvature of a segment, with equal rest angles at all joints: V = 1/2 kappa (q - q_rest)^2."""
 
     equation = "V = 1/2 kappa (q - q_rest)^2"
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of qx and qy [rad], added to the rest angle of every joint that bends about x or y."""
+        """Definitions of qx and qy [rad]. They add to the rest angles of bends about x and y."""
         axes = {spring.axis for spring in elastic_joints_within_segment(system, location)}
         text = "rest angle of every joint about"
         return tuple(
@@ -199,7 +199,7 @@ def _doubly_bending_segments(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("bend_anisotropy")
 class BendAnisotropy(_SpringChange):
-    """Anisotropic bending of a segment: stiffnesses about y and x differ, kappa_y = kappa_x (1 + ratio)."""
+    """Anisotropic bending of a segment. The stiffnesses about y and x differ: kappa_y = kappa_x (1 + ratio)."""
 
     equation = "kappa_y = kappa_x (1 + ratio)"
     possible_locations = _doubly_bending_segments

@@ -1,4 +1,4 @@
-"""How the object is held: springs at its foot and its junctions; grasps that are displaced, compliant or slipping."""
+"""Effects of how the object is held: compliant mounts and junctions, and displaced, compliant or slipping grasps."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class _JointInsertion(EffectBase):
 
 @EFFECTS.register("mount_compliance")
 class MountCompliance(_JointInsertion):
-    """Massless rotational spring under the object's foot or clamp, about the x and y axes of the first link."""
+    """Massless rotational spring under the object's foot or clamp, about x and y of the first link."""
 
     equation = "two joints with V = 1/2 stiffness q^2 before the first link"
     possible_locations = _root_joints_by_base
@@ -88,7 +88,7 @@ class MountCompliance(_JointInsertion):
 
 @EFFECTS.register("junction_compliance")
 class JunctionCompliance(_JointInsertion):
-    """Massless two-axis rotational spring at a junction, between a segment and the branches that leave it there.
+    """Massless two-axis rotational spring between a segment and the branches that leave it at a junction.
 
     At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
     about its own.
@@ -118,7 +118,7 @@ class _GraspChange(EffectBase):
 
 @EFFECTS.register("grasp_offset")
 class GraspOffset(_GraspChange):
-    """Displacement (dx, dy, dz) of the grasped point from its nominal position, in the gripper's frame."""
+    """Displacement (dx, dy, dz) of the grasped point from its nominal position in the gripper's frame."""
 
     equation = "phi = (holder + R (dx, dy, dz)) - held"
     declared_parameters = tuple(
@@ -132,7 +132,7 @@ class GraspOffset(_GraspChange):
 
 @EFFECTS.register("grasp_compliance")
 class GraspCompliance(_GraspChange):
-    """Spring-damper in place of a rigid grasp: force f = phi/C + damping dphi/dt, with phi = gripper - object.
+    """Spring-damper in place of a rigid grasp: f = phi/C + damping dphi/dt with phi = gripper - object.
 
     In a step: phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, regular at C = 0, where it is the rigid
     grasp. The stretch is taken at the end of the step, which by itself damps what is fast against it. Every row of the
@@ -153,7 +153,7 @@ class GraspCompliance(_GraspChange):
 
 @EFFECTS.register("grasp_slip")
 class GraspSlip(_GraspChange):
-    """Slip of a grasp: the grasped point creeps along the tube in the direction in which the gripper pulls.
+    """Slip of a grasp along a tube. The grasped point creeps in the direction in which the gripper pulls.
 
     d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.axial_slip` counts the other way.
     At the start of a recording nothing has slipped.
@@ -167,7 +167,7 @@ class GraspSlip(_GraspChange):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """`offset`, the distance along the tube by which the grasp has slipped."""
+        """The slipped distance `offset` along the tube."""
         return ("offset",)
 
     def _changes(self, grasp: Grasp) -> dict[str, Any]:

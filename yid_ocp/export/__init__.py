@@ -1,1 +1,1 @@
-"""Export of models, equations and signals."""
+"""Export models, equations and signals."""

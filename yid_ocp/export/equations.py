@@ -1,4 +1,4 @@
-"""Export of a step's equations: CasADi functions with their C and names, and a LaTeX document."""
+"""Export a step's equations as CasADi functions with C code, and as a LaTeX document."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def export_step_functions(
 def write_equation_sheet(
     path: Path, symbols: NamedStepEquations, theta: Array, free: Sequence[str], time_step: float
 ) -> None:
-    """Write the LaTeX document of a step's equations; `OutputError` if the file cannot be written.
+    """Write a step's equations as a LaTeX document. `OutputError` if the file cannot be written.
 
     Values `theta` are filled in for all parameters but the `free` ones, which stay symbols; a table lists their values.
     """

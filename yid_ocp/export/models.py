@@ -1,4 +1,4 @@
-"""Export of models: a system's tree as URDF or SDF, and what a format has for each parameter and effect."""
+"""Export a system's tree as URDF or SDF, and list what a format has for each parameter and effect."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
 
 
 def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
-    """The URDF text of a system: joints with damping and friction, links with inertias; no springs, no grasps.
+    """Convert a system to URDF text: joints with damping and friction, links with inertias; no springs, no grasps.
 
     A `mujoco` element gives MuJoCo the least masses that it asks for; others read over it.
     """
@@ -53,7 +53,7 @@ def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
 
 
 def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
-    """The SDF 1.10 world text of a system: joints with springs, damping, friction, links with inertias; no grasps."""
+    """Convert a system to an SDF 1.10 world. Joints have springs, damping and friction; grasps are left out."""
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
@@ -125,14 +125,14 @@ def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class FeatureExportSupport:
-    """Whether an export format can express a parameter or effect: by which element, or the reason why not."""
+    """Whether an export format can express a parameter or effect, with the element or the reason."""
 
     status: _SupportStatus
     how: str
 
     @property
     def is_lost(self) -> bool:
-        """Whether the format leaves out something that moves or holds; what only sensors read is no part of a model."""
+        """Whether the format leaves out something that moves or holds. Effects on sensors alone do not count."""
         return self.status == "not representable" and self != _READING
 
 
@@ -213,7 +213,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
 def format_support_by_parameter(
     system: System, effects: Mapping[str, FeatureExportSupport], form: str
 ) -> dict[str, FeatureExportSupport]:
-    """Support of an export format for each parameter, by name; a parameter of an effect has its effect's support."""
+    """Support of an export format for each parameter. Parameters of an effect have its effect's support."""
     found = {}
     for entry in system.parameters:
         owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_depending_on_symbols(system, entry.symbol))

@@ -1,4 +1,4 @@
-"""Export of signals: CSV tables, ROS 2 messages in one MCAP file for bag readers, and joint trajectories for ROS."""
+"""Export signals as CSV tables, ROS 2 messages in an MCAP file, and ROS joint trajectories."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _WORLD_FRAME = "world"
 
 @dataclass(frozen=True)
 class RosTopicTimeSeries:
-    """Time series of one ROS topic at times t (M,) [s]; times without any finite value get no message.
+    """Time series of one ROS topic at times t (M,) [s]. Times without any finite value get no message.
 
     `values` are each (M, n): of joints `position`, `velocity` and `effort`, with as many columns as there are `names`;
     of all else `xyz`, n = 3, the forces of a wrench.
@@ -82,7 +82,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
 
 
 def ros_signals_from_recording(recording: Recording) -> list[RosTopicTimeSeries]:
-    """The signals of a recording: `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
+    """Convert a recording to `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
     found: list[RosTopicTimeSeries] = []
     for group in recording.joint_and_point_groups:
         if isinstance(group, JointGroup):
@@ -127,7 +127,7 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
 
 
 def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write one table per group, `<group>.csv`, with the columns that `read_csv` knows and all digits.
+    """Write each group as a table `<group>.csv`, with all digits and the columns that `read_csv` knows.
 
     Standard deviations, the kind of effort, sensor, frame, pose and clock are not in the tables; a point not seen is an
     empty cell. Returns the files, joints first; `OutputError` where the folder or a file cannot be written.
@@ -153,7 +153,7 @@ def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[s
 def joint_trajectory_message(
     names: Sequence[str], t: Array, position: Array, velocity: Array, acceleration: Array, effort: Array
 ) -> dict[str, Any]:
-    """A joint trajectory of nj joints as a dict in the form of ROS's trajectory_msgs/JointTrajectory.
+    """Build a ROS trajectory_msgs/JointTrajectory message of nj joints as a dict.
 
     Times t (N,) count from the start [s]; all others are (N, nj). See
     https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html

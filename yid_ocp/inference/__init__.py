@@ -1,1 +1,1 @@
-"""What residuals say: whitening by input noise, covariance and verdicts of parameters, null test, and smoother."""
+"""Statistical inference from residuals: whitening, covariances and verdicts of parameters, null tests and smoothing."""

@@ -1,4 +1,4 @@
-"""One step of a linear Kalman filter with its smoother, and a run of steps in compiled code.
+"""Linear Kalman filter and smoother, step by step or in compiled code.
 
 References
 ----------
@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 @dataclass(frozen=True)
 class FilterStateTransition:
-    """State transition x' = (M (s, p1 + ... + pg), f p) of a filter; x = (s, p) with g parameter groups p1 to pg."""
+    """State transition of a filter: x' = (M (s, p1 + ... + pg), f p), x = (s, p), with g parameter groups p1 to pg."""
 
     state_rows: Array  # M, shape (ns, ns + m)
     decay: Array  # f, shape (nx - ns,), nx - ns = g m
@@ -39,7 +39,7 @@ class FilterStateTransition:
         return len(self.decay) // m if m else 0, m
 
     def propagate_state(self, columns: Array) -> Array:
-        """States (nx, c) after the step, from the states (nx, c) before it; each column is a state."""
+        """Propagate states (nx, c) over the step. Each column is a state."""
         ns, rows, own = len(self.state_rows), self.state_rows, columns[len(self.state_rows) :]
         together = own.reshape(*self._shape, own.shape[1]).sum(axis=0)
         return np.vstack([rows[:, :ns] @ columns[:ns] + rows[:, ns:] @ together, self.decay[:, None] * own])
@@ -54,7 +54,7 @@ class FilterStateTransition:
 
 @dataclass(frozen=True)
 class KalmanStepMatrices:
-    """One step of a linear Kalman filter with fixed gains: a measurement update, then a state transition.
+    """One step of a linear Kalman filter with fixed gains. A measurement update precedes a state transition.
 
     A state x = (s, p) of s and parameters p is measured by y = H x + e with noise e of unit covariance, and goes on by
     x' = (M x, f p) + process noise. With the covariance P before the measurement and S = I + H P H', the normalized
@@ -67,12 +67,12 @@ class KalmanStepMatrices:
     transition: FilterStateTransition
 
     def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
-        """Normalized innovations (r, c) of the measurements (r, c), and the state means (nx, c) after the step."""
+        """Normalized innovations (r, c) of measurements (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
-        """Smoothed measurement noise (r, c), and the costate (nx, c) before the step, from the costate after it.
+        """Smoothed measurement noise (r, c), and the costate (nx, c) before the step from the one after it.
 
         The smoothed state is the filter's prediction + P costate.
         """
@@ -81,7 +81,7 @@ class KalmanStepMatrices:
         return noise, pulled + self.observation.T @ noise
 
     def costate_covariance_before_step(self, information: Array) -> Array:
-        """Covariance (nx, nx) of the costate before the step, from its covariance `information` after the step."""
+        """Covariance of the costate before the step from `information`, the one after it, (nx, nx)."""
         shaped, projected = self.whitening @ self.observation, self.projected_covariance
         pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
         pulled -= (pulled @ projected.T) @ shaped
@@ -92,7 +92,7 @@ class KalmanStepMatrices:
 def kalman_matrices_and_next_covariance(
     covariance: Array, observation: Array, transition: FilterStateTransition
 ) -> tuple[KalmanStepMatrices, Array, float]:
-    """A filter step with fixed gains, the state covariance after it without process noise, and log det S.
+    """Compute a filter step's gains, the next state covariance without process noise, and log det S.
 
     `covariance` is P (nx, nx) before the measurement by H (r, nx). The determinant is infinite, and S counts by its
     diagonal alone, where covariances differ by so many decades that rounding shows.

@@ -1,4 +1,4 @@
-"""Linear model of a residual: its slopes along a trajectory, bounded steps and the reduction they promise."""
+"""Linear model of a residual along a trajectory, with bounded steps and the cost reductions that it predicts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from yid_ocp.problem.model_functions import ModelFunctions, TimeGridStateValues
 
 @dataclass(frozen=True)
 class NominalTrajectory:
-    """Trajectory of an episode with its delay-corrected measurements, about which the residual is linearized.
+    """Trajectory of an episode with its measurements, about which the residual is linearized.
 
     Measurements are shifted by their delays to the times at which they were true. The derivatives of the start by the
     first angles and the first torque of the driven joints, shape (nx, nu), are zero where it does not follow from them.
@@ -42,7 +42,7 @@ class NominalTrajectory:
 def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
-    """Nominal trajectory of an episode, made from the episode's prediction at the parameters `theta`."""
+    """Make an episode's nominal trajectory from its prediction at the parameters `theta`."""
     own = predictor.theta_with_episode_values(episode, theta)
     rest = result.equilibrium
     sizes = predictor.integrator_step.sizes
@@ -56,7 +56,7 @@ def nominal_trajectory_from_prediction(
 
 @dataclass(frozen=True)
 class ResidualDerivativesAtNodes:
-    """Derivatives of a recording's r residuals with respect to states and efforts at the nodes around each sample.
+    """Derivatives of r residuals of a recording by states and efforts at the nodes around each sample.
 
     Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
     """
@@ -69,7 +69,7 @@ class ResidualDerivativesAtNodes:
     def from_nominal_trajectory(
         course: NominalTrajectory, *, with_neighbours: bool = False
     ) -> ResidualDerivativesAtNodes:
-        """Residual derivatives, computed from the sensors' derivatives along a nominal trajectory.
+        """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
 
         A sensor that reads velocities, accelerations or constraint forces depends on four nodes, the first one before
         its sample's; `DataError` of such a sensor unless that is allowed by `with_neighbours`.
@@ -118,19 +118,19 @@ class ResidualDerivativesAtNodes:
 
     @property
     def visible_state_mask(self) -> BoolArray:
-        """Mask (nx,) of the states on which at least one residual depends."""
+        """Mask of the states on which at least one residual depends, shape (nx,)."""
         return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
     def select_states(self, kept: IntArray) -> ResidualDerivativesAtNodes:
-        """The derivatives with respect to only the states at the indices `kept`."""
+        """Keep only derivatives by the states at the indices `kept`."""
         return replace(self, by_state=self.by_state[:, :, kept])
 
     def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesAtNodes:
-        """The derivatives of only the residuals at the indices `rows`."""
+        """Keep only derivatives of the residuals at the indices `rows`."""
         return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Residual derivatives (r, d) in d directions, from those of node states (K, nx, d) and efforts (K, nc, d).
+        """Residual derivatives (r, d) in d directions from those of node states (K, nx, d) and efforts (K, nc, d).
 
         The K nodes begin with `first`; a residual beyond them uses the last one.
         """
@@ -144,7 +144,7 @@ class ResidualDerivativesAtNodes:
         return found
 
     def residual_indices_by_first_node(self, last: int) -> list[IntArray]:
-        """Indices of the residuals whose first node is node k, one array for each k from 0 to `last`."""
+        """For each node from 0 to `last`, indices of the residuals whose first node it is."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
@@ -154,7 +154,7 @@ _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
 def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
-    """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
+    """Noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
     units = np.ones(len(evaluation.residual))
@@ -164,7 +164,7 @@ def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Ev
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
-    """Return the bounded step d that minimises |J d + r|^2 + mu c |d|^2; c is the largest squared column norm of J."""
+    """Solve for the bounded step d that minimises |J d + r|^2 + mu c |d|^2; c: largest squared column norm of J."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
     small = np.zeros((count + 1, count + 1))
@@ -189,14 +189,14 @@ def predicted_cost_reduction(jacobian: Array, residual: Array, step: Array) -> f
 
 
 def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
-    """Whether no step from `x` promises a relevant cost reduction in the linear model; False without a Jacobian."""
+    """Whether no step from `x` predicts a relevant cost reduction. False without a Jacobian."""
     noise = problem.rms_noise_of_data_residuals**2
     worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * noise)
     return achievable_cost_reduction(problem, x, evaluation) <= worth
 
 
 def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
-    """Predicted cost reduction of the best step up to each unknown's size; infinite without a Jacobian."""
+    """Predicted cost reduction of the best step within the unknowns' sizes. Infinite without a Jacobian."""
     if evaluation.jacobian is None:
         return math.inf
     if not len(x):
@@ -208,7 +208,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def solve_step_within_unknown_sizes(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Least-squares step (nx,) within bounds; each unknown moves by at most max(its value, its typical size)."""
+    """Least-squares step (nx,) within bounds. An unknown moves by at most its value or typical size."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)

@@ -1,4 +1,4 @@
-"""Null test: whether a residual is larger than noise alone explains.
+"""Null test of whether noise alone explains a residual.
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
 (white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a
@@ -28,7 +28,7 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 @dataclass(frozen=True)
 class ResidualChannel:
-    """Sample times of one scalar sensor output of a recording, and the samples' indices in the residual vector."""
+    """Sample times of one scalar sensor output, and the samples' indices in the residual vector."""
 
     recording: str
     channel: str
@@ -41,7 +41,7 @@ class ResidualChannel:
 
 @dataclass(frozen=True)
 class AssumedChannelNoiseLevel:
-    """Noise standard deviation that a problem assumes for one channel: the median over its (smoothed) samples."""
+    """Noise standard deviation that a problem assumes for one channel, the median over its samples."""
 
     channel: str
     unit: str
@@ -51,7 +51,7 @@ class AssumedChannelNoiseLevel:
 
     @property
     def noise_rmse(self) -> float:
-        """Root mean square error that noise alone gives; for points that of a distance."""
+        """Root mean square error from noise alone. For points it is that of a distance."""
         return math.sqrt(self.outputs_per_channel) * self.noise_std
 
 
@@ -68,7 +68,7 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """Null test result: chi2 per degree of freedom, and the probability that noise alone gives a value this large."""
+    """Result of a null test: chi2 per degree of freedom and the p-value."""
 
     chi2_per_dof: float
     degrees_of_freedom: float  # effective ones, of autocorrelated noise
@@ -78,7 +78,7 @@ class NullTestResult:
 
 
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
-    """Noise level that the problem assumes for each channel; the level is stated, not measured."""
+    """Noise level that the problem assumes for each channel. It is stated, not measured."""
     found: dict[str, list[Array]] = {}
     told: dict[str, tuple[str, int]] = {}
     for episode in problem.episodes:
@@ -100,7 +100,7 @@ def _variance_inflation(autocorrelation: Array) -> float:
 
 
 def chi2_p_value(chi2: float, degrees: float) -> float:
-    """Probability that noise alone gives at least `chi2` with `degrees` degrees of freedom; 1 for zero degrees."""
+    """Probability that noise alone gives at least `chi2`. It is 1 for zero degrees of freedom."""
     return float(scipy.special.chdtrc(degrees, max(chi2, 0.0))) if degrees else 1.0
 
 
@@ -111,7 +111,7 @@ def residual_chi2_null_test(
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
-    """Test the hypothesis that a whitened residual (nr,), fitted with a number of parameters, is noise alone.
+    """Test whether a whitened residual (nr,) is noise alone after a fit of `parameters` parameters.
 
     Rows that belong to no series (priors) do not count. `level` is the false-discovery rate of the windows, `window`
     their length [s].
@@ -130,7 +130,7 @@ def residual_chi2_null_test(
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Return a residual r (nr,) in noise units, whitened by k further independent errors too: (I + F F')^(-1/2) r.
+    """Whiten a residual r (nr,) in noise units against k more independent errors too: (I + F F')^(-1/2) r.
 
     The `spread` F (nr, k) is the change of the residual per standard deviation of each error; non-finite columns are
     ignored.
@@ -143,7 +143,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
 def residuals_exceed_noise(
     tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
 ) -> bool:
-    """Whether residuals of one model, fitted or held out, exceed noise significantly and by a relevant amount."""
+    """Whether one model's residuals, fitted or held out, exceed noise by a significant and relevant amount."""
     significant = min_bonferroni_p_value(tests) < limits.significance_level
     return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2_per_dof
 
@@ -178,7 +178,7 @@ def _windows(
 
 
 def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """Whether each p-value is significant at the false-discovery rate `level` among `tries` tests, listed here or not.
+    """Mark the p-values that are significant at the false-discovery rate `level` among `tries` tests, listed or not.
 
     Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
     """
@@ -195,7 +195,7 @@ def times_since_recording_start(episode: Episode, samples: SensorMeasurements) -
 
 
 def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
-    """Sample times and residual indices of each scalar sensor output of each recording of a problem."""
+    """Sample times and residual indices of every scalar sensor output of every recording."""
     series: list[ResidualChannel] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):

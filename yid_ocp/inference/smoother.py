@@ -1,4 +1,4 @@
-"""The weak-constraint smoother: which unknown forces, grasp offsets and sensor biases would explain the residual.
+"""Weak-constraint smoother that finds unknown forces, grasp offsets and sensor biases behind a residual.
 
 The unknowns of `smoother_model` change from interval to interval by
 
@@ -48,7 +48,7 @@ _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promisin
 
 @dataclass(frozen=True)
 class SmoothedUnknowns:
-    """Smoothed unknown forces, offsets and biases of one recording: mean and standard deviation in J intervals."""
+    """Smoothed unknown forces, offsets and biases of one recording, with mean and standard deviation per interval."""
 
     recording: str
     interval_edges: Array  # shape (J + 1,) [s]
@@ -61,7 +61,7 @@ class SmoothedUnknowns:
 
 @dataclass(frozen=True)
 class SmoothedUnknownsResult:
-    """Result of the weak-constraint smoother: smoothed unknowns, and the evidence for every group of unknowns."""
+    """Result of the weak-constraint smoother, with smoothed unknowns and the evidence for each group."""
 
     smoothed_unknowns: tuple[SmoothedUnknowns, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # at the largest evidence [squared reference]
@@ -79,14 +79,14 @@ class SmoothedUnknownsResult:
 
     @property
     def explainable_gap_fraction(self) -> float:
-        """Fraction of the gap G = max(0, chi2/n - 1) that unknown forces, offsets and biases can explain."""
+        """Fraction of the gap G = max(0, chi2/n - 1) that the smoothed unknowns can explain."""
         gap = self.chi2_before / self.dof_before - 1
         rest = max(self.chi2_after / self.dof_after - 1, 0.0)
         return float(np.clip(1 - rest / gap, 0.0, 1.0)) if gap > 0 else 0.0
 
     @property
     def plant_or_sensor_origin(self) -> str:
-        """Origin of the gap: "none", "plant", "sensor", "both", or "either" if plant and sensor are confounded."""
+        """Origin of the gap: "none", "plant", "sensor", "both", or "either" if they are confounded."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
         heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
@@ -330,7 +330,7 @@ def select_and_smooth_unknowns(
     evaluation: Evaluation,
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
 ) -> SmoothedUnknownsResult:
-    """Choose the groups of unknowns with the largest evidence at a whitened problem's fit `x`, and estimate them."""
+    """Choose the groups of unknowns with the largest evidence at a whitened fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
         models = recording_models_with_unknown_forces(problem, x, evaluation, limits)
@@ -361,7 +361,7 @@ def select_and_smooth_unknowns(
 def force_log_likelihood_coefficients(
     model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
-    """Return g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2; f (J,) are one unknown's values by interval.
+    """Coefficients g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2 of one unknown's values f (J,).
 
     f is in units of the unknown's reference; free parameters, states and all other unknowns, whose groups have these
     variances [squared reference], are integrated out.

@@ -1,4 +1,4 @@
-"""Linear model of a recording: how unknown forces, grasp offsets and sensor biases change its residual.
+"""Linear model of a recording's residual under unknown forces, grasp offsets and sensor biases.
 
 About the rollout of a fitted model every DEL row gets an unknown generalized force, every segment an unknown push (a
 force in the world on a point of it, which all joints between it and the ground feel), every grasp an unknown offset and
@@ -54,7 +54,7 @@ _FORCE_POINT = "75%"  # by arc length, where a segment is pushed: near what acts
 
 @dataclass(frozen=True)
 class SmootherThresholds:
-    """Thresholds of the smoother: prior sizes of unknowns, and the log evidence for a group (5: odds of 150 to 1)."""
+    """Prior sizes of unknowns, and the log evidence that a group requires (5: odds of 150 to 1)."""
 
     min_log_bayes_factor: Annotated[
         float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
@@ -74,7 +74,7 @@ DEFAULT_SMOOTHER_THRESHOLDS = SmootherThresholds()
 
 @dataclass(frozen=True)
 class SmoothedUnknownGroup:
-    """Group of unknown forces, offsets or biases that share a location and a standard deviation."""
+    """Group of unknown forces, offsets or biases with the same location and standard deviation."""
 
     location: str
     kind: _UnknownKind
@@ -170,7 +170,7 @@ def _unknown_forces(
 
 
 def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
-    """Return the location of a sensor's bias: camera, `wrist:FRAME`, the arm that holds the frame, or its group."""
+    """Location of a sensor's bias: camera, `wrist:FRAME`, the arm that holds the frame, or its group."""
     if sensor.camera_pose is not None:
         return "camera"
     if isinstance(sensor, MountedSensor):
@@ -244,7 +244,7 @@ class _IntervalModel:
 
 @dataclass(frozen=True)
 class LinearResidualModel:
-    """Linear state-space model of one recording's residual, with one set of matrices for each time interval."""
+    """Linear state-space model of one recording's residual, with one set of matrices per time interval."""
 
     recording: str
     intervals: tuple[_IntervalModel, ...]
@@ -258,7 +258,7 @@ class LinearResidualModel:
     torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
 
     def smoothed_unknown_prior_variances(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
-        """Variances (nd,) [squared reference] of all unknowns: the variance of the group plus that of torque noise."""
+        """Prior variances of all unknowns, group variance plus torque noise, (nd,) [squared reference]."""
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 
@@ -269,7 +269,7 @@ def recording_models_with_unknown_forces(
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
     interval: float = _MIN_INTERVAL,
 ) -> tuple[LinearResidualModel, ...]:
-    """Return a residual model of every recording that is linear in unknown forces, offsets and biases, about `x`.
+    """Linearize every recording's residual about `x` in unknown forces, offsets and biases.
 
     `evaluation` is that at `x`, with its Jacobian; unknowns are constant over `interval` [s] at the least.
     """

@@ -44,7 +44,7 @@ _MAX_CHECKED_PARAMETERS = 12
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """Null test of a fit: chi2, p-value, and whether the model explains the recordings on which it was fitted."""
+    """Null test of a fit on its own recordings, with chi2, p-value and whether the model explains them."""
 
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
@@ -81,7 +81,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class EstimateShiftByLinksAndTimeStep:
-    """Shifts of one estimate, in its unit, by dividing links in two and by halving the time step; None if not tried."""
+    """Shifts of one estimate when links are divided in two or the time step is halved. None if not tried."""
 
     links: float | None = None
     time_step: float | None = None
@@ -92,7 +92,7 @@ def assess_goodness_of_fit(
     evaluation: Evaluation,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> GoodnessOfFit:
-    """Null test of a fit on its own recordings; residuals are in noise units for any weighting of the problem."""
+    """Test a fit on its own recordings. Residuals are in noise units for any weighting of the problem."""
     if not evaluation.ok:
         return GoodnessOfFit(math.nan, math.nan, False)
     residual = evaluation.residual
@@ -109,7 +109,7 @@ def assess_goodness_of_fit(
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
-    """Return the covariance (nx, nx) of the unknowns from data and stated priors, and chi2 per degree of freedom.
+    """Covariance of the unknowns from data and stated priors, (nx, nx), and chi2 per degree of freedom.
 
     Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one. A prior
     counts with at least the standard deviation that was stated, however few of the stated ones are noise.
@@ -124,7 +124,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 
 
 def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
-    """Factor F (nx, nx) of the unknowns' covariance F F' that results from noise alone.
+    """Factor F of the unknowns' covariance F F' from noise alone, shape (nx, nx).
 
     The factor keeps the digits that a covariance with uninformed directions loses.
     """
@@ -216,7 +216,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
 
 
 def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
-    """Covariance (nx, nx) of the unknowns at a fit; if the model does not explain the data, it includes the misfit."""
+    """Covariance of the unknowns at a fit, (nx, nx). It includes the misfit if the model does not explain the data."""
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, evaluation)
     return covariance if fit.explains else _misfit_sandwich_covariance(problem, evaluation, covariance)
 
@@ -254,13 +254,13 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
 
 
 def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
-    """Names of the unknowns that are parameters (local ones with their recording's name), not initial states."""
+    """Names of the unknowns that are parameters, not initial states. Local ones include the recording's name."""
     parameters = {*problem.shared_parameters, *problem.local_parameters}
     return tuple(name for name in problem.unknown_names if name.split("[")[0] in parameters)
 
 
 def std_from_covariance(covariance: Array, x: Array) -> Array:
-    """Standard deviations (nx,) from a covariance; infinite where the covariance is NaN."""
+    """Standard deviations (nx,) from a covariance. They are infinite where the covariance is NaN."""
     if not len(covariance):
         return np.zeros(len(x))
     diagonal = np.diag(covariance)
@@ -268,7 +268,7 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Names and covariance for result.json, from the correlations in `matrix` (n, n) and the standard deviations.
+    """Convert correlations (n, n) and standard deviations to names and covariance for result.json.
 
     Parameters without a finite and positive standard deviation are left out: nothing is known of them.
     """
@@ -279,7 +279,7 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
 
 
 def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
-    """Cost of the data, in noise units, plus that of stated priors, without weak priors."""
+    """Cost of data (in noise units) and stated priors, without weak priors."""
     rows = problem.residual_rows
     weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
     return (evaluation.cost - weak - stated) / problem.rms_noise_of_data_residuals**2 + stated
@@ -288,7 +288,7 @@ def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation)
 def parameter_verdict(
     value: float, std: float, *, scale: float = 0.0, explains: bool = True, at_bound: bool = False
 ) -> str:
-    """Verdict on a free parameter from its value and standard deviation.
+    """Judge a free parameter by its value and standard deviation.
 
     ==================  ================================================================================================
     not_identifiable    the standard deviation is above 400 % of the value
@@ -311,7 +311,7 @@ def parameter_verdict(
 
 
 def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str:
-    """Verdict from the relative standard deviation alone: identifiable, weak or not_identifiable."""
+    """Judge a parameter by its relative standard deviation alone: identifiable, weak or not_identifiable."""
     if not math.isfinite(std):
         return "not_identifiable"
     relative, reach = std / max(abs(value), 1e-12), abs(value) + 2 * std
@@ -322,7 +322,7 @@ def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str
 
 
 def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
-    """Copy of an estimate with a profile-likelihood interval, and with std and verdict consistent with it.
+    """Copy an estimate with a profile-likelihood interval. Its std and verdict become consistent with it.
 
     Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
     a bound within `scale` is that bound. Else the wider side is two standard deviations (`verdict_by_relative_std`),
@@ -349,12 +349,12 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
 
 
 def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
-    """Whether a parameter needs no profile: it is identifiable with a relative standard deviation up to 10 %."""
+    """Whether a parameter is identifiable with a relative standard deviation up to 10 %, so it needs no profile."""
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
 
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
-    """Typical magnitude of each free parameter, from its prior, its bounds, similar parameters or its initial value.
+    """Typical magnitude of each free parameter from priors, bounds, similar parameters or initial values.
 
     A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
     same kind (`bend`, say, or else of the same unit) with the median of their sizes.
@@ -390,7 +390,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
 def parameter_estimates(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array, fit: GoodnessOfFit | None
 ) -> dict[str, ParameterEstimate]:
-    """Estimates of all parameters, local ones by recording, from the covariance (nx, nx) and evaluation at `x`.
+    """Estimate all parameters from the covariance (nx, nx) and evaluation at `x`. Local ones are listed by recording.
 
     `fit` is None where `x` is not a fit; misfit and bounds are then ignored.
     """
@@ -428,7 +428,7 @@ def parameter_estimates(
 
 
 def free_estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
-    """Copies of estimates with the verdict not_trusted, except for fixed and not_identifiable parameters."""
+    """Copy estimates with the verdict not_trusted. Fixed and not_identifiable parameters keep theirs."""
     doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}
 
@@ -446,7 +446,7 @@ VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VE
 
 
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
-    """Sentence that states whether a model explains its recordings, with advice if it does not."""
+    """State in a sentence whether a model explains its recordings, with advice if it does not."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "whether the model explains the recordings is not known"
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}"
@@ -456,14 +456,14 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
 
 
 def value_and_uncertainty_text(value: float, std: float | None, interval: ConfidenceInterval | None) -> str:
-    """Format a value with its 95 % interval if there is one, else with its standard deviation if there is one."""
+    """Format a value with its 95 % interval, else with its standard deviation, where there is one."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
     return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return a finite number unchanged, and None for an infinite or NaN one."""
+    """Return a finite number unchanged, but None for infinity or NaN."""
     return value if math.isfinite(value) else None
 
 
@@ -473,7 +473,7 @@ def percent_number_text(part: float) -> str:
 
 
 def interval_text(lower: float | None, upper: float | None) -> str:
-    """Format the ends of a 95 % interval; None is an open end."""
+    """Format the ends of a 95 % interval. None is an open end."""
     if lower is None and upper is None:
         return "open"
     if lower is None:

@@ -1,4 +1,4 @@
-"""Noise that drives the motion: from the residual of one recording to the innovations of a Kalman filter.
+"""Whiten a recording's residual by a Kalman filter that includes errors of recorded torques and encoders.
 
 Recorded torques of driven joints are wrong by w, white from recorded sample to recorded sample, and by b, constant over
 a recording; encoders by v. Along a rollout the error d of its state, model less truth, obeys to first order
@@ -86,7 +86,7 @@ class _SmoothedInputErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class WhiteningFilter:
-    """Kalman filter, linearized along one rollout, that whitens the residual of a recording."""
+    """Kalman filter that whitens the residual of a recording, linearized along one rollout."""
 
     filter_steps: tuple[_FilterPart, ...]  # up to the last node
     input_error_model: InputErrorModel  # with the values of b and w about which it is linearised
@@ -95,7 +95,7 @@ class WhiteningFilter:
     torque_bias_std: Array  # of b after all measurements, shape (nu,) [N m]
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Normalized innovations (r, c) of residual columns, and torque biases (nu, c) [N m] estimated from all rows.
+        """Whiten residual columns to innovations (r, c), and estimate torque biases (nu, c) [N m] from all rows.
 
         Rows (r, c) are a residual in units of the sensors' noise, then columns of its derivative; `push` (N, nu, c) is
         the tracking filter's correction of the torque, and its derivative [N m].
@@ -230,7 +230,7 @@ def _filter_steps(
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
-    """Constant torque error (nu,) [N m] of each driven joint, estimated from all measurements of an episode."""
+    """Estimate the constant torque error of each driven joint from all measurements of an episode, (nu,) [N m]."""
     return whitening.whiten_and_estimate_torque_bias(
         _plain(episode, result)[:, None], result.torque_correction_and_sensitivity
     )[1][:, 0]
@@ -313,7 +313,7 @@ def _behind_effects(
 def problem_whitened_at(
     problem: EstimationProblem, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
 ) -> EstimationProblem:
-    """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
+    """Whiten a problem's residuals by sensor and process noise, linearized at `x`.
 
     It is the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened already,
     the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number of
@@ -339,7 +339,7 @@ def problem_whitened_at(
 def problem_with_whitened_held_out(
     problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
 ) -> EstimationProblem:
-    """The problem with held-out residuals whitened by all noise at `x`, or by sensor noise if a rollout fails.
+    """Whiten held-out residuals by all noise at `x`, or by sensor noise if a rollout fails.
 
     Filters are relinearized about the smoothed motion; `keep_weights` weighs once, which is enough for torque offsets.
     """
@@ -353,7 +353,7 @@ def problem_with_whitened_held_out(
 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """The problem with filters relinearized about the torque offsets at `x`, not at `frozen`; weights unchanged."""
+    """Relinearize filters about the torque offsets at `x`, not at `frozen`. Weights are unchanged."""
     parts = problem.theta_and_initial_state_deviation
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
@@ -363,7 +363,7 @@ def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, fr
 def problem_with_relinearized_held_out_whitening(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
-    """The problem with held-out filters relinearized about the torque offsets at `x`, not at `frozen`."""
+    """Relinearize held-out filters about the torque offsets at `x`, not at `frozen`."""
     before = problem.held_out_theta(frozen)
     at = [(*own, before) for own in problem.held_out_prediction_inputs(x)]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
@@ -371,12 +371,12 @@ def problem_with_relinearized_held_out_whitening(
 
 
 def problem_whitened_by_sensor_noise(problem: EstimationProblem) -> EstimationProblem:
-    """The same problem whitened by sensor noise alone, with the torque offsets estimated so far."""
+    """Whiten a problem by sensor noise alone, with the torque offsets estimated so far."""
     return _with_errors(problem, lambda errors: errors.torque_bias_part)
 
 
 def problem_without_input_errors(problem: EstimationProblem) -> EstimationProblem:
-    """The same problem with the recorded torques and angles taken as exact."""
+    """Treat the recorded torques and angles of a problem as exact."""
     return _with_errors(problem, lambda errors: None)
 
 
@@ -390,7 +390,7 @@ def _with_errors(
 
 
 def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-    """Constant torque errors (nu,) [N m] at `x` and their standard deviations, one pair for each recording.
+    """Constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
 
     None where torques are taken as exact, or where no whitening filter is set (`problem_whitened_at`).
     """
@@ -450,7 +450,7 @@ def _settled(
 def torque_bias_change_in_stds(
     some: Sequence[ProcessNoiseWhitener | None], others: Sequence[ProcessNoiseWhitener | None]
 ) -> float:
-    """Largest difference between the torque offsets of two sets of filters, in stated standard deviations."""
+    """Largest difference between two filter sets' torque offsets, in stated standard deviations."""
     pairs = zip(some, others, strict=True)
     return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)
 

@@ -1,4 +1,4 @@
-"""From symbolic step equations to CasADi functions, index tables and generated C.
+"""Generate CasADi functions, index tables and C code from symbolic step equations.
 
 Functions of several members at once, and long ones, are written in the arithmetic of `simd.c`.
 """
@@ -22,7 +22,7 @@ _Indices = NDArray[np.int32]
 
 
 class StepFunctions:
-    """CasADi functions of one step, with the arguments of `DiscreteEquations.arguments`, and their sparsity patterns.
+    """CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
 
     What is at the midpoint and after it is empty where the constraints pull at the node. A function is made, and its
     common subexpressions found, when it is first used: a kernel from the cache needs none of them.
@@ -43,7 +43,7 @@ class StepFunctions:
 
     @property
     def jacobian_parts(self) -> ca.Function:
-        """Pair vectors, then nonzeros of the rest Jacobian, that of p1, the constraint Jacobian and the curvature.
+        """Jacobian parts: pair vectors, nonzeros of the rest, that of p1, the constraint Jacobian and the curvature.
 
         The curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}.
         """
@@ -51,17 +51,17 @@ class StepFunctions:
 
     @property
     def row_scale_and_time_step(self) -> ca.Function:
-        """Scale of the balance's rows, and the time step by the recording's clock [s]."""
+        """Scale of the momentum balance's rows, and the clock-corrected time step [s]."""
         return self._function("scales")
 
     @property
     def internal_residual_at_rest(self) -> ca.Function:
-        """Equations of the internal coordinates at rest and their derivative by (q, z, lam, u), nodes being one."""
+        """Internal equations at rest, with derivatives by (q, z, lam, u). Both nodes are the same."""
         return self._function("resting")
 
     @property
     def all_functions(self) -> tuple[ca.Function, ...]:
-        """All CasADi functions of the step, in the order in which C code is generated."""
+        """All CasADi functions of the step, in the order of the generated C code."""
         return tuple(map(self._function, self._outputs))
 
     def _expression_text(self) -> str:
@@ -72,7 +72,7 @@ class StepFunctions:
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
-    """Build the CasADi functions that the stepping kernel calls, from the symbolic step equations.
+    """Build the CasADi functions that the stepping kernel calls.
 
     The bodies' part of the Jacobians comes as vectors per joint, everything else from automatic differentiation.
     """
@@ -156,7 +156,7 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 
 
 def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
-    """CasADi function: sparse derivatives of (residual, p1, prescribed effort) with respect to the named parameters."""
+    """Build the sparse derivatives of (residual, p1, prescribed effort) by the named parameters, a CasADi function."""
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     prescribed = list(e.system.prescribed_coordinate_indices)
@@ -168,7 +168,7 @@ def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[st
 
 @dataclass(frozen=True)
 class StepSparsityTables:
-    """Index tables of a step's Jacobians, valid at every state: sparsity, elimination order and fill-in."""
+    """Index tables of a step's Jacobians, valid at every state."""
 
     unknown_rows: _Indices  # full row (balance, internal, constraint) of each unknown (free q1, z1, lam), (ny,)
     elimination_order: _Indices  # internal coordinates, tips before roots, multipliers last, (ny,)
@@ -181,7 +181,7 @@ class StepSparsityTables:
 
 
 def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
-    """Compute a step's index tables: sparsity, elimination order and fill-in of its Jacobians."""
+    """Compute the sparsity, elimination order and fill-in of a step's Jacobians."""
     e = functions.equations
     system = e.system
     n, nz, m = system.n_coordinates, e.z0.numel(), e.lam.numel()
@@ -235,14 +235,14 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
 
 
 def kernel_source_text(functions: StepFunctions, tables: StepSparsityTables) -> str:
-    """Text that determines `kernel_c_source`, without generating it: equations, tables, and the generators' files."""
+    """Collect the text that identifies a kernel without generating C: equations, tables and the generators' files."""
     folder = resources.files("yid_ocp.integrator")
     files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]
     return "\0".join([*files, *_kernel_tables(functions, tables), functions._expression_text()])
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
-    """C source text of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables, then `kernel.c`.
+    """Generate the C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables, then `kernel.c`.
 
     With `batched` for several rollouts at once, as many as `yid_simd_width` returns; then None where a function has no
     SIMD form.
@@ -311,7 +311,7 @@ def _step_source(functions: Sequence[ca.Function]) -> str:
 
 
 def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
-    """C source text that CasADi generates for `functions`, which keep their names; `name` names the file."""
+    """Generate C source for CasADi functions, which keep their names. `name` names the file."""
     generator = ca.CodeGenerator(name, {"with_header": False, "indent": 0})
     for function in functions:
         generator.add(function)
@@ -319,7 +319,7 @@ def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
 
 
 def nonzero_indices(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
-    """Row and column indices of a sparsity pattern's structural nonzeros, as two arrays."""
+    """Row and column indices of a sparsity pattern's structural nonzeros, two arrays."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)
 

@@ -1,4 +1,4 @@
-"""The kernel in generated C, called through ctypes."""
+"""The stepping kernel in generated C, called through ctypes."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class _ThetaColumns:
 
 
 class CompiledKernel:
-    """Stepping kernel in generated C, with the methods of `InterpretedKernel`; thread-safe."""
+    """Thread-safe stepping kernel in generated C. It has the methods of `InterpretedKernel`."""
 
     def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
         self._model = model
@@ -120,17 +120,17 @@ class CompiledKernel:
         )
 
     def with_step_model(self, model: StepModel) -> CompiledKernel:
-        """A kernel that shares this compiled library but uses another step model."""
+        """Make a kernel for another step model that shares this compiled library."""
         other = CompiledKernel(model, self._library)
         other._theta_columns, other._batched = self._theta_columns, self._batched
         return other
 
     def rollout(self, inputs: RolloutInputs) -> Rollout:
-        """Simulate one rollout in C and return its trajectory and derivatives."""
+        """Simulate one rollout in C, with its derivatives."""
         return self._rolled_out(self._library, [inputs])[0]
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        """Simulate several rollouts in C, one per entry of `members`, in SIMD batches where that is faster."""
+        """Simulate several rollouts in C, in SIMD batches where that is faster."""
         return call_merged_with_other_threads(self._rollouts, list(members))
 
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
@@ -204,7 +204,7 @@ class CompiledKernel:
         names: tuple[str, ...],
         by: CostDerivativesByRolloutVariables,
     ) -> RolloutCostGradient:
-        """Gradient of a cost along a rollout by the adjoint method in C; `by` holds the cost's derivatives."""
+        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds the cost's derivatives."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = RolloutCostGradient(*(np.zeros(shape) for shape in shapes))
@@ -220,7 +220,7 @@ class CompiledKernel:
     def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
-        """Step residuals and, with `derivatives`, Jacobians along a trajectory, evaluated in C."""
+        """Evaluate step residuals along a trajectory in C, and their Jacobians if `derivatives` is set."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         # in the order of the struct
         matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
@@ -234,7 +234,7 @@ class CompiledKernel:
     def step_derivatives_along_rollout(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, in C; arguments and shapes as in `step.step_derivatives_along_rollout`."""
+        """Derivatives of a rollout's steps, in C. Arguments and shapes: `step.step_derivatives_along_rollout`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)

@@ -1,4 +1,4 @@
-"""The C compiler, the private cache of compiled libraries, and CasADi functions compiled one by one."""
+"""Compile C code with the machine's C compiler and cache the libraries."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def _machine() -> str:
 def compile_and_load_library(
     source: str, make: Callable[[], str | None] | None = None, level: str | None = None
 ) -> ctypes.CDLL | None:
-    """Compile a C source, or take it from the cache, and load the shared library; None if no compiler works.
+    """Load the shared library of a C source, compiled or from the cache. None if no compiler works.
 
     The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
     which returns the C text, or None where there is none, and is called only if the library is not in the cache,
@@ -160,7 +160,7 @@ def compile_and_load_library(
 
 
 def compiled_casadi_function(function: ca.Function) -> ca.Function:
-    """A CasADi function compiled to C, which cannot be differentiated; unchanged if no compiler works.
+    """Compile a CasADi function to C. It cannot be differentiated then; it is unchanged if no compiler works.
 
     Without optimisation: for functions of many operations with a total run time of seconds.
     """
@@ -257,7 +257,7 @@ def _is_ours(built: Path) -> bool:
 
 
 class MappedFunction:
-    """A CasADi function of dense columns that is evaluated at many points in one call, compiled where possible.
+    """A CasADi function of dense columns, evaluated at many points in one call and compiled where possible.
 
     `shared_inputs` are the positions of inputs that are the same at every point.
     """

@@ -71,7 +71,7 @@ class _ConstraintImpulses:
 
 @dataclass(frozen=True)
 class DiscreteEquations:
-    """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system, with their symbols.
+    """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system.
 
     Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters. 0 and 1 are the
     two nodes; coordinates q (n, 1), internal ones z (nz, 1), momenta p (n, 1) [N m s].
@@ -111,18 +111,18 @@ class DiscreteEquations:
 
     @property
     def arguments(self) -> list[ca.SX]:
-        """Symbols that are the arguments of every compiled function of the step, in order."""
+        """Arguments of every compiled function of the step, in order."""
         return [self.q0, self.q1, self.p0, self.z0, self.z1, self.lam, self.u, self.theta, self.time_step]
 
     @property
     def residual(self) -> ca.SX:
-        """Residual of the step: momentum balance of free coordinates, internal and constraint equations."""
+        """Residual of the step, with momentum balance of free coordinates, internal and constraint equations."""
         balance = self.momentum_balance[list(self.system.unprescribed_coordinate_indices), 0]
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
     def impulses_of_force_with_derivatives(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulses (n, 1) [N m s] of the closed-form force in `momentum_balance` and `p1`; None without one."""
+        """Impulses of the closed-form force in `momentum_balance` and `p1`, (n, 1) [N m s]. None without one."""
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares
@@ -130,21 +130,21 @@ class DiscreteEquations:
 
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
-        """Constraint violation phi(q) - C lam / h at the end of the step (q1, z1), without relaxation, shape (m, 1)."""
+        """Constraint violation phi(q) - C lam / h at the end of the step, without relaxation, shape (m, 1)."""
         if self.constraint_relaxation_gain is None:
             return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
     def newton_unknowns(self) -> ca.SX:
-        """Symbols that Newton's method solves for: free coordinates of q1, internal coordinates z1, multipliers lam."""
+        """Unknowns of Newton's method: free coordinates of q1, internal coordinates z1 and multipliers lam."""
         return ca.vertcat(self.q1[list(self.system.unprescribed_coordinate_indices), 0], self.z1, self.lam)
 
 
 def discrete_equations(
     system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForcePlacement = "midpoint"
 ) -> DiscreteEquations:
-    """Build the discrete Euler-Lagrange equations of one step of a system; arguments as in `compile_step`.
+    """Build the discrete Euler-Lagrange equations of one step. Arguments are as in `compile_step`.
 
     `ModelError` for an unknown force split or constraint force, or an internal coordinate without an equation.
 
@@ -380,7 +380,7 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
 
 @dataclass(frozen=True)
 class EquilibriumEquations:
-    """Symbolic equations of static equilibrium: torques and springs hold driven joints, prescribed joints are given."""
+    """Symbolic equations of static equilibrium. Torques and springs hold driven joints; prescribed joints are given."""
 
     # (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
     # held torque, holding spring's stiffness, theta, time step
@@ -390,7 +390,7 @@ class EquilibriumEquations:
 
 
 def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
-    """Build the static equilibrium equations: a step from a configuration to itself with unchanged momentum."""
+    """Build the static equilibrium equations, a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
     driven = list(system.driven_coordinate_indices)
@@ -413,7 +413,7 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
 
 @dataclass(frozen=True, eq=False)
 class NlpStepConstraints:
-    """Symbolic equality constraints of one step in a nonlinear program (NLP), and their Jacobians.
+    """Symbolic equality constraints of one step in a nonlinear program (NLP), with their Jacobians.
 
     The latter are sparse derivatives of `residual` (nr, 1) and `prescribed_effort` (nc, 1) by `x0`, `x1`, `lam`, `u`.
     """
@@ -432,7 +432,7 @@ class NlpStepConstraints:
     effort_jacobians: dict[str, ca.SX]
 
     def parameter_jacobians(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
-        """Sparse derivatives of `residual` and `prescribed_effort` with respect to `names`, (..., len(names))."""
+        """Sparse derivatives of `residual` and `prescribed_effort` by the parameters `names`, (..., len(names))."""
         parameters = self.equations.system.parameters
         chosen = ca.vertcat(ca.SX(0, 1), *(parameters[name].symbol for name in names))
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)

@@ -1,4 +1,4 @@
-"""The kernel for machines without a C compiler: CasADi differentiates the equations, NumPy solves, Newton is plain.
+"""The stepping kernel for machines without a C compiler, in CasADi and NumPy with a plain Newton method.
 
 It shares nothing with `kernel.c` but the `DiscreteEquations`, so that each is a check of the other.
 """
@@ -36,7 +36,7 @@ _PointEvaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """Stepping kernel in CasADi's interpreter and NumPy, with the methods of `CompiledKernel`; thread-safe.
+    """Thread-safe stepping kernel in CasADi's interpreter and NumPy. It has the methods of `CompiledKernel`.
 
     A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
     constraint equations, then p1, then the effort of prescribed coordinates.
@@ -58,7 +58,7 @@ class InterpretedKernel:
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
     def with_step_model(self, model: StepModel) -> InterpretedKernel:
-        """A kernel that shares the interpreted functions but uses another step model."""
+        """Make a kernel for another step model that shares these interpreted functions."""
         other = InterpretedKernel(model)
         other._functions = self._functions
         return other
@@ -126,7 +126,7 @@ class InterpretedKernel:
 
     @np.errstate(over="ignore", invalid="ignore")  # the status says what is not finite
     def rollout(self, inputs: RolloutInputs) -> Rollout:
-        """Simulate one rollout step by step and return its trajectory and derivatives."""
+        """Simulate one rollout step by step, with its derivatives."""
         theta, torque, path = inputs.theta, inputs.torque, inputs.prescribed_path
         feedback, wanted = inputs.feedback, inputs.directions
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
@@ -206,7 +206,7 @@ class InterpretedKernel:
     def step_derivatives_along_rollout(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of next states and efforts; arguments as in `step.step_derivatives_along_rollout`."""
+        """Derivatives of next states and efforts. Arguments are as in `step.step_derivatives_along_rollout`."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
@@ -220,7 +220,7 @@ class InterpretedKernel:
         return np.array([one[0] for one in found]), np.array([one[1] for one in found])
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        """Simulate several rollouts one after another, one per entry of `members`."""
+        """Simulate several rollouts one after another."""
         return [self.rollout(member) for member in members]
 
     def adjoint_gradient(
@@ -231,7 +231,7 @@ class InterpretedKernel:
         names: tuple[str, ...],
         by: CostDerivativesByRolloutVariables,
     ) -> RolloutCostGradient:
-        """Gradient of a cost along a finished rollout by the adjoint method; `by` holds the cost's derivatives.
+        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds the cost's derivatives.
 
         costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
         """
@@ -266,7 +266,7 @@ class InterpretedKernel:
     def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
-        """Step residuals and, with `derivatives`, Jacobians along a trajectory of len(torque) steps, one by one."""
+        """Evaluate step residuals of len(torque) steps one by one, and Jacobians if `derivatives` is set."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])

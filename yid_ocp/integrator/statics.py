@@ -23,7 +23,7 @@ from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A static equilibrium: state, holding torque, constraint reactions, derivatives and convergence."""
+    """A static equilibrium with its state, holding torque, constraint reactions and derivatives."""
 
     state: Array  # (q, p, z), (nx,); p is half a step's pull of the constraints, so that the next step stays at rest
     holding_torque: Array  # motor torque that holds the configuration [N m], or servo command [rad or m], (nu,)
@@ -55,7 +55,7 @@ _MAX_HOLD_DEFLECTION = 0.02  # of a holding spring, by more than which the postu
 
 
 class EquilibriumSolver:
-    """Newton solver for a system's static equilibrium; driven joints are held, prescribed joints are given.
+    """Newton solver for a system's static equilibrium. Driven joints are held, prescribed joints are given.
 
     `known_coordinates` and `free_coordinates` are indices of those given (driven, then prescribed) and sought.
     """
@@ -87,7 +87,7 @@ class EquilibriumSolver:
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
     ) -> Equilibrium:
-        """Find the equilibrium for given driven and prescribed coordinates; if Newton fails, return its best point.
+        """Find the equilibrium for given driven and prescribed coordinates. If Newton fails, return its best point.
 
         Parameters
         ----------
@@ -331,7 +331,7 @@ def _is_motor_off(system: System, command: Array) -> BoolArray:
 
 
 def measured_angle_holding_stiffness(system: System, known: bool) -> float:
-    """Stiffness of the springs that hold driven joints at measured angles; `known`: torques or commands are given."""
+    """Stiffness of the springs that hold driven joints at measured angles. `known`: torques or commands are given."""
     if not known:
         return _HOLD_STIFFNESS
     return _HOLD_STIFFNESS_WITH_COMMAND if system.servos else _HOLD_STIFFNESS_WITH_TORQUE
@@ -402,7 +402,7 @@ def _solved(matrix: Array, right: Array) -> Array:
 
 
 def steady_effect_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
-    """Steady internal coordinates (nz,) of a system held at configuration `q` until they have fully relaxed."""
+    """Relaxed internal coordinates (nz,) of a system held at configuration `q` for a long time."""
     e = step.equations
     nz = e.z0.numel()
     if nz == 0:

@@ -1,4 +1,4 @@
-"""One step of a system, compiled or interpreted, and rollouts: simulation, sensitivities, adjoint, linearized steps."""
+"""Steps and rollouts of a system, with sensitivities, adjoints and linearized steps."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ALL_STEPS = slice(None)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(ReprMixin):
-    """Step map of a system over one time step, made by `compile_step`; `is_compiled` if it runs generated C code."""
+    """Step map of a system over one time step, made by `compile_step`. It `is_compiled` if it runs generated C code."""
 
     model: StepModel
     kernel: CompiledKernel | InterpretedKernel
@@ -52,7 +52,7 @@ class Step(ReprMixin):
 
     @property
     def system(self) -> System:
-        """System whose motion the step computes."""
+        """System that the step simulates."""
         return self.model.system
 
     @property
@@ -61,14 +61,14 @@ class Step(ReprMixin):
         return self.model.time_step
 
     def clock_scaled_time_step(self, theta: Array) -> float:
-        """Time step [s] corrected for the recording's clock: h times `System.recorded_time_scale` at `theta`."""
+        """Time step corrected for the recording's clock [s], h times `System.recorded_time_scale` at `theta`."""
         s = self.sizes
         none = [np.zeros(s[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
         return float(self.functions.row_scale_and_time_step(*none, theta, self.time_step)[1])
 
     @property
     def force_split(self) -> ForceSplit:
-        """Distribution of a step's forces between its two nodes: `symmetric` (half each) or `left`."""
+        """How a step's forces are split between its two nodes: `symmetric` (half each) or `left`."""
         return self.model.equations.force_split
 
     @property
@@ -78,12 +78,12 @@ class Step(ReprMixin):
 
     @property
     def functions(self) -> codegen.StepFunctions:
-        """CasADi functions that evaluate the step equations and their derivatives."""
+        """CasADi functions of the step equations and their derivatives."""
         return self.model.functions
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Dimensions by symbol, such as n (coordinates), nz (internal), m (constraints), nu (inputs) and ntheta."""
+        """Dimensions by symbol: n (coordinates), nz (internal), m (constraints), nu (inputs), ntheta and more."""
         return self.model.sizes
 
     def __call__(
@@ -121,7 +121,7 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of the next state (q, p, z) with respect to state, input and parameters (implicit functions).
+        """Derivatives of the next state (q, p, z) by state, input and parameters, from implicit functions.
 
         Returns A (nx, nx) by (q, p, z)_k, B_u (nx, nu) and B_theta (nx, len(names)), by all of theta without `names`.
         """
@@ -172,7 +172,7 @@ def compile_step(
     use_compiler: bool = True,
     tolerance: float | None = None,
 ) -> Step:
-    """Build the step map of a system, as compiled C code where a compiler is found.
+    """Build the step map of a system, as compiled C code if there is a compiler.
 
     Parameters
     ----------
@@ -205,13 +205,13 @@ def compile_step(
 
 
 def copy_of_step_with_time_step(step: Step, time_step: float) -> Step:
-    """A copy of a step with another (positive) time step [s] that shares equations and compiled code."""
+    """Copy a step with another positive time step [s]. Equations and compiled code are shared."""
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_correction_tolerance(time_step))
     return Step(model, step.kernel.with_step_model(model), step.is_compiled)
 
 
 def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
-    """Build the step of another system with the time step, integration rules and (by default) kernel type of `step`."""
+    """Build the step of another system with the time step, rules and (by default) kernel type of `step`."""
     compiled = step.is_compiled if use_compiler is None else use_compiler
     rules = (step.force_split, step.equations.constraint_force)
     return compile_step(system, step.time_step, *rules, use_compiler=compiled)
@@ -224,7 +224,7 @@ def _positive(time_step: float) -> float:
 
 
 def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Convert values to a contiguous float array; `ModelError` that names `name` if the shape is not `shape`."""
+    """Convert values to a contiguous float array. `ModelError` names `name` if the shape differs from `shape`."""
     array = np.ascontiguousarray(values, dtype=float)
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)
@@ -246,7 +246,7 @@ def simulate(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> Rollout:
-    """Simulate a system over `steps` steps, with forward sensitivities along `directions` if given.
+    """Simulate a system over `steps` steps. Sensitivities are computed along `directions`, if given.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def simulate(
 
 
 def simulate_rollouts(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several rollouts, each from `checked_rollout_inputs`; equal to `simulate` except for rounding."""
+    """Simulate several rollouts from `checked_rollout_inputs`. They equal `simulate` except for rounding."""
     return step.kernel.rollout_batch(members)
 
 
@@ -281,7 +281,7 @@ def checked_rollout_inputs(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> RolloutInputs:
-    """Check the shapes of one rollout's inputs and return `RolloutInputs`; arguments and errors as in `simulate`."""
+    """Check the shapes of one rollout's inputs. Arguments and errors are as in `simulate`."""
     sizes, check = step.sizes, float_array_with_checked_shape
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
@@ -306,7 +306,7 @@ def checked_rollout_inputs(
 
 
 def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
-    """Torque that acts on driven joints in every step, (N, nu) [N m]: the input, or the torque of position servos."""
+    """Torque on driven joints in every step, the input or that of position servos, shape (N, nu) [N m]."""
     system, h = step.system, step.time_step
     if not system.servos:
         return rollout.torque
@@ -322,7 +322,7 @@ def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rol
 
 
 def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv [N m s] at (q, v), in the shape of q; compliant coordinates are scaled by compliance.
+    """Generalized momentum dL/dv at (q, v) [N m s]. Compliant coordinates are scaled by their compliance.
 
     `q` and `v` have the shape (n,) or (K, n).
     """
@@ -344,7 +344,7 @@ def moving_observable_state_mask(
     loads: tuple[Array, Array] | None = None,
     seen: BoolArray | None = None,
 ) -> BoolArray:
-    """Mask (nx,) of the states that move and that affect other states, efforts or sensors.
+    """Mask of the states that move and affect other states, efforts or sensors, shape (nx,).
 
     Internal states of a neutral effect are excluded. The first and the last step of the rollout stand for all, `seen`
     (nx,) says which states sensors depend on.
@@ -376,7 +376,7 @@ def step_derivatives_along_rollout(
     loads: tuple[Array, Array] | None = None,
     chosen: slice = _ALL_STEPS,
 ) -> Iterator[tuple[Array, Array]]:
-    """Iterate over the derivatives of a finished rollout's steps in blocks, with prescribed coordinates held fixed.
+    """Iterate over the derivatives of a rollout's steps in blocks. Prescribed coordinates are held fixed.
 
     Derivatives of the next state (k, nx, d), and of prescribed coordinates' effort followed by constraint forces
     (k, nc + m, d), are by the state, under the feedback where one is given, by c columns of torque that are `inputs`

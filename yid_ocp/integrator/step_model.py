@@ -1,4 +1,4 @@
-"""Data types shared by all kernels: the model of a step, inputs and results of rollouts, adjoints, linearizations."""
+"""Data types that all stepping kernels share: step models, rollouts, adjoints and linearizations."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 
 @dataclass(frozen=True, eq=False)
 class StepModel:
-    """Equations, functions and index tables of one step, from which a kernel is built.
+    """Equations, functions and index tables of one step. A kernel is built from them.
 
     `sizes` holds n, nz, m, nu, nc, nx and ntheta, `time_step` is h [s], `tolerance` Newton's [rad or m].
     """
@@ -48,7 +48,7 @@ def build_step_model(
     constraint_force: ConstraintForcePlacement,
     tolerance: float | None = None,
 ) -> StepModel:
-    """Build the `StepModel` of a system; arguments as in `compile_step`."""
+    """Build the `StepModel` of a system. Arguments are as in `compile_step`."""
     e = discrete_equations(system, force_split, constraint_force)
     functions = codegen.step_functions(e)
     n, nz = system.n_coordinates, e.z0.numel()
@@ -60,12 +60,12 @@ def build_step_model(
 
 
 def newton_correction_tolerance(time_step: float) -> float:
-    """Largest coordinate correction [rad or m] at which Newton's method has converged, for a time step [s]."""
+    """Convergence tolerance of Newton's method on coordinate corrections [rad or m], for a time step [s]."""
     return max(_ROUNDING_FLOOR, min(_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE * time_step))
 
 
 class NewtonStatusCode(IntEnum):
-    """Status with which Newton's iteration of one step ended, with the numbers of the C kernel."""
+    """Status codes of Newton's method in one step, with the numbers of the C kernel."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -94,7 +94,7 @@ _INSTABILITY_HINT = (
 
 @dataclass(frozen=True)
 class RolloutStatus:
-    """Convergence status of a rollout: status code, Newton's last correction [rad or m], and totals over all steps.
+    """Convergence of a rollout: status code, Newton's last correction [rad or m] and totals over all steps.
 
     `prescribed_effort` (nc,) is that at the first node of the last step [N m], `internal_coordinates` (nz,) are those
     after it.
@@ -115,7 +115,7 @@ class RolloutStatus:
 
     @property
     def message(self) -> str:
-        """Sentence that explains the status, with the step, the last correction and a remedy."""
+        """Explain the status in a sentence, with the step, the last correction and a remedy."""
         if self.is_converged:
             return _STATUS_MESSAGES[self.code]
         step, what = self.completed_steps, _STATUS_MESSAGES[self.code]
@@ -127,7 +127,7 @@ class RolloutStatus:
 
 @dataclass(frozen=True)
 class SensitivityDirections:
-    """The d directions in which a rollout is differentiated: named parameters first, then tangents of start and inputs.
+    """The d directions in which a rollout is differentiated. Named parameters precede tangents of start and inputs.
 
     Derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path (N + 1, nc, d).
     """
@@ -150,7 +150,7 @@ class SensitivityDirections:
 
 @dataclass(frozen=True)
 class TrackingFeedback:
-    """Time-varying feedback of the tracking filter: torque u_k = ubar_k - K_k (x_k[index] - xbar_k).
+    """Time-varying feedback of the tracking filter: u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     Of the rows of the state (q, p, z) in `state_indices` (nb,), with K_k in `gain` (N, nu, nb) [N m/rad for a
     coordinate, 1/s for a momentum] and the rows' measured values in `reference` (N, nb).
@@ -163,7 +163,7 @@ class TrackingFeedback:
 
 @dataclass(frozen=True)
 class RolloutInputs:
-    """Inputs of one rollout: parameters, initial state, torques, prescribed path, feedback and directions.
+    """Inputs of one rollout, with feedback and directions of differentiation.
 
     The parameters (ntheta,), the initial state (q, p, z) (nx,), the nominal motor torque of every step (N, nu) [N m],
     and the prescribed coordinates at every node (N + 1, nc).
@@ -179,7 +179,7 @@ class RolloutInputs:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A simulated trajectory and, if requested, its derivatives (..., d) along d directions; NaN after a failed step.
+    """A simulated trajectory, with derivatives (..., d) along d directions on request. NaN follows a failed step.
 
     (q, p, z) at every node (N + 1, nx), multipliers (N, m) [N s], effort of prescribed coordinates at nodes 0..N-1
     (N, nc) [N m] and applied torque (N, nu) [N m]. At node 0 the effort assumes that p_0 came from a step before (an
@@ -202,7 +202,7 @@ CostDerivativesByRolloutVariables = tuple[Array, Array | None, Array | None]
 
 @dataclass(frozen=True)
 class RolloutCostGradient:
-    """Gradient of a scalar cost along a rollout, by the adjoint method; NaN if the equations of a step are singular.
+    """Gradient of a scalar cost along a rollout by the adjoint method. NaN if a step's equations are singular.
 
     By the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the prescribed coordinates at
     every node (N + 1, nc), those at node 0 as in `by_initial_state`.
@@ -216,7 +216,7 @@ class RolloutCostGradient:
 
 @dataclass(frozen=True)
 class StepEquationLinearizations:
-    """Residuals and Jacobians of the step equations along a trajectory that need not satisfy them.
+    """Residuals and Jacobians of the step equations along any trajectory, even one that does not satisfy them.
 
     Of every step the momentum balance (n), internal (nz) and constraint (m) equations, nt in all, and the p_{k+1} (n)
     that follows from the other values, with their derivatives by what is new, (q_{k+1}, z_{k+1}, lam_k), by what is
@@ -236,7 +236,7 @@ class StepEquationLinearizations:
 
 
 def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
-    """A rollout filled with NaN for a kernel to write into; with `count` directions, or no sensitivities for None."""
+    """Allocate a rollout filled with NaN for a kernel. `count` is the number of directions (None: no sensitivities)."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
     names = [f"{name}_sensitivity" for name in ("state", "multipliers", "effort")]
@@ -250,7 +250,7 @@ def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -
 def allocate_linearization(
     sizes: dict[str, int], count: int, width: int, derivatives: bool
 ) -> StepEquationLinearizations:
-    """Linearizations of `count` steps and `width` parameters, filled with zeros; no Jacobians without `derivatives`."""
+    """Allocate zero linearizations of `count` steps and `width` parameters. No Jacobians without `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
     shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
@@ -267,7 +267,7 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
 
 
 def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
-    """The `InsufficientMemoryError` to raise when `size` bytes for `what` cannot be allocated."""
+    """Make the `InsufficientMemoryError` for `size` bytes of `what` that cannot be allocated."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}: it takes {amount}"
     hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
@@ -277,7 +277,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 def attach_status_to_rollout(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """A copy of the rollout with a `RolloutStatus`; `counts` are Newton iterations and matrix factorisations."""
+    """Copy a rollout with a `RolloutStatus`. `counts` are Newton iterations and matrix factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
     return replace(rollout, status=RolloutStatus(NewtonStatusCode(code), step, error, *counts, last, inner))

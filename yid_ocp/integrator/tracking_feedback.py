@@ -1,4 +1,4 @@
-"""The tracking filter of driven arms: feedback about the measured motion, gains from an LQR, and what effects do to it.
+"""Tracking filter of driven arms, a feedback about the measured motion with LQR gains.
 
 The discrete momentum contains half the impulse of the previous step, so a torque other than the recorded one, or an
 effect, changes the momentum of the same motion.
@@ -26,7 +26,7 @@ _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the sam
 
 
 def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
-    """Tracking feedback u_k = ubar_k - K (q_k - qbar_k) on the driven joints, with a constant diagonal K.
+    """Make a proportional tracking feedback on the driven joints: u_k = ubar_k - K (q_k - qbar_k), K diagonal.
 
     `measured` are their angles qbar at every node, shape (N + 1, nu) [rad], `gains` one or one arm's worth or nu
     [N m/rad]; `ModelError` of another number of gains, or a negative one.
@@ -47,7 +47,7 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
 def lqr_tracking_feedback(
     step: Step, measured: ArrayLike, torque: ArrayLike, theta: ArrayLike, arms: Step | None = None
 ) -> TrackingFeedback:
-    """Tracking feedback with finite-horizon LQR gains for the driven arms, linearised about their measured motion.
+    """Compute a tracking feedback with finite-horizon LQR gains, linearised about the driven arms' measured motion.
 
     Minimises the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording for the arms without
     the object, with the errors that weigh the same; the gains act on the arms' angles and momenta (Anderson and Moore
@@ -86,7 +86,7 @@ def lqr_tracking_feedback(
 
 
 def compile_driven_arms_only_step(step: Step) -> Step:
-    """Compiled step of the driven joints alone, without object, grasps, prescribed joints and effects.
+    """Compile a step of the driven joints alone, without object, grasps, prescribed joints and effects.
 
     `ModelError` where the driven joints do not come first in the configuration.
     """
@@ -161,7 +161,7 @@ class JointMotionWithSensitivities:
 
 
 class EffectMomentumShift:
-    """Computes the momentum of a motion with effects minus that of the recorded motion without effects.
+    """Computes by how much effects change the momentum of the recorded motion.
 
     `lqr_tracking_feedback` computes its reference once, from recorded angles and torques without effects. With a torque
     other than the recorded one, or an effect such as an armature, the motion has another momentum, and the feedback
@@ -218,7 +218,7 @@ class EffectMomentumShift:
                 self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
 
     def momentum_derivative_by_previous_torque(self, theta: Array) -> Array:
-        """Derivative of the momentum with respect to the torques of the previous step, shape (nu, nu) [s]."""
+        """Derivative of the momentum by the torques of the previous step, (nu, nu) [s]."""
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
@@ -229,7 +229,7 @@ class EffectMomentumShift:
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Momentum shift (with effects minus recorded) at nodes 0..N-1, (N, nu), and its derivatives (N, nu, d).
+        """Momentum shift (with effects minus recorded) at nodes 0..N-1, (N, nu), and derivatives (N, nu, d).
 
         `recorded` is the recorded motion, `true` that corrected for effects, whose derivatives alone are used; `names`
         are the parameters of the first of the d derivatives.
@@ -276,18 +276,18 @@ class EffectMomentumShift:
         return z, total if np.any(total) else None
 
     def theta_without_effects(self, theta: Array) -> Array:
-        """Copy of theta with the effects' parameters neutral; the feedback's reference is computed with it."""
+        """Copy theta with neutral effect parameters. The feedback's reference is computed with it."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
         return plain
 
     def is_active(self, theta: Array, names: Sequence[str]) -> bool:
-        """Whether an effect shifts the momentum: one of its parameters is not neutral at `theta` or is in `names`."""
+        """Whether an effect shifts the momentum. A parameter is then in `names` or not neutral at `theta`."""
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 
 def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative (..., nu, nu) of the applied torque with respect to a recorded torque's error, including feedback.
+    """Derivative of the applied torque by an error of the recorded torque, including feedback, (..., nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
     `gain` (..., nu, nb) is that of a step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.

@@ -1,4 +1,4 @@
-"""The mechanical model: parameters, mechanisms, flexible objects and the `System`; new terms come through `effects`."""
+"""Mechanical model of a robot and a flexible object. New terms come through `effects`."""
 
 from yid_ocp.model.flexible import FlexibleObject as FlexibleObject
 from yid_ocp.model.flexible import Segment as Segment

@@ -31,7 +31,7 @@ AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0,
 
 @dataclass(frozen=True)
 class Segment:
-    """Segment of a flexible object (tube, branch, beam): length, mass, links, joint stiffness, damping and parent."""
+    """One segment of a flexible object, such as a tube, a branch or a beam."""
 
     name: str
     length: float
@@ -77,7 +77,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class ElasticJoint:
-    """Spring with energy 1/2 stiffness (q - rest)^2 and damper with force -damping v on one joint of a segment."""
+    """Spring and damper on one joint of a segment: 1/2 stiffness (q - rest)^2 and -damping v."""
 
     joint_name: str
     segment_name: str
@@ -90,7 +90,7 @@ class ElasticJoint:
 
 @dataclass(frozen=True)
 class SegmentLayout:
-    """A segment's place in the mechanism: its joints and lengths link by link, radius, mass and parent segment."""
+    """Joints, link lengths, radius, mass and parent segment of one segment in the mechanism."""
 
     name: str
     link_joints: tuple[tuple[str, ...], ...]  # names, link by link
@@ -102,7 +102,7 @@ class SegmentLayout:
 
 @dataclass(frozen=True, repr=False)
 class FlexibleObject(ReprMixin):
-    """A flexible object as a rigid-link model: its mechanism, elastic joints and segments.
+    """A flexible object as a model of rigid links with elastic joints.
 
     Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, the root frame `object_root`, and points by
     arc length, independent of the number of links, as `SEGMENT:40%`.
@@ -124,7 +124,7 @@ def flexible_object(
     name: str = "object",
     gravity_fraction: float = 1.0,
 ) -> FlexibleObject:
-    """Build a flexible object from segments, as a chain of rigid links with elastic joints before each link.
+    """Build a flexible object as chains of rigid links, with elastic joints before each link.
 
     Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
     `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
@@ -215,7 +215,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 
 
 def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
-    """Twist-free rotations along a polyline: one (3, 3) matrix per edge, relative to the frame of the edge before.
+    """Compute the twist-free rotation of each edge of a polyline relative to the edge before, each (3, 3).
 
     They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take. `vertices`, shape (k, 3), are the
     undeformed centre line [m]; `initial_frame`, shape (3, 3), is the frame before the first edge, whose z axis is the

@@ -1,4 +1,4 @@
-"""Symbolic kinematics and rigid-body mechanics of a tree, in world-frame screw coordinates.
+"""Symbolic kinematics and rigid-body mechanics of a kinematic tree in world-frame screw coordinates.
 
 A spatial velocity is (angular, linear of the body point now at the world origin), a wrench (moment about the world
 origin, force); with both in one fixed frame the derivatives of the Lagrangian take the closed forms given at
@@ -17,7 +17,7 @@ from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement, symbol
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Poses and screws of all joints of a mechanism at a configuration, as symbolic expressions."""
+    """Symbolic poses and screws of all joints of a mechanism at one configuration."""
 
     mechanism: Mechanism
     joint_rotations: tuple[ca.SX, ...]  # from each joint's moving frame to the world, each (3, 3)
@@ -25,7 +25,7 @@ class Kinematics:
     joint_screws: tuple[ca.SX, ...]  # S_j, the spatial velocity per unit rate of joint j, each (6, 1)
 
     def frame_pose(self, frame: str | Frame) -> Placement:
-        """Pose of a frame in the world, given by name or as a `Frame`."""
+        """Pose of a frame in the world. The frame is a name or a `Frame`."""
         entry = self._frame(frame)
         j, local = entry.joint_index, entry.placement
         return local if j < 0 else Placement(self.joint_rotations[j], self.joint_origins[j]) @ local
@@ -40,7 +40,7 @@ class Kinematics:
         return self._columns(frame, lambda screw: screw[3:] + ca.cross(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Jacobian (3, n) of a frame's angular velocity, in world axes, with respect to the configuration's rates."""
+        """Jacobian of a frame's angular velocity (world axes) by the joint rates, shape (3, n)."""
         return self._columns(frame, lambda screw: screw[:3])
 
     def _frame(self, frame: str | Frame) -> Frame:
@@ -55,7 +55,7 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class MultibodyLagrangianDerivatives:
-    """First derivatives of the rigid-body Lagrangian at (q, v), and vectors that give its second derivatives.
+    """First derivatives of the rigid-body Lagrangian, and vectors from which the second derivatives follow.
 
     With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
 
@@ -80,17 +80,17 @@ class MultibodyLagrangianDerivatives:
 
 
 def motion_cross_motion_product(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Spatial cross product a x b of two motion vectors (twists), shape (6, 1), angular part first."""
+    """Spatial cross product a x b of two twists, angular part first, shape (6, 1)."""
     return ca.vertcat(ca.cross(a[:3], b[:3]), ca.cross(a[:3], b[3:]) + ca.cross(a[3:], b[:3]))
 
 
 def motion_cross_force_product(a: ca.SX, f: ca.SX) -> ca.SX:
-    """Spatial cross product a x* f of a motion vector a and a wrench f, shape (6, 1), angular part first."""
+    """Spatial cross product a x* f of a twist and a wrench, angular part first, shape (6, 1)."""
     return ca.vertcat(ca.cross(a[:3], f[:3]) + ca.cross(a[3:], f[3:]), ca.cross(a[:3], f[3:]))
 
 
 def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
-    """Compute poses and screws of all joints at a configuration q, shape (n, 1) [rad or m]."""
+    """Compute the poses and screws of all joints at a configuration q (n, 1) [rad or m]."""
     rotations: list[ca.SX] = []
     origins: list[ca.SX] = []
     screws: list[ca.SX] = []
@@ -114,7 +114,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 def rigid_body_lagrangian_derivatives(
     kinematics: Kinematics, v: ca.SX, gravity: ca.SX
 ) -> MultibodyLagrangianDerivatives:
-    """Energies and first Lagrangian derivatives of a mechanism's bodies at velocity v (n, 1) and gravity (3, 1)."""
+    """Compute the Lagrangian derivatives of a mechanism's bodies. Velocity v is (n, 1), gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
@@ -189,14 +189,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 
 def mass_matrix(rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
-    """Mass matrix M = L_vv of the mechanism, (n, n), from the closed form in `MultibodyLagrangianDerivatives`."""
+    """Mass matrix of the mechanism in closed form (`MultibodyLagrangianDerivatives`), shape (n, n)."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(
     rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Second derivatives (L_qq, L_qv, L_vv) of the bodies' Lagrangian, each (n, n); L_qv has rows q, columns v."""
+    """Second derivatives L_qq, L_qv, L_vv of the bodies' Lagrangian, each (n, n). Rows of L_qv belong to q."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
     by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
     by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))

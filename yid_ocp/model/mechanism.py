@@ -1,4 +1,4 @@
-"""Trees of rigid bodies: rotations and rigid transforms, inertias, joints and frames, and how trees are combined."""
+"""Kinematic trees of rigid bodies, their parts, and how trees are combined."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from yid_ocp.model.parameters import Parameters
 
 @dataclass(frozen=True)
 class Placement:
-    """Rigid transform from a child frame to its parent: symbolic rotation (3, 3) and translation (3, 1) [m]."""
+    """Symbolic rigid transform from a child frame to its parent: rotation (3, 3) and translation (3, 1) [m]."""
 
     rotation: ca.SX
     translation: ca.SX
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> Placement:
-        """Placement from a numeric 4x4 homogeneous matrix."""
+        """Make a placement from a numeric homogeneous matrix, shape (4, 4)."""
         array = snap_near_integer_entries(np.asarray(matrix, dtype=float))
         return Placement(ca.SX(ca.DM(array[:3, :3])), ca.SX(ca.DM(array[:3, 3])))
 
     @staticmethod
     def identity() -> Placement:
-        """Identity placement: no rotation and no translation."""
+        """Make a placement without rotation and translation."""
         return Placement.from_matrix(np.eye(4))
 
     def __matmul__(self, other: Placement) -> Placement:
         return Placement(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def homogeneous_matrix(self) -> ca.SX:
-        """The placement as a homogeneous 4x4 matrix."""
+        """Convert the placement to a homogeneous matrix, shape (4, 4)."""
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]])))
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """Inertia of a rigid body: mass [kg], centre of mass [m] and tensor about it [kg m^2], in its joint's frame.
+    """Inertia of a rigid body in its joint's frame: mass [kg], centre of mass [m] and tensor about it [kg m^2].
 
     `gravity_fraction` multiplies the pull of gravity on the body, not its inertia; None means 1.
     """
@@ -58,15 +58,15 @@ class Inertia:
 
     @staticmethod
     def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
-        """Inertia from numbers: mass [kg], centre of mass (3,) [m] and tensor about it (3, 3) [kg m^2]."""
+        """Make an inertia from numbers: mass [kg], centre (3,) [m], tensor about the centre (3, 3) [kg m^2]."""
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
     def scaled_by(self, factor: ca.SX) -> Inertia:
-        """The inertia with mass and inertia tensor multiplied by `factor`."""
+        """Multiply mass and inertia tensor by `factor`."""
         return replace(self, mass=self.mass * factor, inertia_about_com=self.inertia_about_com * factor)
 
     def transformed_by(self, placement: Placement) -> Inertia:
-        """The inertia expressed in another frame; `placement` is the pose of the present frame in it."""
+        """Express the inertia in another frame. `placement` is the pose of the present frame in it."""
         rotation = placement.rotation
         com = rotation @ self.center_of_mass + placement.translation
         return replace(self, center_of_mass=com, inertia_about_com=rotation @ self.inertia_about_com @ rotation.T)
@@ -74,7 +74,7 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Joint:
-    """One degree of freedom (revolute or prismatic), its limits, and the bodies rigidly attached to its moving side."""
+    """One revolute or prismatic joint with its limits and the bodies attached to its moving side."""
 
     name: str
     kind: Literal["revolute", "prismatic"]
@@ -109,7 +109,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class ArcLengthChain:
-    """A chain of straight links on which points are located by their fraction of the arc length."""
+    """A chain of straight links with points located by arc-length fraction."""
 
     tip_frames: tuple[str, ...]  # at the far end of every link, which is its translation, base to tip
     length_fractions: tuple[float, ...]  # part of the nominal arc length that each link has; they sum to one
@@ -127,7 +127,7 @@ class ArcLengthChain:
 
 @dataclass(frozen=True, repr=False)
 class Mechanism(ReprMixin):
-    """A kinematic tree: joints (parents before children) with bodies, named frames and parameters.
+    """A kinematic tree of joints (parents before children) with bodies, named frames and parameters.
 
     Placements and inertias depend on its `parameters`; along its `link_chains` `NAME:40%` names a point by arc length.
     """
@@ -155,18 +155,18 @@ class Mechanism(ReprMixin):
         return tuple(joint.parent_index for joint in self.joints)
 
     def joint_index(self, name: str) -> int:
-        """Index of a joint by name; `ModelError` with the nearest name if there is no such joint."""
+        """Find the index of a joint by name. `ModelError` suggests the nearest name."""
         names = self.joint_names
         if name not in names:
             raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest_name_hint(name, names))
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:
-        """Whether the mechanism has a frame of this name, or for a name such as `T1:40%` the segment `T1`."""
+        """Whether a frame of this name exists. For `T1:40%` the segment `T1` must exist."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
 
     def frame(self, name: str) -> Frame:
-        """The frame of a name; `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length from the base.
+        """Find a frame by name. `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length from the base.
 
         Such a point lies on the straight link that reaches there and turns with it, however many links there are.
         `ModelError` where there is no such frame (with the nearest name) or no percentage from 0 to 100.
@@ -182,7 +182,7 @@ class Mechanism(ReprMixin):
         return replace(end, placement=Placement(end.placement.rotation, part * end.placement.translation))
 
     def ancestor_joint_indices(self, index: int) -> tuple[int, ...]:
-        """Indices of the joints on the path from the root to joint `index`, inclusive; empty for the world (-1)."""
+        """Indices of the joints from the root to joint `index`, inclusive. The world (-1) has none."""
         chain = []
         while index >= 0:
             chain.append(index)
@@ -192,7 +192,7 @@ class Mechanism(ReprMixin):
     def with_attached_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
-        """This mechanism with another attached, whose root has the pose `placement` (4, 4) in `frame` (None: world)."""
+        """Attach another mechanism. Its root has the pose `placement` (4, 4) in `frame` (None: world)."""
         root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
         if frame is not None:
@@ -219,7 +219,7 @@ class Mechanism(ReprMixin):
         return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
 
     def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
-        """The mechanism with an additional frame `name`, fixed at a pose (4, 4) in `frame` (None: world)."""
+        """Add a frame `name`, fixed at a pose (4, 4) in `frame` (None: world)."""
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
@@ -227,7 +227,7 @@ class Mechanism(ReprMixin):
         return replace(self, frames={**self.frames, name: added})
 
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """The mechanism with numbers in place of all parameters, nominal or from `values`; it has no parameters."""
+        """Replace all parameters by numbers, from `values` or nominal. The result has no parameters."""
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)
 
         def number(expression: ca.SX) -> ca.SX:
@@ -239,7 +239,7 @@ class Mechanism(ReprMixin):
         return replace(mapped, parameters=Parameters())
 
     def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """The mechanism with a chain of joints inserted at `index`; no other joint or frame is attached to it yet.
+        """Insert a chain of joints at `index`. No other joint or frame is attached to it yet.
 
         The first joint's parent stands before `index`, every other one's is the one before it whatever it says.
         """
@@ -256,7 +256,7 @@ class Mechanism(ReprMixin):
 
 
 def map_expressions(description: Any, change: Callable[[ca.SX], ca.SX]) -> Any:
-    """A model description with `change` applied to every symbolic expression in it, except its parameters."""
+    """Apply `change` to every symbolic expression of a model description, except its parameters."""
     if isinstance(description, ca.SX):
         return change(description)
     if isinstance(description, tuple):
@@ -281,7 +281,7 @@ def _fraction(name: str, said: str) -> float:
 
 
 def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
-    """The rigid body equivalent to several rigidly connected bodies; None without bodies or for zero total mass."""
+    """Combine rigidly connected bodies into one. None without bodies or with zero total mass."""
     entries = list(bodies)
     if not entries:
         return None
@@ -303,7 +303,7 @@ _SNAP_TOLERANCE = 1e-11
 
 
 def snap_near_integer_entries(matrix: Array) -> Array:
-    """The matrix with entries within `_SNAP_TOLERANCE` of -1, 0 or 1 rounded to these numbers."""
+    """Round matrix entries within `_SNAP_TOLERANCE` of -1, 0 or 1 to these numbers."""
     result = np.array(matrix, dtype=float)
     for exact in (-1.0, 0.0, 1.0):
         result[np.abs(result - exact) < _SNAP_TOLERANCE] = exact
@@ -311,14 +311,14 @@ def snap_near_integer_entries(matrix: Array) -> Array:
 
 
 def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Homogeneous 4x4 matrix from a rotation (3, 3) and a translation (3,) [m]."""
+    """Build a homogeneous (4, 4) matrix from a rotation (3, 3) and a translation (3,) [m]."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = np.asarray(rotation, float), np.asarray(translation, float)
     return matrix
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) from angles [rad], the convention of URDF, shape (3, 3)."""
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) from angles [rad], as in URDF, shape (3, 3)."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
     y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
@@ -326,7 +326,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw [rad] of a rotation matrix, the inverse of `rotation_from_rpy`."""
+    """Roll, pitch and yaw [rad] of a rotation matrix. This is the inverse of `rotation_from_rpy`."""
     # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
@@ -335,13 +335,13 @@ def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
 
 
 def rotation_from_axis_sin_cos(axis: ArrayLike, sine: float, cosine: float) -> Array:
-    """Rotation matrix about a unit axis, from the sine and cosine of the angle (Rodrigues' formula)."""
+    """Rotation matrix from a unit axis and the sine and cosine of the angle (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
 
 
 def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca.SX:
-    """Rotation matrix about a numeric unit axis by a symbolic angle [rad], shape (3, 3)."""
+    """Rotation matrix from a numeric unit axis and a symbolic angle [rad], shape (3, 3)."""
     c, s = ca.cos(angle), ca.sin(angle)
     for k in range(3):
         if abs(abs(axis[k]) - 1.0) < 1e-15:
@@ -356,7 +356,7 @@ def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca
 
 
 def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
-    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], (3, 3); yaw is zero if absent."""
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) from symbolic angles [rad], shape (3, 3). Yaw defaults to zero."""
     about_x = symbolic_rotation_from_axis_angle((1.0, 0.0, 0.0), roll)
     turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ about_x
     return ca.densify(turned if yaw is None else symbolic_rotation_from_axis_angle((0.0, 0.0, 1.0), yaw) @ turned)
@@ -367,5 +367,5 @@ def _skew(u: Array) -> Array:
 
 
 def transform_from_xyz_rpy(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Homogeneous 4x4 matrix from a translation [m] and roll, pitch, yaw [rad]."""
+    """Build a homogeneous (4, 4) matrix from a translation [m] and roll, pitch, yaw [rad]."""
     return homogeneous_transform(rotation_from_rpy(*np.asarray(rpy, float)), xyz)

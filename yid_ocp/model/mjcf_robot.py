@@ -1,4 +1,4 @@
-"""Robots from MJCF files: MuJoCo compiles the file, and its bodies and joints become those of a URDF file."""
+"""Read robots from MJCF files. MuJoCo compiles the file; its bodies and joints become those of a URDF file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _JOINT_EQUALITY, _WORLD = 2, "world"
 
 
 def parsed_mjcf(file: Path) -> SimpleNamespace:
-    """Name, links and joints of an MJCF file, as `read_urdf` takes them from a URDF file; logs what is left out.
+    """Read name, links and joints of an MJCF file in the form that `read_urdf` uses. What is left out is logged.
 
     A body is a link with its inertial, or with what MuJoCo computes from its geoms; sites are frames. Coordinates are
     MuJoCo's, `ref` included. A joint that an equality ties to another one linearly follows it, as `mimic` does.
@@ -49,7 +49,7 @@ def parsed_mjcf(file: Path) -> SimpleNamespace:
 
 
 def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
-    """Constants of an MJCF file's joints that are not zero, by joint and name; empty for other files.
+    """Nonzero constants of an MJCF file's joints, by joint and name. Other files give none.
 
     They are `armature` [kg m^2], `damping` [N m s/rad], `frictionloss` [N m], and of a position actuator `servo_gain`
     [N m/rad] and `servo_damping` [N m s/rad]. Errors as `parsed_mjcf`.

@@ -102,7 +102,7 @@ MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
 
 @dataclass(frozen=True)
 class MotorOptions:
-    """Settings of a servo's motor: its kind, `ideal` or `dc`, and the preset with published data of a dc motor."""
+    """Settings of a servo's motor. Its kind is `ideal` or `dc`; a preset holds published data of a dc motor."""
 
     kind: Annotated[
         _MotorKind,
@@ -125,7 +125,7 @@ class MotorOptions:
 
 @dataclass(frozen=True)
 class RobotJointSpring:
-    """Spring on a robot joint: stiffness [N m/rad, prismatic N/m] and rest position [rad, prismatic m]."""
+    """Spring on a robot joint with stiffness [N m/rad or N/m] and rest position [rad or m]."""
 
     stiffness: float
     rest_position: float = 0.0
@@ -133,7 +133,7 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class PositionServoOptions:
-    """Settings of all position servos: interpolation, gravity compensation, motor, firmware; gains are parameters."""
+    """Settings of all position servos: interpolation, gravity compensation, motor, firmware. Gains are parameters."""
 
     command_interpolation: Annotated[
         _CommandInterpolation,
@@ -164,7 +164,7 @@ class PositionServoOptions:
 
 @dataclass(frozen=True)
 class PositionServo:
-    """A position servo on one joint, which turns the commanded coordinate u into a torque.
+    """Position servo on one joint. It turns the commanded coordinate u into a torque.
 
         ideal:  torque = clip(gain (e + integral z) - damping dq/dt)
         dc:     torque = clip(gain (e + integral z) - derivative dq/dt) - damping dq/dt
@@ -188,7 +188,7 @@ class PositionServo:
     torque_constant: float | None = None  # published one of a dc motor [N m/A]
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Torque [N m], or force [N], of the servo for a commanded coordinate, the coordinate q and its rate v."""
+        """Servo torque [N m] or force [N] at the commanded coordinate, the coordinate q and the rate v."""
         on = command < MOTOR_OFF_COMMAND / 2
         error, drag = self.error(command, q), self.damping * v
         error = error if self.integral.is_zero() else error + self.integral
@@ -201,7 +201,7 @@ class PositionServo:
         return ca.if_else(on, torque, 0)
 
     def error(self, command: ca.SX, q: ca.SX) -> ca.SX:
-        """Position error [rad or m] beyond the dead band; zero while the motor is off."""
+        """Position error beyond the dead band [rad or m]. It is zero while the motor is off."""
         error = ca.if_else(command < MOTOR_OFF_COMMAND / 2, command, q) - q
         if self.dead_band.is_zero():
             return error
@@ -216,7 +216,7 @@ def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
 
 
 def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
-    """Parameters `JOINT.stiffness` and `JOINT.rest` of a spring on a robot joint."""
+    """Make the parameters `JOINT.stiffness` and `JOINT.rest` of a robot joint's spring."""
     unit = tree.joints[tree.joint_index(joint)].coordinate_unit
     per = "N m/rad" if unit == "rad" else "N/m"
     return (
@@ -228,7 +228,7 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJoin
 def build_joint_servos(
     tree: Mechanism, joints: Sequence[str], options: PositionServoOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
-    """Build a servo for every named joint; return them by joint, and parameters such as `JOINT.servo_gain`.
+    """Build a servo for every named joint. Also return parameters such as `JOINT.servo_gain`.
 
     They give the joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`. Of a direct-current motor
     `JOINT.servo_gain_factor` multiplies the gain: the firmware's, which recordings may state.
@@ -287,7 +287,7 @@ def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_
 
 
 def mechanism_without_gravity(tree: Mechanism) -> Mechanism:
-    """The robot with no gravity on its bodies, as if its controller compensated its weight."""
+    """Remove gravity from the robot's bodies, as if its controller compensated its weight."""
     joints = tuple(
         replace(joint, bodies=tuple(replace(body, gravity_fraction=ca.SX(0)) for body in joint.bodies))
         for joint in tree.joints

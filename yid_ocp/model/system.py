@@ -1,4 +1,4 @@
-"""The mechanical system: mechanism, springs, dampers, grasps and inputs, and the interface of effects."""
+"""The mechanical system of robot and object, and the interface of effects."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _GRASP_EQUATION_NAMES = {
 
 @dataclass(frozen=True)
 class Grasp:
-    """A grasp as a holonomic constraint: origins (and, by kind, axes) of a holder's and an object's frame coincide."""
+    """A grasp that makes the origins of an object's and a holder's frame coincide. By kind it also aligns axes."""
 
     name: str
     """`left`, `right`, `gripper`, or a clamp's name."""
@@ -66,11 +66,11 @@ class Grasp:
 
     @property
     def constraint_equation_names(self) -> tuple[str, ...]:
-        """Names of the constraint equations: positions such as `left.x`, then tilts or rotations."""
+        """Names of the constraint equations. Positions such as `left.x` precede tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual phi(q) as a column: holder minus held position [m], then direction or rotation [rad]."""
+        """Constraint residual phi(q) as a column, holder minus held. Position [m] precedes orientation [rad]."""
         holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
         held = kinematics.frame_pose(self.held_frame)
         rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
@@ -82,7 +82,7 @@ class Grasp:
         return ca.vertcat(*rows)
 
     def holder_minus_held_axis_directions(self, kinematics: Kinematics) -> ca.SX:
-        """Holder minus held axes (0, 3 or 9 rows); unlike `constraint_residual` nonzero for opposite axes."""
+        """Holder minus held axes (0, 3 or 9 rows). Unlike `constraint_residual` nonzero for opposite axes."""
         if self.kind == "point":
             return ca.SX(0, 1)
         holder, held = (kinematics.frame_pose(name).rotation for name in (self.holder_frame, self.held_frame))
@@ -92,7 +92,7 @@ class Grasp:
 
 @dataclass(frozen=True)
 class MidpointState:
-    """Symbols at the midpoint of one step; energies and forces may depend on them.
+    """Symbols at the midpoint of one step. Energies and forces may depend on them.
 
     q, v and z, z_rate are the mean and the difference over h of coordinates and internal coordinates at both nodes.
     """
@@ -111,7 +111,7 @@ class MidpointState:
 
 @dataclass(frozen=True)
 class NodeState:
-    """Symbols at one node of a trajectory; measurements may depend on them.
+    """Symbols at one node of a trajectory. Measurements may depend on them.
 
     `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node, at both ends
     that of the one step there, half a step off; `a` their difference over h, of order two in h, at both ends that of
@@ -133,7 +133,7 @@ class NodeState:
 
 @dataclass(frozen=True)
 class ForceWithDerivativeFactors:
-    """A dissipative generalized force F(q, v) of wrenches on bodies, (n, 1) [N m or N], with derivatives.
+    """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives, (n, 1) [N m or N].
 
     With S_j and D_j as in `MultibodyLagrangianDerivatives` and the columns of A and T, shape (6, n), for i an ancestor
     of joint j or j itself:
@@ -148,7 +148,7 @@ class ForceWithDerivativeFactors:
 
 @dataclass(frozen=True)
 class StepTerms:
-    """Energy, generalized forces (n, 1) [N m or N] and internal equations that one effect adds to a step."""
+    """Energy, generalized forces (n, 1) [N m or N] and internal equations that an effect adds to one step."""
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
     generalized_force: ca.SX | None = None  # F(q, v, u, z)
@@ -163,7 +163,7 @@ class StepTerms:
 
 @dataclass(frozen=True)
 class Effect:
-    """Base class of additions to the nominal model, such as friction; the base class itself changes nothing.
+    """Base class of additions to the nominal model, such as friction. The base class itself changes nothing.
 
     Whatever a subclass overrides must leave the nominal model unchanged at neutral parameters. Recorded torques drive
     the model, recorded angles prescribe it or are followed: there the reading is known and the true value is sought by
@@ -177,30 +177,30 @@ class Effect:
     internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def apply_to_system(self, system: System) -> System:
-        """The system with this effect's changes of masses, lengths, springs, grasps, gravity or joints applied."""
+        """Apply this effect's changes to the system: masses, lengths, springs, grasps, gravity or joints."""
         return system
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """Energy, forces and internal equations that this effect adds to a step, as functions of its midpoint state."""
+        """Energy, forces and internal equations that this effect adds to a step at its midpoint state."""
         return StepTerms()
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """Sensor reading that replaces the error-free `output`; `channel`: `group.point` or `joints.quantity.JOINT`."""
+        """Predict a reading from the error-free `output`; `channel`: `group.point` or `joints.quantity.JOINT`."""
         return output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """True value of a recorded `joints.position.JOINT` or `joints.effort.JOINT`, given the true `effort`."""
+        """Correct a recorded `joints.position.JOINT` or `joints.effort.JOINT`, given the true `effort`."""
         return reading
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """Added delay [s], recorded minus true time of a sample; `channel` as in `distorted_reading`.
+        """Added delay [s] of a channel, recorded minus true time of a sample. `channel` is as in `distorted_reading`.
 
         A recorded torque that drives the model is `torque.JOINT`: it acts so much later than it was recorded.
         """
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
-        """Time constant [s] by which `torque.JOINT` lags its record, or recorded `joints.effort.JOINT` the true one."""
+        """Lag time constant [s]: `torque.JOINT` behind its record, `joints.effort.JOINT` behind the true one."""
         return ca.SX(0)
 
 
@@ -226,7 +226,7 @@ class _ServoIntegral(Effect):
 
 
 class SystemBuildArguments(TypedDict, total=False):
-    """Keyword arguments of `System.build`: objects, grasps, driven and prescribed joints, damping, gravity, ..."""
+    """Keyword arguments of `System.build`, such as objects, grasps and driven joints."""
 
     objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]]
     """Each with the frame of what came before on which it hangs (None: the world), and a 4x4 placement there."""
@@ -248,7 +248,7 @@ class SystemBuildArguments(TypedDict, total=False):
 
 @dataclass(frozen=True, repr=False)
 class System(ReprMixin):
-    """Complete model: mechanism of arms and object, parameters, springs, dampers, grasps, inputs and effects."""
+    """Complete model of robot and object, with parameters, springs, dampers, grasps, inputs and effects."""
 
     mechanism: Mechanism
     parameters: Parameters
@@ -322,7 +322,7 @@ class System(ReprMixin):
         return replace(system, segment_layouts=tuple(segments)).with_effects([*integrals, *effects])
 
     def with_effects(self, effects: Sequence[Effect]) -> System:
-        """This system with additional effects; their parameters are appended to theta in the given order."""
+        """Add effects to the system. Their parameters are appended to theta in the given order."""
         system = self
         for effect in effects:
             system = replace(system, parameters=system.parameters.with_added(effect.parameters))
@@ -341,7 +341,7 @@ class System(ReprMixin):
 
     @property
     def n_coordinates(self) -> int:
-        """Number n of configuration variables (generalized coordinates)."""
+        """Number n of generalized coordinates."""
         return len(self.mechanism.joints)
 
     @property
@@ -351,48 +351,48 @@ class System(ReprMixin):
 
     @cached_property
     def driven_coordinate_indices(self) -> tuple[int, ...]:
-        """Index in the configuration q of each driven joint, in the order of the inputs."""
+        """Indices in q of the driven joints, in the order of the inputs."""
         return tuple(self.mechanism.joint_index(name) for name in self.driven)
 
     @cached_property
     def prescribed_coordinate_indices(self) -> tuple[int, ...]:
-        """Index in the configuration q of each joint whose motion is prescribed."""
+        """Indices in q of the joints with prescribed motion."""
         return tuple(self.mechanism.joint_index(name) for name in self.prescribed)
 
     @cached_property
     def unprescribed_coordinate_indices(self) -> tuple[int, ...]:
-        """Indices in the configuration q of the joints whose motion is not prescribed."""
+        """Indices in q of the joints without prescribed motion."""
         return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_coordinate_indices)
 
     @property
     def effect_internal_coordinate_symbols(self) -> dict[str, ca.SX]:
-        """Symbols of the internal coordinates by name, in the order of z, as they enter grasps and placements."""
+        """Symbols of the effects' internal coordinates by name, in the order of z. Grasps and placements use them."""
         return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
     def segment_layout(self, name: str) -> SegmentLayout:
-        """Layout of a segment by name; `ModelError` with the nearest name if there is no such segment."""
+        """Layout of a segment by name. `ModelError` suggests the nearest name."""
         found = {layout.name: layout for layout in self.segment_layouts}
         if name not in found:
             raise ModelError(f"there is no segment '{name}'", hint=nearest_name_hint(name, found))
         return found[name]
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> System:
-        """The system with `change` applied to every symbolic expression except those of its effects."""
+        """Apply `change` to every symbolic expression of the system except those of its effects."""
         mapped: System = map_expressions(replace(self, effects=()), change)
         return replace(mapped, effects=self.effects)
 
     def numeric_mechanism(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """The mechanism with numbers in place of all parameters: those in `values`, else nominal values."""
+        """Mechanism with numbers in place of all parameters, from `values` or nominal."""
         return replace(self.mechanism, parameters=self.parameters).with_numeric_values(values)
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
-        """Elastic energy [J], the sum of 1/2 stiffness (q - rest)^2 over the elastic joints."""
+        """Elastic energy of all elastic joints [J], the sum of 1/2 stiffness (q - rest)^2."""
         index = self.mechanism.joint_index
         terms = (0.5 * s.stiffness * (q[index(s.joint_name)] - s.rest_angle) ** 2 for s in self.elastic_joints)
         return sum(terms, ca.SX(0))
 
     def viscous_force(self, v: ca.SX) -> ca.SX:
-        """Generalized force of all viscous dampers at the velocity v, shape (n, 1) [N m]."""
+        """Generalized force of all viscous dampers at velocity v, shape (n, 1) [N m]."""
         force, index = [ca.SX(0)] * self.n_coordinates, self.mechanism.joint_index
         dampers = [(spring.joint_name, spring.damping) for spring in self.elastic_joints]
         for joint, coefficient in (*dampers, *self.joint_damping.items()):
@@ -400,7 +400,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Generalized force of the input u, motor torques or servo commands, shape (n, 1) [N m]."""
+        """Generalized force of motor torques or servo commands u, shape (n, 1) [N m]."""
         force = [ca.SX(0)] * self.n_coordinates
         for row, (joint, index) in enumerate(zip(self.driven, self.driven_coordinate_indices, strict=True)):
             servo = self.servos.get(joint)
@@ -408,7 +408,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def weight_and_grasp_force_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
-        """Generalized force [N m or N] on one coordinate by weight and grasps of all it moves, at a step's midpoint."""
+        """Generalized force on one coordinate from weight and grasps of all it moves, at midpoint [N m or N]."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)
         for j, joint in enumerate(tree.joints):
@@ -426,14 +426,14 @@ class System(ReprMixin):
         return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))
 
     def constraint_relaxation_times(self) -> ca.SX | None:
-        """Relaxation times T of the constraints, phi + T dphi/dt = C lam / h, (m, 1) [s]; None if no grasp has one."""
+        """Relaxation times T of the constraints, (m, 1) [s]: phi + T dphi/dt = C lam / h. None if no grasp has one."""
         if all(grasp.relaxation_time is None for grasp in self.grasps):
             return None
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
         return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
     def grasp_compliance_diagonal(self) -> ca.SX:
-        """Compliances of the constraints: the diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
+        """Constraint compliances, the diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(g.compliance for g in self.grasps for _ in range(g.n_constraint_equations)))
 
 
@@ -456,7 +456,7 @@ def _check_names(
 
 
 def floating_joint_mechanism(name: str, frame: str | None = None) -> Mechanism:
-    """A massless mechanism whose six joints `NAME_x` ... `NAME_rz` move a frame, named `frame` or like the clamp."""
+    """Build a massless mechanism whose six joints `NAME_x` to `NAME_rz` move a frame, `frame` or `NAME`."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)

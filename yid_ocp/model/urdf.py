@@ -1,4 +1,4 @@
-"""Reading and writing mechanisms as URDF."""
+"""Read and write mechanisms as URDF."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _example_robot_urdf(robot: str) -> Path:
 
 
 def resolve_urdf_path(robot: str | Path) -> Path:
-    """Path of the URDF file for a robot's name in the settings; the file need not exist.
+    """Find the path of the URDF file for a robot's name in the settings. The file need not exist.
 
     The name is a file, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
     that ships with this package; `ModelError` where there is no such robot.
@@ -113,7 +113,7 @@ def read_urdf(
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
 ) -> Mechanism:
-    """Read a mechanism from a URDF or MJCF file, with the chosen joints movable and all others locked.
+    """Read a mechanism from a URDF or MJCF file. Chosen joints are movable, all others are locked.
 
     Each kept joint's bodies have the parameter `JOINT.mass` [kg] (inertia in proportion). Links without a kept joint
     above them are fixed to the world. Every link is a frame of its name.
@@ -445,7 +445,7 @@ def _unit_axis(joint: Any) -> Array:
 
 
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
-    """URDF text of a mechanism: each joint's bodies become one link, each named frame a link on a fixed joint.
+    """Write a mechanism as URDF text. Each joint's bodies become one link, each named frame a link on a fixed joint.
 
     Reading the text back with `read_urdf` gives the same numbers to 1e-12.
     """

@@ -1,4 +1,4 @@
-"""Parallel work: threads, processes and cluster clients, which no other package starts."""
+"""Parallel work in threads, processes and cluster clients. No other package starts any."""
 
 from yid_ocp.parallel.resumable_tasks import LOCAL_WORKER_CONFIG as LOCAL_WORKER_CONFIG
 from yid_ocp.parallel.resumable_tasks import Task as Task

@@ -1,4 +1,4 @@
-"""Tasks with stored results, run by processes on this machine or by a scheduler's workers.
+"""Run tasks and store their results, by processes on this machine or a scheduler's workers.
 
 A task is a function at the top of a module with plain data and paths. Its result is one JSON file, written whole by
 whoever worked it out, under a name that is the hash of the function's name, the sources it depends on and the
@@ -53,7 +53,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """The result of a task: what its function returned, as read back from its file, or why it failed."""
+    """The result of a task. It is what the function returned, as read from its file, or why it failed."""
 
     name: str
     value: Any = None
@@ -64,7 +64,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Workers of a run: local processes or a Dask scheduler's (address or file); `ConfigError` if both are given."""
+    """Workers of a run: local processes, or a Dask scheduler's (address or file). `ConfigError` if both are given."""
 
     n_processes: int | None = None
     scheduler_address: str = ""
@@ -78,7 +78,7 @@ class WorkerConfig:
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_scheduler_available(self) -> None:
-        """Raise `WorkerError` if the scheduler does not answer or a worker is unsuitable; for use before long work."""
+        """Raise `WorkerError` if the scheduler does not answer or a worker is unsuitable. Use it before long work."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
                 pass
@@ -96,7 +96,7 @@ def run_tasks(
     progress: TaskProgressCallback | None = None,
     code: str | None = None,
 ) -> list[TaskResult]:
-    """Results of a function for all tasks, in order of the tasks; results already stored in `folder` are reused.
+    """Run a function for all tasks and return results in their order. Results stored in `folder` are reused.
 
     A task that raises leaves `HASH.error.json` and a warning, and the others go on; the next run tries it again. An
     interruption leaves the results that are finished. A worker of other sources than these does nothing.
@@ -141,7 +141,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Values of the tasks; `WorkerError` if the first failure is an error of this package, else `RuntimeError`."""
+    """Get the values of all tasks. A failure raises `WorkerError` for an error of this package, else `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]

@@ -1,4 +1,4 @@
-"""Threads and processes on this machine: how many, parallel maps, values shared between threads, pools.
+"""Threads and processes on this machine: parallel maps, merged calls, shared caches and process pools.
 
 Batched evaluation: items run in parallel until all wait for a function, which is then called once for all.
 """
@@ -29,7 +29,7 @@ _Answer = TypeVar("_Answer")
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Results in the order of the items, computed in as many threads as the process may use."""
+    """Apply a function to items in all available threads. Results are in the order of the items."""
     entries = list(items)
     workers = min(len(entries), _max_threads())
     if workers < 2:
@@ -65,7 +65,7 @@ CASADI_LOCK = threading.RLock()
 
 
 class CasadiLockedCache(Generic[_Key, _Value]):
-    """Cache of values by key; `compute_value` computes each once, under the CasADi lock, from the key alone."""
+    """Cache of values by key. `compute_value` computes each once from its key, under the CasADi lock."""
 
     def __init__(self, compute_value: Callable[[_Key], _Value]) -> None:
         self._make = compute_value
@@ -163,7 +163,7 @@ def _answer(requests: Sequence[_Request]) -> None:
 def call_merged_with_other_threads(
     function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
 ) -> list[_Answer]:
-    """Answers of a function to `questions`, in one call with those of concurrent `map_with_merged_calls` items."""
+    """Answer `questions` by a function, in one call with those of concurrent `map_with_merged_calls` items."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
@@ -172,7 +172,7 @@ def call_merged_with_other_threads(
 
 
 def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Results of a function for all items, run concurrently; their `call_merged_with_other_threads` become one call.
+    """Apply a function to items concurrently. Their `call_merged_with_other_threads` become one call.
 
     As many run as there are threads to use. Which questions meet depends on the items alone. No item may hold a lock
     while it asks.
@@ -224,10 +224,10 @@ def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[
 
 
 class InlineExecutor(Executor):
-    """An executor that runs each call at once in the calling process, for work too small for a process."""
+    """An executor that runs each call at once in the calling process, for small work."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """A completed future with the call's result or its exception."""
+        """Run a call and return a completed future with its result or exception."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -237,7 +237,7 @@ class InlineExecutor(Executor):
 
 
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """A pool of processes that ignore interrupt signals, by default one per processor.
+    """Make a pool of processes that ignore interrupt signals. By default there is one per processor.
 
     Together they use as many threads as this process might.
     """

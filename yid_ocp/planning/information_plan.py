@@ -1,4 +1,4 @@
-"""Planning of informative motions: to identify parameters, or to discriminate effects that look alike."""
+"""Plan informative motions that identify parameters or discriminate between similar effects."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _ParameterPrecision:
 
 @dataclass(frozen=True, eq=False)
 class InformativeMotionPlan(PlannedMotion):
-    """The most informative motion found, with predicted parameter precisions and distances between effects."""
+    """Most informative motion found, with predicted parameter precisions and distances between effects."""
 
     parameter_precisions: Mapping[str, _ParameterPrecision]
     # for each pair of effects, distance of the change by the first from what the second and all free unknowns can

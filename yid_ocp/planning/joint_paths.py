@@ -30,7 +30,7 @@ _PlanGoal = Literal["place", "path", "box", "information"]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """Limits of a planned motion: fractions of URDF velocity and effort limits, acceleration and spring angles."""
+    """Limits of a planned motion on velocity, acceleration, effort and spring angles."""
 
     velocity_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of the URDF's velocity limits that is used")] = (
         0.9
@@ -116,7 +116,7 @@ class PlanOptions:
 
 
 class FramePositionEvaluator:
-    """Numeric function for world positions of named frames and their Jacobian with respect to the configuration.
+    """Numeric evaluator of world positions of named frames and their Jacobian by the configuration.
 
     Raises `ConfigError` for a frame that does not exist.
     """
@@ -135,7 +135,7 @@ class FramePositionEvaluator:
             self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
 
     def positions_and_jacobian(self, q: Array, theta: Array) -> tuple[Array, Array]:
-        """Positions (N, 3 np) [m] of the np frames and their Jacobian (N, 3 np, n) at configurations (N, n)."""
+        """Positions (N, 3 np) [m] of np frames, and their Jacobian (N, 3 np, n), at configurations (N, n)."""
         at, slope = (np.array(x).T for x in self._function(np.asarray(q).T, np.asarray(theta)))
         return at, slope.reshape(len(at), at.shape[1], np.shape(q)[1])
 
@@ -166,17 +166,17 @@ class SplinePath:
         return BSpline(knots, controls, _SPLINE_DEGREE).derivative(order)
 
     def coefficients_to_control_points_matrix(self, order: int = 0) -> Array:
-        """Matrix (..., K) from coefficients to control points of the spline or of its derivative of an order."""
+        """Matrix from coefficients to control points of the spline or its `order`-th derivative, (..., K)."""
         splines = self._splines(order)
         return np.asarray(splines.c[: len(splines.t) - splines.k - 1])
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
-        """Values (N, K) of the K basis functions, or of their derivative of an order, at times `t` (N,) [s]."""
+        """Values of the K basis functions or their `order`-th derivative at times `t` (N,) [s], shape (N, K)."""
         values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight_line_coefficients(self, change: Array) -> Array:
-        """Coefficients of a straight line in joint space with displacement `change` (nj,), shape (K, nj)."""
+        """Coefficients (K, nj) of a straight line in joint space with displacement `change` (nj,)."""
         t = np.linspace(0.0, self.duration, 200)
         s = t / self.duration
         smooth = s**3 * (10 - 15 * s + 6 * s**2)
@@ -186,7 +186,7 @@ class SplinePath:
 
 @dataclass(frozen=True, eq=False)
 class PathSimulator:
-    """Simulator of a system, initially at rest, whose prescribed joints follow a spline path."""
+    """Simulates a system, initially at rest, whose prescribed joints follow a spline path."""
 
     step: Step  # every joint that moves is prescribed; nothing is driven
     theta: Array  # (ntheta,)
@@ -205,7 +205,7 @@ class PathSimulator:
         return np.asarray(self.start_equilibrium.state[self.moved_joint_indices])
 
     def coefficient_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds (K, nc) of the coefficients, within which joints keep their position limits."""
+        """Lower and upper bounds of the coefficients from joint position limits, each (K, nc)."""
         shape, limits = (self.path.n_coefficients, 1), _position_limits(self.step.system)
         lower, upper = (np.tile(side - self.moved_joint_start_positions, shape) for side in limits)
         return lower, upper
@@ -219,7 +219,7 @@ class PathSimulator:
 
     @cached_property
     def standstill_node_indices(self) -> IntArray:
-        """Indices of the nodes from the end of the motion on, where the joints stand still."""
+        """Indices of the nodes at which the motion has ended and the joints stand still."""
         return np.flatnonzero(self.node_times >= self.path.duration - 1e-9)
 
     @cached_property
@@ -227,11 +227,11 @@ class PathSimulator:
         return self.path.basis_values(self.node_times)
 
     def joint_positions(self, w: Array) -> Array:
-        """Positions (N + 1, nc) of the moved joints at the nodes, for spline coefficients (K, nc)."""
+        """Positions of the moved joints at the nodes, (N + 1, nc), for spline coefficients (K, nc)."""
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """Rollout of the path with coefficients (K, nc), with sensitivities to named parameters, then coefficients."""
+        """Simulate the path of coefficients (K, nc). Sensitivities are by named parameters, then coefficients."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
@@ -255,7 +255,7 @@ class PathSimulator:
 
     @property
     def start_configuration(self) -> Array:
-        """Configuration at the start, shape (n,)."""
+        """Configuration q at the start, shape (n,)."""
         return np.asarray(self.start_equilibrium.state[: self.step.system.n_coordinates])
 
 
@@ -266,7 +266,7 @@ TARGET_REACHED_TOLERANCE_FACTOR = 1.5  # of that unit: beyond it a place is out 
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A planned motion of the arms: simulator, spline coefficients, rollout, success and message."""
+    """A planned motion of the arms, with its simulator, rollout, success and message."""
 
     simulator: PathSimulator
     spline_coefficients: Array  # (K, nc)
@@ -301,12 +301,12 @@ class PlannedMotion:
 
     @property
     def joint_efforts(self) -> Array:
-        """Required efforts of the moved joints, shape (N + 1, nc) [N m or N]; the last row is repeated."""
+        """Required efforts of the moved joints, shape (N + 1, nc) [N m or N]. The last row is repeated."""
         return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
 
     @cached_property
     def point_trajectories(self) -> dict[str, Array]:
-        """Trajectories (N + 1, 3) [m] of the system's points, and of a target point if there is one, by name."""
+        """Trajectories of the system's points and any target point, by name, each (N + 1, 3) [m]."""
         system = self.simulator.step.system
         names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
         places = self.simulator.frame_positions_along_states(FramePositionEvaluator(system, names), self.rollout.state)
@@ -324,7 +324,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 
 
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
-    """Start positions (nc,) of the moved joints from a mapping; `ConfigError` if one is missing or out of range."""
+    """Start positions (nc,) of the moved joints from a mapping. `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
@@ -345,7 +345,7 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
 
 
 def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, guess: Array | None = None) -> Equilibrium:
-    """Solve for the equilibrium at which a motion begins, near the configuration `guess` if one is given.
+    """Solve for the equilibrium at which a motion begins, near the configuration `guess` if given.
 
     Raises `ModelError` where there is none, for example because a grasp cannot be closed.
     """
@@ -377,7 +377,7 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 def solve_equilibrium_at_point_target(
     step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, place: Array, tolerance: float
 ) -> Equilibrium:
-    """Solve for an equilibrium near the start, within joint limits, at which a point rests at its target.
+    """Find an equilibrium within joint limits at which a point rests at its target. The start is the guess.
 
     Raises `ConfigError` where no joint moves the point, or where it cannot rest there.
     """
@@ -423,7 +423,7 @@ def solve_equilibrium_at_point_target(
 
 
 def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """The function with its latest value cached, for searches that ask for residual and Jacobian at one point."""
+    """Cache a function's latest value. Searches often ask for residual and Jacobian at one point."""
     last: list[tuple[Array, _Value]] = []
 
     def at(x: Array) -> _Value:

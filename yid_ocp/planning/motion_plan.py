@@ -1,4 +1,4 @@
-"""Planning of a motion that brings a point to a target: end equilibria by statics, the path by shooting."""
+"""Plan a motion that brings a point to a target. Statics gives end equilibria, shooting the path."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _CONVERGED_TOLERANCE_FRACTION = 0.1  # change by halving it, in parts of the tol
 
 @dataclass(frozen=True)
 class ParameterCovariance:
-    """Names of uncertain model parameters and their covariance matrix, in the order of the names."""
+    """Covariance matrix of uncertain model parameters, in the order of their names."""
 
     parameter_names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))

@@ -1,4 +1,4 @@
-"""Goal and limits of a planned motion with Jacobians, and searches within limits: for a goal, and for information.
+"""Search for motions within limits that reach a goal or maximise information.
 
 For a goal it is single shooting. Bounds of the unknowns are kept by the trust region, all other limits by an augmented
 Lagrangian: a row g <= u adds rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is passed.
@@ -52,7 +52,7 @@ def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array,
 
 @dataclass(eq=False)
 class PlanResidualAndLimitFunctions:
-    """Functions for goal residuals and limited quantities of a planned motion, for one set of model parameters."""
+    """Goal residuals and limited quantities of a planned motion as functions, for one set of model parameters."""
 
     simulator: PathSimulator
     options: PlanOptions
@@ -71,7 +71,7 @@ class PlanResidualAndLimitFunctions:
 
     @property
     def point_reference_trajectory(self) -> Array | None:
-        """Reference position of the point at every node, shape (N + 1, 3) [m]; None if only the end position counts."""
+        """Reference position of the point at every node, (N + 1, 3) [m]. None if only the end position counts."""
         if self.options.goal != "path":
             return None
         begin = self.simulator.start_configuration[None]
@@ -109,7 +109,7 @@ class PlanResidualAndLimitFunctions:
         return parts
 
     def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
-        """Values (rows,) of the limited quantities along a motion, in the order of `limit_rows` and in their own units.
+        """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
         The second result is their Jacobian (rows, K nc) by the coefficients; None if the rollout has no sensitivities.
         """
@@ -152,12 +152,12 @@ class PlanResidualAndLimitFunctions:
         return found
 
     def split_values_by_limit_kind(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
-        """Pairs of limit rows and their values, one pair for each kind of limit; `value` is ordered as `limit_rows`."""
+        """Iterate over pairs of limit rows and values by kind of limit. `value` is ordered as `limit_rows`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
     def worst_violated_row_by_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
-        """Name, value and bound of the worst violated row, by kind of limit; kinds without violation are absent."""
+        """Name, value and bound of the worst violated row of each kind of limit that is violated."""
         found = {}
         for rows, own in self.split_values_by_limit_kind(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
@@ -192,7 +192,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 @dataclass(frozen=True)
 class TargetMotionSearchResult:
-    """Result of a search for a planned motion: coefficients w (K, nc), and whether it converged within the limits."""
+    """Result of a search for a planned motion, with coefficients w (K, nc) and convergence within the limits."""
 
     w: Array
     is_converged: bool
@@ -201,7 +201,7 @@ class TargetMotionSearchResult:
 
 
 class TargetMotionSearch:
-    """Shooting problem for a motion: goal residuals of several parameter cases, and limits of the first case."""
+    """Shooting problem for a motion. Goal residuals are of several parameter cases, limits of the first case."""
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
@@ -222,7 +222,7 @@ class TargetMotionSearch:
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> TargetMotionSearchResult:
-        """Optimise the spline coefficients of a motion from `start` within bounds, all of shape (K, nc).
+        """Optimise a motion's spline coefficients from `start` within bounds, all (K, nc).
 
         Rockafellar (1973), doi:10.1007/BF01580138; Branch, Coleman and Li (1999), doi:10.1137/S1064827595289108.
         """
@@ -279,7 +279,7 @@ def _prior(columns: int, bounded: Sequence[int]) -> Array:
 
 @dataclass(frozen=True)
 class DOptimalityCriterion:
-    """Criterion -1/2 log det of the covariance of chosen parameters, with all other unknowns eliminated.
+    """Optimality criterion -1/2 log det of chosen parameters' covariance. All other unknowns are eliminated.
 
     D-optimality, with some of the parameters chosen D_s-optimality: Atkinson, Donev and Tobias (2007), Optimum
     Experimental Designs, with SAS, sections 10.2 and 10.3.
@@ -289,7 +289,7 @@ class DOptimalityCriterion:
     parameter_columns: tuple[int, ...]
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] at sensitivities (nr, columns), and its gradient, which is empty if `slope` is False."""
+        """Criterion [nat] and its gradient at sensitivities (nr, columns). No gradient if `slope` is False."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
@@ -304,7 +304,7 @@ class DOptimalityCriterion:
 
 @dataclass(frozen=True)
 class EffectDiscriminationCriterion:
-    """Criterion for distances between each effect's change of the readings and the changes another effect can imitate.
+    """Criterion for how well the readings separate effects from what other effects can imitate.
 
     d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
     -1/2 log sum_ij 1 / (1 + d_ij^2).
@@ -316,14 +316,14 @@ class EffectDiscriminationCriterion:
     parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
 
     def pairwise_effect_distances(self, rows: Array) -> Array:
-        """Distances [data stds] of effect i's (row) changes from all that effect j can imitate; infinite diagonal."""
+        """Distances of effect i's (row) changes from all that effect j can imitate [data stds]. Infinite diagonal."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] at sensitivities (nr, columns), and its gradient, which is empty if `slope` is False."""
+        """Criterion [nat] and its gradient at sensitivities (nr, columns). No gradient if `slope` is False."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
@@ -359,7 +359,7 @@ _MAX_LIMIT_CORRECTIONS = 2  # of the linear limits where a step passes the true 
 
 @dataclass(frozen=True)
 class MotionSearchResult:
-    """Result of a search for an informative motion: coefficients w (K, nc), initial and final criterion [nat]."""
+    """Result of a search for an informative motion, with coefficients w (K, nc) and criteria [nat]."""
 
     w: Array
     initial_criterion: float
@@ -370,7 +370,7 @@ class MotionSearchResult:
 
 
 class InformativeMotionSearch:
-    """Search for the motion of a planned experiment that maximises an optimality criterion within limits."""
+    """Searches the motion of a planned experiment that maximises an optimality criterion within limits."""
 
     def __init__(
         self,
@@ -390,7 +390,7 @@ class InformativeMotionSearch:
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
     def shrink_to_limits(self, w: Array) -> Array:
-        """Spline coefficients `w` (K, nc), scaled down until the motion keeps its limits."""
+        """Scale down spline coefficients `w` (K, nc) until the motion keeps its limits."""
         for _ in range(60):
             if self._limited_values(w)[1]:
                 return w
@@ -403,7 +403,7 @@ class InformativeMotionSearch:
         return -np.inf if rows is None else self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
-        """Maximise the criterion from coefficients `start` (K, nc) that keep the limits, in at most `rounds` rounds."""
+        """Maximise the criterion in at most `rounds` rounds, from feasible coefficients `start` (K, nc)."""
         w, radius = start, _INITIAL_TRUST_RADIUS
         value, rows = self._value_and_rows(w)
         first, finished, done = value, False, 0

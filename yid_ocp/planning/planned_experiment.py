@@ -1,4 +1,4 @@
-"""Predicted recording and sensitivities of a planned motion of the arms with the configured sensors.
+"""Predict recording and sensitivities of a planned arm motion with the configured sensors.
 
 To search, the arms are moved and the torques that this needs are measured, with a constant error each; what errors of a
 driven arm's motion do to all readings is taken at rest, once, and eliminated (Golub and Pereyra 1973,
@@ -48,7 +48,7 @@ _SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
 
 @dataclass(frozen=True, eq=False)
 class ParameterizedExperiment:
-    """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients w."""
+    """A planned experiment whose predicted recording and sensitivities depend on spline coefficients w."""
 
     configured_problem: EstimationProblem  # of the settings; its first recording defines sensors, noise and rates
     parameter_values: Mapping[str, float]  # at which the sensitivities are taken
@@ -59,7 +59,7 @@ class ParameterizedExperiment:
     def from_options(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
     ) -> ParameterizedExperiment:
-        """Planned experiment from a plan's options at parameter `values`, with the parameters `names` free.
+        """Make a planned experiment from a plan's options at parameter `values`, with parameters `names` free.
 
         Raises `ConfigError` if no joint moves or clamps follow measured points, `ModelError` without an equilibrium.
         """
@@ -164,11 +164,11 @@ class ParameterizedExperiment:
 
     @property
     def zero_coefficients(self) -> Array:
-        """Zero spline coefficients, shape (K, nc), with which the arms stay where they start."""
+        """Zero spline coefficients, which keep the arms at their start, shape (K, nc)."""
         return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.moved_joint_indices)))
 
     def planned_estimation_problem(self, w: Array) -> EstimationProblem:
-        """The configured estimation problem with the planned recording (coefficients w) in place of its recordings."""
+        """Configured estimation problem with the planned recording for coefficients w instead of its own."""
         return self._problem(self.configured_problem.step, self._noise_free_recording(w), self._options())
 
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
@@ -178,7 +178,7 @@ class ParameterizedExperiment:
         return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
     def configured_problem_sensitivities(self, w: Array) -> Array:
-        """Whitened sensitivities of the planned recording to relative changes; `SolverError` if its rollout fails."""
+        """Whitened sensitivities of the planned recording to relative changes. `SolverError` if its rollout fails."""
         return self._weighted(self.planned_estimation_problem(w))
 
     @property
@@ -222,7 +222,7 @@ class ParameterizedExperiment:
 
     @cached_property
     def unknown_scales(self) -> Array:
-        """Size of every unknown of the search problem, to which relative changes refer, in column order."""
+        """Size of every unknown of the search problem, in column order. Relative changes refer to it."""
         return _sizes(self._known)
 
     @cached_property
@@ -255,7 +255,7 @@ class ParameterizedExperiment:
         return np.vstack([found, np.eye(len(std))])
 
     def search_problem_sensitivities(self, w: Array) -> Array | None:
-        """Whitened sensitivities (nr, columns) to relative changes of the unknowns; None if the rollout fails."""
+        """Whitened sensitivities to relative changes of unknowns, (nr, columns). None if the rollout fails."""
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None
@@ -307,7 +307,7 @@ class ParameterizedExperiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
-        """Forward differences (w.size, nr, columns) of `search_problem_sensitivities` in w; None if one fails."""
+        """Differences of `search_problem_sensitivities` by w, (w.size, nr, columns). None if one fails."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()

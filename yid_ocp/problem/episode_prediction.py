@@ -1,4 +1,4 @@
-"""Prediction of an episode: initial state, rollout, sensor readings and their derivatives."""
+"""Predict an episode's initial state, rollout and sensor readings, with derivatives."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class _Prepared:
 
 @dataclass(frozen=True)
 class EpisodePredictor:
-    """Predicts episodes with the model: initial state, rollout, sensor readings and derivatives; holds no state."""
+    """Predicts episodes with the model, from the initial state to readings with derivatives. It holds no state."""
 
     model_functions: ModelFunctions
     options: ProblemOptions
@@ -64,12 +64,12 @@ class EpisodePredictor:
 
     @property
     def integrator_step(self) -> Step:
-        """The integrator step with which episodes are rolled out."""
+        """Integrator step with which episodes are rolled out."""
         return self.model_functions.step
 
     @property
     def system(self) -> System:
-        """The system whose motion the step computes."""
+        """System whose motion the step computes."""
         return self.model_functions.step.system
 
     # -- the start ----------------------------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ class EpisodePredictor:
         )
 
     def episode_with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
-        """The episode with its initial state fitted to the first measured points if `initial_state` asks for it."""
+        """Fit an episode's initial state to the first measured points if `initial_state` asks for it."""
         if episode.fixed_initial_state is not None or self.options.initial_state != "fitted_to_points":
             return episode
         samples = episode.measurements
@@ -100,7 +100,7 @@ class EpisodePredictor:
         return replace(episode, fixed_initial_state=start)
 
     def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
-        """Vector theta with the episode's own values inserted: known ones and those fitted with its initial state."""
+        """Insert an episode's own values into theta: known ones and those fitted with its initial state."""
         start = episode.fixed_initial_state
         return self._with(theta, {**episode.known_parameters, **({} if start is None else start.fitted_parameters)})
 
@@ -113,7 +113,7 @@ class EpisodePredictor:
     def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode's rollout and its derivative with respect to (`wanted` parameters, `offset`).
+        """Initial state of an episode's rollout, and its derivative by (`wanted` parameters, `offset`).
 
         `theta` is that of `theta_with_episode_values`, `offset` that of an estimated initial state from equilibrium,
         and `guess` (n,) a configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of
@@ -181,7 +181,7 @@ class EpisodePredictor:
         return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
-        """Recorded torques, angles and paths corrected by effects, with derivatives with respect to `wanted`."""
+        """Correct recorded torques, angles and paths for effects, with derivatives by the parameters `wanted`."""
         corrections = self.model_functions.input_corrections
         torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
@@ -223,13 +223,13 @@ class EpisodePredictor:
     def predict_episode(
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
     ) -> EpisodePrediction | str:
-        """Roll out one episode and predict its samples; return the prediction, or an error message if it fails."""
+        """Roll out one episode and predict its samples. Return an error message if it fails."""
         return self.predict_episodes([(episode, theta, offset, guess)], derivatives)[0]
 
     def predict_episodes(
         self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
     ) -> list[EpisodePrediction | str]:
-        """Predict several episodes, each given as (episode, theta, offset, guess); a failed one gives an error text."""
+        """Predict several episodes, each given as (episode, theta, offset, guess). A failed one gives an error text."""
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
@@ -309,7 +309,7 @@ class EpisodePredictor:
     def readings_along_trajectory(
         self, samples: SensorMeasurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
-        """Predicted sensor readings (M, k) along a trajectory (N + 1, nx), and their derivatives (M, k, d).
+        """Predicted readings (M, k) along a trajectory (N + 1, nx), and their derivatives (M, k, d).
 
         `by_state` (N + 1, nx, d) are those of the trajectory, the first ones by the free parameters.
         """
@@ -318,7 +318,7 @@ class EpisodePredictor:
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
     def state_values_at_nodes(self, rollout: Rollout) -> TimeGridStateValues:
-        """State values at all nodes of a rollout; the load is effort (prescribed joints) or torque (driven joints)."""
+        """State values at all nodes of a rollout. The load is effort (prescribed joints) or torque (driven joints)."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.driven_coordinate_indices)] = rollout.torque
@@ -338,7 +338,7 @@ class EpisodePredictor:
         )
 
     def delay_corrected_measurements(self, samples: SensorMeasurements, theta: Array) -> SensorMeasurements:
-        """Measurements shifted earlier by the sensor's delay at `theta`, to the times at which they were true."""
+        """Shift measurements earlier by the sensor's delay at `theta`, to the times at which they were true."""
         late = self._delay_in_steps(samples, theta, ())
         return samples if late is None else samples.shifted_earlier_by_steps(late[0])
 
@@ -352,7 +352,7 @@ class EpisodePredictor:
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
     def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeSmoother | None:
-        """Smoother of predicted efforts, the same filter as for measured efforts; None if no efforts are compared."""
+        """Smoother of predicted efforts, equal to the filter of measured ones. None if no efforts are compared."""
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
@@ -412,7 +412,7 @@ class EpisodePredictor:
     def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
-        """Gradient of a cost of an episode's predictions with respect to its (shared, local, start) unknowns.
+        """Gradient of a cost of an episode's predictions by its (shared, local, start) unknowns.
 
         `result` is predicted at the same unknowns, `pulls` (M, k) are the cost's derivatives by every prediction.
         """
@@ -499,7 +499,7 @@ class _Trajectory:
 
 
 def with_seen_equilibrium_and_denoised_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """The episode with an initial equilibrium near its first points, and with gear loads freed of effort noise."""
+    """Start an episode at an equilibrium near its first points, and remove effort noise from gear loads."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
 

@@ -1,4 +1,4 @@
-"""Episodes: recordings placed on the nodes of a rollout (inputs and their errors, measurements, tracking filter)."""
+"""Episodes, which are recordings placed on the nodes of a rollout."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from yid_ocp.sensors.joints import (
 
 @dataclass(frozen=True)
 class EpisodePrediction:
-    """Prediction of one episode: rollout, initial equilibrium, predicted sensor readings and sensitivities."""
+    """Prediction of one episode, with rollout, initial equilibrium, sensor readings and sensitivities."""
 
     rollout: Rollout
     equilibrium: Equilibrium | None
@@ -63,7 +63,7 @@ class EpisodePrediction:
 
     @property
     def torque_correction_and_sensitivity(self) -> Array | None:
-        """`torque_correction` and, if known, its derivative, in one array (N, nu, 1 + d); None without correction."""
+        """`torque_correction` and its derivative, if known, in one array (N, nu, 1 + d). None without correction."""
         if self.torque_correction is None:
             return None
         known, slopes = self.torque_correction[:, :, None], self.torque_correction_sensitivity
@@ -72,7 +72,7 @@ class EpisodePrediction:
 
 @dataclass(frozen=True)
 class InitialStateWithSensitivity:
-    """Initial state of a rollout with its derivative and equilibrium, and a message if it was not found."""
+    """Initial state of a rollout with its derivative and equilibrium. A message says why it was not found."""
 
     state: Array  # (q, p, z), (nx,)
     state_sensitivity: Array  # with respect to (wanted parameters, state offset), (nx, d)
@@ -109,24 +109,24 @@ class InputErrorModel:
 
     @property
     def estimated_torque_error(self) -> Array:
-        """Estimated torque error, recorded minus true, in every step: constant offset plus noise, (N, nu) [N m]."""
+        """Estimated torque error in every step, recorded minus true, offset plus noise, (N, nu) [N m]."""
         return self.torque_bias + self.torque_noise
 
     @property
     def estimated_torque_error_to_subtract(self) -> Array:
-        """Part of the torque error that remains to be subtracted once effects on torques apply, (N, nu) [N m]."""
+        """Torque error that remains to be subtracted once effects on torques apply, (N, nu) [N m]."""
         return self.estimated_torque_error - self.transmitted_torque_noise
 
     @property
     def torque_bias_part(self) -> InputErrorModel:
-        """The same errors with only the torques' constant offset: without torque noise and smoothed reference."""
+        """Keep only the torques' constant offset, without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
     def on_finer_steps(self, ratio: int) -> InputErrorModel:
-        """The same errors with each step divided into `ratio` steps: torques held, the reference interpolated."""
+        """Divide each step into `ratio` steps. Torques are held, the reference is interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
         if (known := self.smoothed_reference) is not None:
@@ -178,7 +178,7 @@ def _recorded_input_errors(
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording on the time grid of a rollout: inputs, measurements, tracking filter and input errors."""
+    """One recording on the time grid of a rollout, with inputs, measurements, tracking filter and input errors."""
 
     recording: Recording
     grid: TimeGrid
@@ -201,7 +201,7 @@ class Episode:
 
     @property
     def feedback_about_smoother_estimate(self) -> TrackingFeedback | None:
-        """Tracking filter with the Kalman smoother's estimate as its reference, or unchanged without a smoother."""
+        """Tracking filter about the Kalman smoother's estimate. It is unchanged without a smoother."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
@@ -275,7 +275,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
 
 
 def truncate_episode(episode: Episode, steps: int) -> Episode:
-    """The episode truncated to its first `steps` steps and the measurements in them."""
+    """Truncate an episode to its first `steps` steps and the measurements in them."""
     steps = min(steps, episode.grid.steps)
     samples = []
     for entry in episode.measurements:
@@ -299,7 +299,7 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
 
 
 def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
-    """Diagonal entries of the mass matrix for the named joints at zero configuration, (k,) [kg m^2 or kg]."""
+    """Diagonal of the mass matrix for the named joints at zero configuration, (k,) [kg m^2 or kg]."""
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]

@@ -1,4 +1,4 @@
-"""The estimation problem: a model and recordings, its unknowns, and the residual with its derivatives."""
+"""The estimation problem of a model and recordings: unknowns, and the residual with its derivatives."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _HELD_OUT_ITERATIONS = 3
 
 
 class EstimationProblem(ReprMixin):
-    """Problem of estimating free parameters from recordings: residual, cost, derivatives; immutable, thread-safe.
+    """Immutable, thread-safe problem of estimating free parameters from recordings.
 
     It evaluates the cost, predicts held-out recordings, and derives problems with other parameters, data, options or
     whitening filters; `inference.whitening` makes these filters.
@@ -173,7 +173,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_unknowns(self) -> Array:
-        """Initial value of the unknown vector, shape (nx,): initial parameter values and zero state offsets."""
+        """Initial unknown vector of initial parameter values and zero state offsets, shape (nx,)."""
         index, parts = self.system.parameters.index, (self.shared_parameters, self.local_parameters)
         shared, local = ([self.theta[index(name)] for name in part] for part in parts)
         offset = np.zeros(len(self.unknowns.initial_state_names))
@@ -204,7 +204,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def rms_noise_of_data_residuals(self) -> float:
-        """RMS noise of all data residuals: 1 if they are whitened; with the paper's weights that of the points [m]."""
+        """RMS noise of all data residuals. It is 1 if they are whitened, else that of the points [m]."""
         if self.options.weighting != "paper":
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
@@ -212,7 +212,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_state_prior_std(self) -> Array:
-        """Prior standard deviations of the estimated components of an initial state, as in `initial_state_names`."""
+        """Prior standard deviations of the estimated initial state components, as in `initial_state_names`."""
         at = len(self.unknowns.free_parameters)
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
@@ -228,7 +228,7 @@ class EstimationProblem(ReprMixin):
         return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Initial unknown vector (nx,) with the entries in `values` replaced, clipped to the bounds."""
+        """Replace entries of the initial unknown vector (nx,) by `values`, clipped to the bounds."""
         start = self.named_values(self.initial_unknowns)
         return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
 
@@ -241,7 +241,7 @@ class EstimationProblem(ReprMixin):
     def evaluate(
         self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
-        """Evaluate residual, cost and, with `derivatives`, Jacobian at an unknown vector.
+        """Evaluate residual and cost at an unknown vector. With `derivatives` the Jacobian is evaluated too.
 
         `ok` is False, with the reason, where an equilibrium or a rollout failed. `equilibrium_guesses` of a nearby
         point's evaluation shorten the search for least energy.
@@ -276,7 +276,7 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Return cost, gradient and evaluation; the gradient is by adjoint, with process noise by sensitivities.
+        """Compute cost, gradient and evaluation. The gradient is by adjoint, with process noise by sensitivities.
 
         An `evaluation` at `x` that is known already saves the rollout, most of the work; it is returned, without a
         Jacobian.
@@ -304,7 +304,7 @@ class EstimationProblem(ReprMixin):
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
     def prior_residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Return the residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
+        """Residual of the stated and weak priors, and its Jacobian by the unknowns."""
         stated, weak, start = self._stated, self._weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
         spread = np.log(max(self.options.weak_prior_geometric_std, 1.0 + 1e-9))
@@ -315,7 +315,7 @@ class EstimationProblem(ReprMixin):
     def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode, with derivative with respect to (free parameters, offset from equilibrium).
+        """Initial state of an episode, with derivatives by (free parameters, offset from equilibrium).
 
         `guess` (n,) is a configuration near the equilibrium.
         """
@@ -328,7 +328,7 @@ class EstimationProblem(ReprMixin):
     def predict_held_out(
         self, x: ArrayLike, derivatives: bool = False
     ) -> list[tuple[Episode, EpisodePrediction | str]]:
-        """Predict the held-out recordings with the shared parameters in `x` and initial values of local ones.
+        """Predict held-out recordings with the shared parameters in `x` and initial values of local ones.
 
         Returns each episode, with its fitted initial state where it has one, and its prediction or an error message.
         An `estimated` initial state is found from the first moments and its prior. Derivatives are by
@@ -338,7 +338,7 @@ class EstimationProblem(ReprMixin):
         return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """Inputs of each held-out prediction: episode with fitted initial state, theta, and estimated state offset."""
+        """Episode with fitted initial state, theta, and estimated state offset of each held-out prediction."""
         x = np.asarray(x, float)
         theta, found = self.held_out_theta(x), []
         for held in self.held_out:
@@ -353,7 +353,7 @@ class EstimationProblem(ReprMixin):
         return found
 
     def held_out_theta(self, x: Array) -> Array:
-        """Vector theta with the shared parameters in `x`; local parameters keep their initial values."""
+        """Vector theta with the shared parameters in `x`. Local parameters keep their initial values."""
         theta, _ = self.theta_and_initial_state_deviation(x, 0)
         for name in self.local_parameters:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
@@ -364,7 +364,7 @@ class EstimationProblem(ReprMixin):
     def simulate_synthetic_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
     ) -> Recording:
-        """Simulate a synthetic recording with the inputs of one recording and, if given, other parameter values.
+        """Simulate a synthetic recording with one recording's inputs and, if given, other parameter values.
 
         Parameters
         ----------
@@ -386,11 +386,11 @@ class EstimationProblem(ReprMixin):
     # -- problems like this one ---------------------------------------------------------------------------------------
 
     def with_free_parameters_without_recompiling(self, names: Sequence[str]) -> EstimationProblem:
-        """The same problem with other free parameters out of `free` and `may_free`; compiled functions are shared."""
+        """Choose other free parameters from `free` and `may_free`. Compiled functions are shared."""
         return self._changed(free=tuple(names))
 
     def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
-        """The same problem with other values of fixed and initial values of free parameters; filters are kept."""
+        """Set values of fixed and initial values of free parameters. Filters are kept."""
         theta = self.theta.copy()
         for name, value in values.items():
             theta[self.system.parameters.index(name)] = value
@@ -403,28 +403,28 @@ class EstimationProblem(ReprMixin):
         whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
         held_out_whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
     ) -> EstimationProblem:
-        """The same problem on other episodes; without given filters, residuals are whitened by sensor noise alone."""
+        """Use other episodes. Without given filters, residuals are whitened by sensor noise alone."""
         filters = {"whitening_filters": whitening_filters, "held_out_whitening_filters": held_out_whitening_filters}
         changes = {"episodes": episodes, "held_out": held_out, **filters}
         return self._changed(**{name: tuple(value) for name, value in changes.items()})
 
     @property
     def has_process_noise(self) -> bool:
-        """Whether errors of recorded torques or angles act as process noise in at least one recording."""
+        """Whether errors of recorded torques or angles are process noise in at least one recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
 
     def whitened_held_out_prediction_residual(
         self, i: int, episode: Episode, result: EpisodePrediction
     ) -> ResidualAndJacobian:
-        """Whitened residual of a prediction of held-out recording `i` (`predict_held_out`), without a robust loss."""
+        """Whitened residual of held-out recording `i` (`predict_held_out`), without a robust loss."""
         return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
     def truncated_to_duration(self, duration: float) -> EstimationProblem:
-        """The same problem on the first `duration` [s] of each recording, rebuilt without held-out recordings."""
+        """Rebuild the problem on the first `duration` [s] of each recording, without held-out recordings."""
         return self._prepared(options=replace(self.options, duration=duration), held_out=())
 
     def with_time_step(self, time_step: float) -> EstimationProblem:
-        """The same problem with another time step [s], without whitening filters and held-out recordings.
+        """Use another time step [s]. Whitening filters and held-out recordings are removed.
 
         Initial states, guesses of equilibria and loads on gears are those of this problem.
         """
@@ -441,15 +441,15 @@ class EstimationProblem(ReprMixin):
         return self._changed(model_functions=functions).with_episodes(list(map(placed, self.episodes)), ())
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
-        """The same problem, prepared anew from its recordings with other options."""
+        """Prepare the problem anew from its recordings with other options."""
         return self._prepared(options=options)
 
     def with_multivariate_prior(self, prior: MultivariateGaussianPrior) -> EstimationProblem:
-        """The same problem with another multivariate prior; filters are kept."""
+        """Use another multivariate prior. Filters are kept."""
         return self._changed(options=replace(self.options, multivariate_prior=prior))
 
     def with_free_parameters(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
-        """The same problem, prepared anew with other free parameters and, if given, other parameter values."""
+        """Prepare the problem anew with other free parameters and, if given, other parameter values."""
         options = replace(
             self.options,
             local_parameters=tuple(name for name in self.options.local_parameters if name in free),

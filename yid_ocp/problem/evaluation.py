@@ -1,4 +1,4 @@
-"""Unknown vector and residual of an estimation problem: layouts, priors and bounds, value and derivative at a point."""
+"""Layout of unknowns and residual of an estimation problem, with priors, bounds and evaluations."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ProcessNoiseWhitener(Protocol):
         ...
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten residual and derivatives; return them (r, c) and estimated constant torque errors (nu, c) [N m].
+        """Whiten residual and derivatives (r, c), and estimate constant torque errors (nu, c) [N m].
 
         Of `rows` (r, c), a residual in units of the sensors' noise and columns of its derivative, and `push`
         (N, nu, c), the tracking filter's correction of the torque and its derivative [N m].
@@ -49,7 +49,7 @@ class ProcessNoiseWhitener(Protocol):
 
 @dataclass(frozen=True)
 class ResidualVectorLayout:
-    """Slices of the residual vector: measurements of all episodes, then stated priors, then weak priors."""
+    """Slices of the residual vector. Measurements of all episodes precede stated priors, then weak priors."""
 
     measurements: tuple[tuple[slice, ...], ...]  # slices by episode and sensor group
     data: slice
@@ -58,7 +58,7 @@ class ResidualVectorLayout:
 
     @property
     def slice_without_weak_priors(self) -> slice:
-        """Slice of the residual vector with data and stated priors, without weak priors."""
+        """Slice of the residual vector with data and stated priors."""
         return slice(0, self.stated_priors.stop)
 
     @staticmethod
@@ -77,7 +77,7 @@ class ResidualVectorLayout:
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(ReprMixin):
-    """Result of evaluating an estimation problem at one unknown vector: cost, residual, Jacobian, predictions."""
+    """Evaluation of an estimation problem at one unknown vector: cost, residual, Jacobian and predictions."""
 
     cost: float  # 1/2 |r|^2, or the robust loss; infinite where the rollout failed
     residual: Array  # (nr,)
@@ -120,7 +120,7 @@ def _sensor_whitened_residual(
 def whitened_episode_residual(
     episode: Episode, whitening: ProcessNoiseWhitener | None, result: EpisodePrediction, threshold: float
 ) -> ResidualAndJacobian:
-    """Whitened residual of one episode, by sensor noise or by the Kalman filter `whitening` if it is given.
+    """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
     Constant sensor errors count as noise, see `whitened_for_sensor_biases`.
     """
@@ -151,7 +151,7 @@ SOFT_LOGARITHM_MIN_RATIO = 1e-3
 
 @dataclass(frozen=True)
 class UnknownVectorLayout:
-    """Order of the unknown vector: shared parameters, then per recording local parameters and initial state offset."""
+    """Order of the unknown vector. Shared parameters precede each recording's local parameters and state offset."""
 
     shared_parameters: tuple[str, ...]  # free, with one value for all recordings
     local_parameters: tuple[str, ...]  # free, with a value in each
@@ -160,7 +160,7 @@ class UnknownVectorLayout:
 
     @cached_property
     def unknown_names(self) -> tuple[str, ...]:
-        """Names of all unknowns; those of local parameters and initial states contain the recording's name."""
+        """Names of all unknowns. Local parameters and initial states include the recording's name."""
         own = [*self.local_parameters, *(f"{INITIAL_STATE_PREFIX}{name}" for name in self.initial_state_names)]
         each = (f"{name}[{recording}]" for recording in self.recording_names for name in own)
         return (*self.shared_parameters, *each)
@@ -171,12 +171,12 @@ class UnknownVectorLayout:
         return (*self.shared_parameters, *self.local_parameters)
 
     def unknown_indices_affecting_recording(self, recording: int) -> IntArray:
-        """Indices in the unknown vector of shared unknowns and of one recording's local and initial state unknowns."""
+        """Indices of shared unknowns and of one recording's local and initial state unknowns."""
         shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
 
     def scatter_to_unknown_columns(self, block: Array, recording: int) -> Array:
-        """Scatter one recording's derivative columns (r, d) to those of the unknown vector (r, nx); others are zero."""
+        """Scatter one recording's derivative columns (r, d) to the unknowns' (r, nx). Others are zero."""
         wide = np.zeros((len(block), len(self.unknown_names)))
         wide[:, self.unknown_indices_affecting_recording(recording)] = block
         return wide
@@ -184,7 +184,7 @@ class UnknownVectorLayout:
     def theta_and_initial_state_deviation(
         self, x: ArrayLike, recording: int, theta: Array, system: System
     ) -> tuple[Array, Array]:
-        """Return theta with one recording's values in `x`, and that recording's initial state offset."""
+        """Extract theta with one recording's values from `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
         result = theta.copy()
         for name, value in zip(self.free_parameters, own, strict=False):
@@ -192,7 +192,7 @@ class UnknownVectorLayout:
         return result, own[len(self.free_parameters) :]
 
     def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
-        """Unknown vector from shared values, and local values and an initial state offset used for all recordings."""
+        """Pack the unknown vector, with the same local values and initial state offset for all recordings."""
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
         return np.concatenate(parts)
@@ -201,7 +201,7 @@ class UnknownVectorLayout:
 def stated_prior_stds(
     unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
 ) -> Array:
-    """Standard deviation (nx,) of each unknown's stated Gaussian prior; infinite for unknowns without one.
+    """Standard deviation of each unknown's stated Gaussian prior, (nx,). Infinite for unknowns without one.
 
     `inertia` gives the diagonal of the mass matrix, by which a start's velocity becomes a momentum. An internal
     coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
@@ -225,7 +225,7 @@ def stated_prior_stds(
 
 
 def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Jacobian (k, nx) of the stated priors' whitened residual, which is Jacobian x (x - initial x)."""
+    """Jacobian (k, nx) of the stated priors' whitened residual Jacobian x (x - initial x)."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -267,7 +267,7 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
 
 
 def max_allowed_initial_state_offsets(system: System, names: Sequence[str]) -> Array:
-    """Largest absolute offset of each estimated initial state component; infinite for coordinates and momenta."""
+    """Largest absolute offset of each estimated initial state component. Infinite for coordinates and momenta."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 
@@ -301,7 +301,7 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
 
 
 def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
-    """Return log(ratio) and its slope; below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
+    """Compute log(ratio) and its slope. Below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
     below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
     small = below < 0
     kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)

@@ -1,4 +1,4 @@
-"""Fit of an initial state to the first measured points, for recordings that do not start at equilibrium."""
+"""Fit an initial state to the first measured points of a recording that does not start at equilibrium."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _TRIALS_PER_PARAMETER = 4
 
 @dataclass(frozen=True)
 class PrecomputedInitialState:
-    """Initial state, given or fitted to the first measured points, that does not depend on the unknowns."""
+    """Initial state that does not depend on the unknowns, given or fitted to the first measured points."""
 
     state: Array  # (q, p, z) at node 0, (nx,)
     fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # along with it, in their units
@@ -58,7 +58,7 @@ class _Task:
 
 
 class InitialStateFitter:
-    """Solver that fits an initial state, and optionally parameters, to the first measured points of an episode.
+    """Fits an initial state, and optionally parameters, to the first measured points of an episode.
 
     Minimises, by Gauss-Newton over q (and the parameters asked for) at the first frame,
 

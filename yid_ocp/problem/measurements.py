@@ -1,4 +1,4 @@
-"""Measurements of one sensor on the nodes of a rollout: time grid, interpolation, whitening, constant errors."""
+"""Measurements of one sensor on rollout nodes, with time grid, interpolation, whitening and constant errors."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class TimeGrid:
 
     @property
     def node_times(self) -> Array:
-        """Times [s] of all nodes, shape (steps + 1,)."""
+        """Times of all nodes, shape (steps + 1,) [s]."""
         return np.asarray(self.start_time + self.time_step * np.arange(self.steps + 1), dtype=float)
 
     def node_and_fraction(self, t: ArrayLike) -> tuple[IntArray, Array]:
-        """Return the node before each time and the fraction of a step after that node, to within 1e-6 of a step."""
+        """Node before each time, and the fraction of a step after it, to within 1e-6 of a step."""
         position = (np.asarray(t, float) - self.start_time) / self.time_step
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-6, near, position)
@@ -45,7 +45,7 @@ class TimeGrid:
 
 
 def recording_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
-    """Time grid that covers a recording's joint samples, or without joints its first point group.
+    """Make a time grid over a recording's joint samples, or without joints over its first point group.
 
     `DataError` where it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its length.
     """
@@ -68,7 +68,7 @@ ResidualWeightingName = Literal["whitened", "paper"]
 
 @dataclass(frozen=True)
 class ResidualAndJacobian:
-    """One block of the residual vector: its cost, residual, Jacobian and factors of the robust loss."""
+    """One block of the residual vector, with cost, Jacobian and factors of the robust loss."""
 
     cost: float  # half the sum of squares, or Huber's loss
     residual: Array  # (nr,)
@@ -78,7 +78,7 @@ class ResidualAndJacobian:
 
 @dataclass(frozen=True)
 class SensorMeasurements:
-    """M samples of a sensor's k outputs, located between the nodes of a rollout, with weights and noise levels."""
+    """M samples of a sensor's k outputs, located between rollout nodes, with weights and noise levels."""
 
     sensor: Sensor
     node: IntArray  # before each sample, (M,), or (M, k) where outputs are late by different times
@@ -105,12 +105,12 @@ class SensorMeasurements:
 
     @property
     def channel_name_per_output(self) -> tuple[str, ...]:
-        """Name of the channel that each of the k outputs belongs to."""
+        """Channel name of each of the k outputs."""
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @property
     def evaluation_nodes(self) -> IntArray:
-        """Sorted indices of the nodes at which the sensor must be predicted to interpolate at the samples."""
+        """Sorted indices of the nodes at which the sensor is predicted, to interpolate at the samples."""
         if self.node.ndim > 1:
             # with the neighbours that a slope needs
             low = int(self.node.min(initial=self.predictable_nodes[1]))
@@ -126,12 +126,12 @@ class SensorMeasurements:
 
     @property
     def n_residuals(self) -> int:
-        """Number of scalar residuals of the measurements, one per used output."""
+        """Number of scalar residuals of the measurements, one for each used output."""
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
     def residual_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
-        """Matrix R^(-1/2), (nr, nr), that decorrelates normalized residuals; None if outputs are independent.
+        """Matrix R^(-1/2) that decorrelates normalized residuals, (nr, nr). None if outputs are independent.
 
         R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
         doi:10.1080/00031305.2016.1277159).
@@ -147,18 +147,18 @@ class SensorMeasurements:
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.n_residuals, self.n_residuals))
 
     def decorrelate(self, rows: Any) -> Any:
-        """Decorrelate rows (nr,) or (nr, d), dense or sparse, already divided by their standard deviations."""
+        """Decorrelate rows (nr,) or (nr, d) that are already divided by their standard deviations, dense or sparse."""
         return rows if self.residual_decorrelation_matrix is None else self.residual_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
-        """Whitened residual (M, k), prediction minus measurement; zero where nothing was measured."""
+        """Whitened residual (M, k), prediction minus measurement. It is zero where nothing was measured."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
         if self.residual_decorrelation_matrix is not None:
             plain[self.positive_weight_mask] = self.residual_decorrelation_matrix @ plain[self.positive_weight_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
-        """Adjoint of `whitened_residual`: maps a cost's gradient (M, k) by residual to the gradient by prediction."""
+        """Map a cost's gradient (M, k) by residual to the gradient by prediction, as adjoint of `whitened_residual`."""
         if self.residual_decorrelation_matrix is not None:
             pull = pull.copy()
             pull[self.positive_weight_mask] = self.residual_decorrelation_matrix.T @ pull[self.positive_weight_mask]
@@ -177,7 +177,7 @@ class SensorMeasurements:
         return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
     def shifted_earlier_by_steps(self, steps: Array) -> SensorMeasurements:
-        """The same samples, shifted earlier by each output's delay (k,) [steps] and clipped to predictable nodes."""
+        """Shift samples earlier by each output's delay (k,) [steps], clipped to predictable nodes."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-9, near, position)
@@ -186,7 +186,7 @@ class SensorMeasurements:
         return replace(self, node=node, fraction=position - node)
 
     def prediction_change_per_step(self, at_nodes: Array, unmoved: SensorMeasurements, steps: Array) -> Array:
-        """Change of a prediction per step at delayed samples, (M, k); at a node the mean of both adjacent steps.
+        """Change of a prediction per step at delayed samples, (M, k). At a node it is the mean of adjacent steps.
 
         `at_nodes` (len(nodes), k) is the prediction, `unmoved` the measurements before the delay of `steps` (k,).
         """
@@ -214,7 +214,7 @@ class SensorMeasurements:
         return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
     def interpolation_adjoint(self, at_samples: Array) -> Array:
-        """Transpose of the linear map `interpolate_to_samples`: values (M, ...) to (len(nodes), ...)."""
+        """Apply the transpose of `interpolate_to_samples` to values (M, ...). Result: (len(nodes), ...)."""
         nodes = self.evaluation_nodes
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
@@ -231,7 +231,7 @@ class SensorMeasurements:
 
 
 def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -> SensorMeasurements:
-    """Locate a sensor's samples between the nodes of a rollout; `DataError` if a noise level is not positive."""
+    """Locate a sensor's samples between rollout nodes. `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
         what, allowed = "a noise level is zero or missing", "a positive standard deviation"
@@ -247,7 +247,7 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
 
 
 def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
-    """Measurements at nearest nodes, weighted as in Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
+    """Weight measurements at nearest nodes as Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
     """
@@ -261,7 +261,7 @@ def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid)
 
 
 def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
-    """Return the Huber loss sum rho(r) of whitened residuals, and least-squares factors sqrt(rho'(r)/r).
+    """Huber loss sum rho(r) of whitened residuals, and least-squares factors sqrt(rho'(r)/r).
 
     Beyond `scale` the loss grows linearly [standard deviations]; infinite for plain squares.
     """
@@ -274,7 +274,7 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
 
 
 def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
-    """Whiten a residual and its derivatives, columns (r, c) in units of noise, by constant sensor errors too.
+    """Whiten a residual and its derivatives (r, c), in units of noise, by constant sensor errors too.
 
     `slopes` (r, m) are the sensitivities of residuals of unit variance to errors of unit variance.
     """

@@ -1,4 +1,4 @@
-"""Compiled functions of a model that many estimation problems share: sensors, equilibrium, input corrections."""
+"""Compiled functions of a model, for sensors, equilibrium and input corrections, that many problems share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from yid_ocp.sensors import Sensor, sensor_reading_function
 
 @dataclass(frozen=True)
 class CorrectedInputs:
-    """Inputs of a rollout corrected by effects, with derivatives (..., d) along d parameters (None: zero)."""
+    """Inputs of a rollout corrected for effects, with derivatives (..., d) along d parameters (None: zero)."""
 
     torque: Array  # (N, nu) [N m]
     first_torque: Array  # torque of the initial equilibrium, (nu,) [N m]
@@ -42,11 +42,11 @@ class CorrectedInputs:
 
     @property
     def initial_known_coordinates(self) -> Array:
-        """Coordinates of the driven, then the prescribed joints at node 0, shape (nk,)."""
+        """Coordinates of driven, then prescribed joints at node 0, shape (nk,)."""
         return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
 
     def initial_known_coordinates_sensitivity(self, width: int) -> Array:
-        """Derivative of `initial_known_coordinates` with respect to the parameters, shape (nk, d)."""
+        """Derivative of `initial_known_coordinates` by the parameters, shape (nk, d)."""
         by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
@@ -54,7 +54,7 @@ class CorrectedInputs:
     def feedback_with_corrected_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
-        """Tracking filter whose reference is corrected to true angles and by the effects' momentum shift."""
+        """Correct the tracking filter's reference to true angles and by the effects' momentum shift."""
         turned = None if self.driven_angles_sensitivity is None else self.driven_angles - measured
         if feedback is None or (turned is None and self.momentum_shift is None):
             return feedback
@@ -74,7 +74,7 @@ class CorrectedInputs:
         wanted: Sequence[str],
         by_internal: Array | None,
     ) -> CorrectedInputs:
-        """The inputs with the momentum that effects add to the tracking filter's reference at every step.
+        """Add to every step the momentum that effects add to the tracking filter's reference.
 
         The angles `recorded` are smooth, those `measured` (N + 1, nu) are as they were read; `by_internal` (nz, d) is
         the derivative of the internal coordinates at the start.
@@ -92,7 +92,7 @@ class CorrectedInputs:
     def nominal_torque_sensitivity(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
-        """Derivatives (N, nu, width) of the nominal torque, including those through the tracking filter's reference."""
+        """Derivatives of the nominal torque, also through the tracking filter's reference, (N, nu, width)."""
         reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
         for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
             if feedback is not None and slope is not None:
@@ -177,7 +177,7 @@ class InputCorrectionFunctions:
     def true_angles_and_efforts(
         self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """True angles and efforts (K, nj) of `joint_names`, computed from recorded ones, with derivatives.
+        """True angles and efforts (K, nj) of `joint_names` from recorded ones, with derivatives.
 
         Followed by their derivatives by the d parameters `wanted`, (K, nj, d), and that of the effort by its reading.
         """
@@ -189,7 +189,7 @@ class InputCorrectionFunctions:
     def joint_delay_or_lag(
         self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Delays or lag time constants (nj,) [s] of driven joints' torques or prescribed joints' efforts.
+        """Delays or lag time constants of driven joints' torques or prescribed joints' efforts, (nj,) [s].
 
         With their derivatives by the parameters `wanted`; None where no effect has any.
         """
@@ -198,7 +198,7 @@ class InputCorrectionFunctions:
     def sensor_delays_with_derivatives(
         self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Recorded minus true time of each sensor output, (k,) [s], and its derivatives; None without delays."""
+        """Recorded minus true time of each sensor output, (k,) [s], and its derivatives. None without delays."""
         return self._evaluate(self._sensor_delays(sensor), theta, wanted)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
@@ -241,7 +241,7 @@ class TimeGridStateValues:
     def from_trajectory(
         step: Step, state: Array, load: Array | None = None, lam: Array | None = None
     ) -> TimeGridStateValues:
-        """Compute the values at all nodes of a trajectory (K, nx); absent loads and constraint forces are zero."""
+        """Compute the values at all nodes of a trajectory (K, nx). Absent loads and constraint forces are zero."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
         v, a = (
@@ -251,7 +251,7 @@ class TimeGridStateValues:
         return TimeGridStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
 
     def at(self, nodes: IntArray) -> TimeGridStateValues:
-        """The same values at the nodes with the given indices."""
+        """Select the values at the nodes with the given indices."""
         return TimeGridStateValues(*(values[nodes] for values in vars(self).values()))
 
 
@@ -263,7 +263,7 @@ def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> 
 
 
 def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of the linear map `central_difference_velocity`: values (len(nodes), n) to (count, n)."""
+    """Transpose of `central_difference_velocity`, from (len(nodes), n) to (count, n)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
     scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))
     np.add.at(result, after, scaled)
@@ -278,7 +278,7 @@ def second_difference_acceleration(q: Array, nodes: IntArray, time_step: float) 
 
 
 def second_difference_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of the linear map `second_difference_acceleration`: values (len(nodes), n) to (count, n)."""
+    """Transpose of `second_difference_acceleration`, from (len(nodes), n) to (count, n)."""
     middle, result = _inner_nodes(nodes, count), np.zeros((count, pull.shape[1]))
     for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
         np.add.at(result, middle + shift, factor / time_step**2 * pull)
@@ -326,7 +326,7 @@ class ModelFunctions:
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
-        """The same functions for another time step [s]; those that do not depend on it are shared."""
+        """Make the functions for another time step [s]. Those that do not depend on it are shared."""
         made = ModelFunctions(
             copy_of_step_with_time_step(self.step, time_step), self.parameter_names, self._start_parameters
         )
@@ -357,7 +357,7 @@ class ModelFunctions:
     def compiled_sensor_function(
         self, sensor: Sensor, wanted: tuple[str, ...] = ()
     ) -> Callable[[TimeGridStateValues, Array], _SensorReadings]:
-        """Compiled function of a sensor's readings at nodes, with derivatives with respect to `wanted`."""
+        """Compiled function of a sensor's readings at nodes, with derivatives by `wanted`."""
         function, columns = self._sensors((sensor, bool(wanted))), [self.parameter_names.index(name) for name in wanted]
 
         def read(at: TimeGridStateValues, theta: Array) -> _SensorReadings:

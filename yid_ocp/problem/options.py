@@ -33,19 +33,19 @@ class MultivariateGaussianPrior:
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def with_parameters_scaled_by(self, factors: Mapping[str, float]) -> MultivariateGaussianPrior:
-        """Prior of the rescaled parameters factor x parameter; parameters without a factor are unchanged."""
+        """Prior of the rescaled parameters factor x parameter. Parameters without a factor are unchanged."""
         by = np.array([factors.get(name, 1.0) for name in self.parameter_names])
         return MultivariateGaussianPrior(self.parameter_names, self.covariance * np.outer(by, by))
 
     def restricted_to(self, names: Sequence[str]) -> MultivariateGaussianPrior:
-        """Marginal prior of those of the named parameters that it covers, in the given order."""
+        """Marginal prior of the named parameters that it covers, in the given order."""
         at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
         return MultivariateGaussianPrior(tuple(self.parameter_names[i] for i in at), self.covariance[np.ix_(at, at)])
 
 
 @dataclass(frozen=True)
 class ExcessResidualCriteria:
-    """Significance level and smallest excess chi2 at which a residual counts as exceeding its noise.
+    """Significance level and smallest excess chi2 at which a residual exceeds its noise.
 
     It does where it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`; of the stated standard
     deviations `noise_fraction_of_std` is noise, the rest represents model error.
@@ -58,7 +58,7 @@ class ExcessResidualCriteria:
 
 @dataclass(frozen=True)
 class DividedLinksModel:
-    """Model of the same object with each link divided in two, and factors on parameters that keep its stiffness."""
+    """Model of an object with each link divided in two. Factors on parameters keep its stiffness."""
 
     build_step: Callable[[bool], Step]  # of whether it is compiled
     parameter_factors: Mapping[str, float]
@@ -66,7 +66,7 @@ class DividedLinksModel:
 
 @dataclass(frozen=True)
 class ProblemOptions:
-    """Settings of an estimation problem besides model and data: initial states, tracking filter, weighting, priors, ...
+    """Settings of an estimation problem besides model and data, such as initial states, weighting and priors.
 
     Attributes
     ----------
@@ -163,5 +163,5 @@ class ProblemOptions:
 
     @property
     def no_data_issue_exceeds_warning(self) -> bool:
-        """Whether no data quality issue of the recordings is more severe than a warning."""
+        """Whether no data quality issue is more severe than a warning."""
         return all(doubt.weight == "warning" for doubt in self.data_issues)

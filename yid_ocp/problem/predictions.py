@@ -1,4 +1,4 @@
-"""Results of predictions: model-free baselines, channels with their measurements, synthetic recordings."""
+"""Results of predictions: model-free baselines, measured channels and synthetic recordings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
 
 
 def constant_position_baseline(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
-    """Baseline prediction: every point stays where it was in the last given frame.
+    """Predict that every point stays where it was in the last given frame (baseline).
 
     The `given` first frames are as measured; shape (M, len(points), 3) [m]. Raises `DataError` for a point that is not
     recorded or not seen in the last given frame, or too few frames.
@@ -52,7 +52,7 @@ def constant_position_baseline(recording: Recording, points: Sequence[str], give
 def mean_clamp_displacement_baseline_prediction(
     recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2
 ) -> Array:
-    """Baseline prediction: every point moves by the clamped points' mean displacement since the last given frame.
+    """Predict that every point moves by the clamped points' mean displacement since the last given frame.
 
     Shape and errors as in `constant_position_baseline`; the path of the points `clamped` is known throughout.
     """
@@ -68,7 +68,7 @@ def interpolated_displacement_position_baseline(
     clamped: Sequence[str] | None = None,
     given: int = 2,
 ) -> Array:
-    """Baseline prediction: displacements interpolated along the parent's arc length; children move with their junction.
+    """Predict displacements by interpolation along the parent's arc length. Children move with their junction.
 
     Shape and errors as in `constant_position_baseline`, and for a point of no branch. `parent` has its points from end
     to end, of which `clamped` are those between which is interpolated, its two ends when absent; each child begins with
@@ -93,7 +93,7 @@ def interpolated_displacement_position_baseline(
 
 
 def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
-    """Root mean square of the Euclidean error over points and frames [m]; NaN if there is nothing to compare.
+    """Root mean square of the Euclidean error over points and frames [m]. NaN if there is nothing to compare.
 
     Given frames and those in which a point was not measured do not count; shapes are (M, np, 3), `DataError` where the
     two differ.
@@ -106,7 +106,7 @@ def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
 
 
 def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
-    """Measured positions (M, len(points), 3) [m] of some points of one group of a recording."""
+    """Measured positions of some points of one group of a recording, (M, len(points), 3) [m]."""
     group = _group_with_points(recording, points)
     return group.position[:, [group.names.index(point) for point in points]]
 
@@ -138,7 +138,7 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelPrediction(ReprMixin):
-    """Measured and predicted samples (M, w) of one channel of a recording; w is 3 for a point, 1 for a joint."""
+    """Measured and predicted samples (M, w) of one channel. w is 3 for a point, 1 for a joint."""
 
     recording: str
     channel: str
@@ -155,11 +155,11 @@ class ChannelPrediction(ReprMixin):
 
     @property
     def rmse(self) -> float:
-        """Root mean square error in the channel's unit; for a point, that of the Euclidean distance."""
+        """Root mean square error in the channel's unit. For a point it is that of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
     def predicted_at(self, t: Array) -> Array:
-        """Prediction (K, w) at other times t (K,) [s], on straight lines between the samples."""
+        """Interpolate the prediction linearly to other times t (K,) [s], shape (K, w)."""
         return np.stack([np.interp(t, self.t, column) for column in self.predicted.T], axis=1)
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -213,7 +213,7 @@ def recording_from_prediction(
     seed: int | None = None,
     description: str = "",
 ) -> Recording:
-    """Convert an episode's prediction at `theta` into a synthetic recording with its sensors' clocks and noise levels.
+    """Convert an episode's prediction to a synthetic recording with its sensors' clocks and noise levels.
 
     `seed` is that of the noise that the estimation assumes, constant torque offsets included; no noise when absent.
     """
@@ -244,7 +244,7 @@ def recording_from_prediction(
 def synthesize_recording(
     predictor: EpisodePredictor, episode: Episode, theta: Array, seed: int | None = None
 ) -> Recording:
-    """Roll out an episode at `theta` and return the prediction as a synthetic recording, with noise for a `seed`."""
+    """Roll out an episode at `theta` and make a synthetic recording. It has noise if a `seed` is given."""
     refit = predictor.options.initial_state == "fitted_to_points"
     fresh = (
         predictor.episode_with_fitted_initial_state(replace(episode, fixed_initial_state=None), theta)

@@ -1,4 +1,4 @@
-"""Inputs of a rollout from a recording: torques or commands of every step, prescribed paths, joint angles."""
+"""Inputs of a rollout from a recording: step torques or commands, prescribed paths and joint angles."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def mean_step_inputs(
     delay: Array | None = None,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Mean input of driven joints in every step, (steps, nu): torques [N m], or servo commands [rad or m].
+    """Mean input of driven joints in every step, torque [N m] or servo command [rad or m], (steps, nu).
 
     An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
     efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
@@ -58,7 +58,7 @@ def mean_step_input_delay_derivative(
     delay: Array,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Derivative (steps, nu) of `mean_step_inputs` with respect to each joint's delay; mean of both sides at a jump."""
+    """Derivative of `mean_step_inputs` by each joint's delay, (steps, nu). At a jump both sides are averaged."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
@@ -81,7 +81,7 @@ def _motor_off_steps(
 
 
 def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
-    """Firmware gains stated in recordings, as values of `JOINT.servo_gain_factor` by recording name.
+    """Firmware gains stated in recordings, as `JOINT.servo_gain_factor` values by recording name.
 
     `DataError` where some recordings state it and others, whose motors are on, do not: their gains would not compare.
     """
@@ -159,7 +159,7 @@ def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
 def smoothed_joint_angles_at_nodes(
     joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: LowPassFilter
 ) -> Array:
-    """Joint angles at every node, low-pass filtered from the recording, (steps + 1, len(names)) [rad]."""
+    """Low-pass filter recorded joint angles and sample them at every node, (steps + 1, len(names)) [rad]."""
     columns = recorded_joint_column_indices(joints, names, where)
     return _smoothed_at_nodes(joints.t, joints.position[:, columns], grid, low_pass)
 
@@ -172,7 +172,7 @@ def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: LowPas
 def smoothed_joint_efforts(
     recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: LowPassFilter
 ) -> Array:
-    """Low-pass filtered joint efforts at every node, (steps + 1, len(names)) [N m]; `DataError` without efforts."""
+    """Low-pass filtered joint efforts at every node, (steps + 1, len(names)) [N m]. `DataError` without efforts."""
     joints = recording.joints
     if joints is None or joints.effort is None:
         what = "the model's gears give way under an effort that the recording does not have"
@@ -183,7 +183,7 @@ def smoothed_joint_efforts(
 
 
 def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Gear loads without effort noise: the model's loads plus the slow part of measured minus model loads.
+    """Remove effort noise from gear loads: the model's loads plus the slow part of measured minus model loads.
 
     Both are smoothed (N + 1, k) and compared at `nodes` (M,), beyond the first and last of which neither is right; the
     filter of paths and efforts has the `cutoff` [Hz].
@@ -193,7 +193,7 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 
 
 def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Kinds of signals, such as `joints.effort`, that recordings contain and effects can require.
+    """Kinds of signals in recordings that effects can require, such as `joints.effort`.
 
     Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`, and so is each group of points, no camera's
     nor an arm's, beside joints: `points:GROUP`.
@@ -235,7 +235,7 @@ def prescribed_coordinates_at_nodes(
     low_pass: LowPassFilter,
     clamps: tuple[ClampPoseDefinition, ...] = (),
 ) -> Array:
-    """Prescribed coordinates at every node, (steps + 1, nc), from smoothed recorded joints and clamp points.
+    """Prescribed coordinates at every node from smoothed recorded joints and clamp points, (steps + 1, nc).
 
     Joints follow the smoothed recorded positions, clamps their smoothed points; `DataError` where one is not recorded,
     or is seen too seldom.

@@ -1,4 +1,4 @@
-"""Filters of recorded and predicted signals: a zero-phase low-pass filter and first-order lags."""
+"""Zero-phase low-pass filter and first-order lags of recorded and predicted signals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MIN_RELATIVE_WEIGHT = 1e-4
 
 @dataclass(frozen=True)
 class LowPassFilter:
-    """Zero-phase low-pass filter (Butterworth of order 4, forward and backward) on an even clock."""
+    """Zero-phase Butterworth low-pass filter of order 4 on an even clock. It runs forward and backward."""
 
     cutoff: float  # frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter
     passes: int = 1
@@ -43,17 +43,17 @@ class LowPassFilter:
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def decorrelation_stride(self, step: float) -> int:
-        """Number of samples, `step` [s] apart, after which filtered white noise is nearly uncorrelated."""
+        """Number of samples (`step` [s] apart) after which filtered white noise is nearly uncorrelated."""
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 
     @property
     def settling_time(self) -> float:
-        """Settling time [s], after which the distortion at the ends of a record has decayed to a thousandth."""
+        """Time after which the distortion at the ends of a record has decayed to a thousandth [s]."""
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * _FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
     def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]:
-        """Standard deviations of filtered unit white noise, and of its first [1/s] and second [1/s^2] derivatives."""
+        """Standard deviations of filtered unit white noise and of its first [1/s] and second [1/s^2] derivatives."""
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
         response = self._response(step)
@@ -63,7 +63,7 @@ class LowPassFilter:
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 
     def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeSmoother:
-        """The filter as a matrix that smooths values at `nodes` out of `count` nodes, `step` [s] apart.
+        """Make a matrix filter that smooths values at `nodes` out of `count` nodes, `step` [s] apart.
 
         Values before node 1 and after the last node are taken as constant.
         """
@@ -100,19 +100,19 @@ class LowPassFilter:
 
 @dataclass(frozen=True)
 class NodeSmoother:
-    """A smoothing filter as a matrix (M, N): smooths values at M of N nodes and leaves the others unchanged."""
+    """A smoothing filter as a matrix (M, N). It smooths values at M of N nodes and leaves the others unchanged."""
 
     nodes: IntArray
     matrix: scipy.sparse.csr_array
 
     def smooth(self, values: Array) -> Array:
-        """Apply the filter to values at all nodes, (N, ...), and return them in the same shape."""
+        """Smooth values at all nodes, (N, ...), in the same shape."""
         smooth = values.copy()
         smooth[self.nodes] = (self.matrix @ values.reshape(len(values), -1)).reshape(len(self.nodes), *values.shape[1:])
         return smooth
 
     def smoothing_adjoint(self, pull: Array) -> Array:
-        """Adjoint of `smooth`: maps a cost's gradient (N, k) by smoothed values to the gradient by input values."""
+        """Map a cost's gradient (N, k) by smoothed values to the gradient by input values, as adjoint of `smooth`."""
         passed = pull.copy()
         passed[self.nodes] = 0.0
         return np.asarray(passed + self.matrix.T @ pull[self.nodes])
@@ -129,7 +129,7 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
 
 
 def twice_applied_effort_filter(cutoff: float) -> LowPassFilter:
-    """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
+    """Filter of measured and predicted efforts, the zero-phase filter of prescribed paths applied twice."""
     return LowPassFilter(cutoff, 2)
 
 
@@ -146,7 +146,7 @@ class FirstOrderLag:
     time_step: float  # h [s]
 
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
-        """Mean of the lagged output over each step, for inputs held over steps; output and input start equal.
+        """Mean lagged output over each step, for inputs held over steps. Output and input start equal.
 
         Of x (N, k) with its slope (N, k, d), if any, it is x + (z - x) f, with z_{k+1} = x + (z - x) E; and its slope.
         """
@@ -161,7 +161,7 @@ class FirstOrderLag:
         return value + share * gap, through + mean_by_time
 
     def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
-        """Lagged output at nodes and its derivatives, for an input that is linear between nodes; it starts at node 1.
+        """Lagged output at nodes with derivatives, for an input linear between nodes. It starts at node 1.
 
         Of x (N, k) it is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences. Slopes
         (N, k, d) are by all directions, first the parameters of `time_constant_sensitivity`.
@@ -179,7 +179,7 @@ class FirstOrderLag:
         return followed, total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Adjoint of `lagged_node_values`: maps a cost's gradient (N, k) by output to those by input and parameters."""
+        """Map a cost's gradient (N, k) by lagged node values to those by input and parameters (adjoint)."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         by_time = self._by_time(value, self._straight(value, decay, share))

@@ -1,4 +1,4 @@
-"""The interface of all sensors: recorded channels, symbolic readings, and measurements taken from a recording."""
+"""Interface of all sensors, with recorded channels, symbolic readings, and measurements from a recording."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NonNegative = Annotated[float, Ge(0)]
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """Settings of one sensor group (such as `points` or `joints.effort`): use, noise, bias, frames and constants."""
+    """Settings of one sensor group, such as `points` or `joints.effort`."""
 
     use: Annotated[
         bool | None,
@@ -88,7 +88,7 @@ class SensorOptions:
 
 @dataclass(frozen=True)
 class ChannelSpecification:
-    """Kind of recorded quantity: its group and dataset in a recording, unit, components and sensor constants.
+    """One kind of recorded quantity, with its group, dataset, unit, components and sensor constants.
 
     The noise stands in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`, of points in the dataset `std`.
     """
@@ -102,11 +102,11 @@ class ChannelSpecification:
 
     @property
     def std_attribute_names(self) -> tuple[str, str]:
-        """Names of the recorded attributes with the standard deviations of white noise and of a constant error."""
+        """Attribute names of the standard deviations of white noise and of a constant error."""
         return f"{self.quantity}_std", f"{self.quantity}_bias_std"
 
     def matches_group_name(self, name: str) -> bool:
-        """Whether a group's name is `GROUP` or `GROUP_NAME` of this channel kind; its contents are not checked."""
+        """Whether a group's name is `GROUP` or `GROUP_NAME` of this channel kind. Contents are not checked."""
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
@@ -115,7 +115,7 @@ CHANNEL_KINDS: Registry[ChannelSpecification] = Registry("recorded channel")
 
 
 def channel_kinds_for_group_name(group: str) -> tuple[ChannelSpecification, ...]:
-    """Channel kinds registered for a recording's group of this name; an empty tuple for joints and points."""
+    """Channel kinds registered for a recording's group of this name. Joints and points have none."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
 
@@ -130,7 +130,7 @@ class _RecordedGroup(Protocol):
 
 
 class RecordedPointGroup(_RecordedGroup, Protocol):
-    """Interface of a recorded point group (names, times, positions), as implemented by `data.recording.PointGroup`."""
+    """Interface of a recorded point group. `data.recording.PointGroup` implements it."""
 
     @property
     def sensor(self) -> str: ...
@@ -143,7 +143,7 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
 
 
 class RecordedJointGroup(Protocol):
-    """Interface of recorded joints (names, times, channels), as implemented by `data.recording.JointGroup`."""
+    """Interface of recorded joints. `data.recording.JointGroup` implements it."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -166,7 +166,7 @@ class RecordedJointGroup(Protocol):
 
 
 class RecordedChannelGroup(_RecordedGroup, Protocol):
-    """Interface of a further sensor's recorded channels, as implemented by `data.recording.SensorChannelGroup`."""
+    """Interface of an additional sensor's recorded channels. `data.recording.SensorChannelGroup` implements it."""
 
     @property
     def values_by_quantity(self) -> Mapping[str, Array]: ...
@@ -188,7 +188,7 @@ class _RecordingData(Protocol):
 
 
 def recorded_joint_column_indices(joints: RecordedJointGroup, names: tuple[str, ...], where: str) -> list[int]:
-    """Column indices of the named joints in the recorded arrays; `DataError` for a joint that is not recorded."""
+    """Column indices of the named joints in the recorded arrays. `DataError` for a joint that is not recorded."""
     for name in names:
         if name not in joints.names:
             what, hint = f"joint '{name}' of the model is not recorded", nearest_name_hint(name, joints.names)
@@ -199,7 +199,7 @@ def recorded_joint_column_indices(joints: RecordedJointGroup, names: tuple[str, 
 def expand_to_joint_values(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
-    """One value per joint in `names`, from a single value, one value per recorded joint, or a mapping by joint."""
+    """Expand a single value, one per recorded joint or a mapping by joint to one value per joint in `names`."""
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
@@ -213,7 +213,7 @@ def expand_to_joint_values(
 
 
 class Sensor(ABC):
-    """Base class of sensors: a group of measured channels on one clock and its prediction from the model; hashable.
+    """Base class of sensors. A sensor predicts a group of measured channels with a common clock; it is hashable.
 
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
     """
@@ -239,42 +239,42 @@ class Sensor(ABC):
     @property
     @abstractmethod
     def channel_names(self) -> tuple[str, ...]:
-        """Names of the sensor's channels, in the order of its outputs."""
+        """Names of the channels in the order of the outputs."""
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """Name of each scalar output: the channel's name, followed by the component's name if there are several."""
+        """Name of each scalar output. With several components, the component's name follows the channel's."""
         parts = [f".{part}" for part in self.channel.components] or [""]
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
     def output_frame_names(self) -> tuple[str, ...]:
-        """Name of the mechanism's frame at which each output is measured; an empty string for joints."""
+        """Name of the frame at which each output is measured. Joints have an empty string."""
         frames = self.frame_names or ("",) * len(self.channel_names)
         return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """Names of the joints whose effort the sensor reads, filtered like the prescribed path; empty if none."""
+        """Names of the joints whose effort the sensor reads, filtered like the prescribed path."""
         return ()
 
     @property
     def effort_per_unit_reading(self) -> Array:
-        """Joint effort that corresponds to one unit of each output, (len(effort_joints),) [N m per unit]."""
+        """Joint effort per unit of each output, shape (len(effort_joints),) [N m per unit]."""
         return np.ones(len(self.effort_joints))
 
     @property
     def camera_pose(self) -> Placement | None:
-        """Pose of the camera in the world; None if the sensor is not a camera."""
+        """Pose of the camera in the world. None if the sensor is not a camera."""
         return None
 
     @abstractmethod
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        """Symbolic reading of the sensor at a node, without errors, (outputs_per_channel * len(channel_names), 1)."""
+        """Symbolic error-free reading at a node, shape (outputs_per_channel * len(channel_names), 1)."""
 
 
 def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
-    """Build a CasADi function of a sensor's readings y(q, v, a, z, load, lam; theta), with effects, and derivatives.
+    """Build a CasADi function of a sensor's readings with effects, and of their derivatives.
 
     It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in
     `NodeState`, the last one by the parameters `names`; v, a and lam by the recorded clock. Slopes by these have no
@@ -320,7 +320,7 @@ class _SmoothingFilter(Protocol):
 
 @dataclass(frozen=True)
 class SensorDataInputs:
-    """Inputs for reading a sensor's measurements from a recording: system, recording, options, nodes and filters.
+    """System, recording, options, nodes and filters from which a sensor's measurements are read.
 
     `joint_mass_matrices` maps joint names and some of their configurations, shape (K, k), to their part of the mass
     matrix in each of them, shape (K, k, k) [kg m^2 or kg].
@@ -339,7 +339,7 @@ class SensorDataInputs:
 
 @dataclass(frozen=True)
 class SensorData:
-    """Measurements of one sensor in one recording: times, values, noise and bias standard deviations."""
+    """Measurements of one sensor in one recording, with standard deviations of noise and bias."""
 
     sensor: Sensor
     t: Array  # shape (M,) [s]

@@ -1,4 +1,4 @@
-"""Inertial measurement units on links: angular velocity and specific force along the axes of the frame they sit on."""
+"""Inertial measurement units on links. They read angular velocity and specific force along their frame's axes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors of the robot's joints: encoders of driven ones, efforts and motor currents of prescribed ones, and noise."""
+"""Sensors of the robot's joints: encoders of driven joints, efforts of prescribed joints, and their noise."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: th
 
 @dataclass(frozen=True)
 class JointSensor(Sensor):
-    """Base class of sensors of named joints, with one output per joint."""
+    """Base class of sensors of named joints. Each joint has one output."""
 
     frame_names = point_names = ()
 
@@ -50,13 +50,13 @@ class JointSensor(Sensor):
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
     def select_sensor_joint_rows(self, values: ca.SX, state: NodeState) -> ca.SX:
-        """Entries (nj, 1) of the sensor's joints in a column of values of all joints (n, 1)."""
+        """Select the rows (nj, 1) of the sensor's joints from a column for all joints (n, 1)."""
         return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
 @dataclass(frozen=True)
 class PositionSensor(JointSensor):
-    """Encoders of named driven joints, which measure joint positions [rad or m]."""
+    """Encoders of named driven joints. They measure joint positions [rad or m]."""
 
     channel = _POSITION
     has_paper_weight = False
@@ -139,7 +139,7 @@ def smoothed_effort_data(
     *,
     is_sample: bool,
 ) -> SensorData:
-    """Measurements of an effort sensor, low-pass filtered and thinned until their noise is nearly independent.
+    """Low-pass filter an effort sensor's measurements and thin them until their noise is nearly independent.
 
     `values`, shape (M, k), are in the sensor's unit, `std` and `bias`, shape (k,), those of their white noise and of an
     error that is constant in the recording; `is_sample` says whether a value is that at its time, not of the interval
@@ -160,7 +160,7 @@ def smoothed_effort_data(
 def nodes_and_decorrelated_values(
     around: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
 ) -> tuple[IntArray, Array]:
-    """Return nodes (K,) and low-pass filtered values (K, k) there, so far apart that noise is nearly independent.
+    """Low-pass filter values and select nodes (K,) so far apart that noise is nearly independent; values (K, k).
 
     `values` (M, k) belong to the times `t` + `late` [s] and are called `noun` in a `DataError` of a recording too short
     for the filter: that of efforts, whose prediction is smoothed again, or the one of the path.
@@ -198,7 +198,7 @@ def is_noise_std_stated(joints: RecordedJointGroup, group: str, choice: SensorOp
 
 
 def quantization_step(values: Array) -> float:
-    """Quantization step of a channel, from the gaps between its sorted values; zero if it is not quantized."""
+    """Estimate a channel's quantization step from the gaps between sorted values. Zero if not quantized."""
     levels = np.unique(values)
     apart = np.diff(levels)
     step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
@@ -244,7 +244,7 @@ joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME
 
 
 def joint_torque_bias_std(joints: RecordedJointGroup, names: Sequence[str], choice: SensorOptions) -> Array:
-    """Standard deviation of the recorded torques' constant errors, (len(names),) [N m]; zero if unknown."""
+    """Standard deviation of the recorded torques' constant errors, (len(names),) [N m]. Zero if unknown."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
     key = f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"
     return expand_to_joint_values(0.0 if given is None else given, joints.names, names, key)

@@ -1,4 +1,4 @@
-"""Sensors mounted on a frame of a link, whose readings are vectors along that frame's axes: what they share."""
+"""Common base of sensors mounted on a link's frame. They read vectors along that frame's axes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _Kind = TypeVar("_Kind", bound="MountedSensor")
 
 @dataclass(frozen=True)
 class MountedSensor(Sensor):
-    """Base class of sensors mounted on frames, with three components along each frame's axes."""
+    """Base class of sensors mounted on frames. Each has three components along its frame's axes."""
 
     naive_prediction: ClassVar = "stays"
     has_paper_weight = False
@@ -52,7 +52,7 @@ class MountedSensor(Sensor):
 
 
 def register_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
-    """Register the reader of a kind of mounted sensor under its channel: one `SensorData` per recorded group."""
+    """Register the reader of a kind of mounted sensor. It makes one `SensorData` per recorded group."""
     SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
     return kind
 

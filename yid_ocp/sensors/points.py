@@ -1,4 +1,4 @@
-"""Sensors of points: a camera, motion capture, or the arm that holds the point."""
+"""Sensors of point positions: cameras, motion capture, and the arm that holds the point."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _POINTS = CHANNEL_KINDS.register("points")(ChannelSpecification("points", "posit
 
 @dataclass(frozen=True)
 class PointSensor(Sensor):
-    """Sensor of the positions of named frames in the world [m], such as motion capture or a camera."""
+    """Sensor of the world positions of named frames [m], such as motion capture or a camera."""
 
     channel = _POINTS
     group_name: str
@@ -116,7 +116,7 @@ def _rates(t: Array, values: Array) -> Array:
 
 
 def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
-    """Pose (4x4) of the camera that measured a point group; None if no camera measured it.
+    """Pose of the camera that measured a point group, shape (4, 4). None if no camera measured it.
 
     A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera
     then counts as standing in the world's origin.

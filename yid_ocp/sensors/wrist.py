@@ -1,4 +1,4 @@
-"""Wrist force/torque sensors: what the bodies and grasps beyond a frame exert on the sensor there.
+"""Wrist force/torque sensors. They read the wrench that bodies and grasps beyond a frame exert there.
 
 The model is cut at the frame, and what is beyond hangs on six locked joints there: three that slide along the frame's
 axes, three that turn about them. What these joints must hold, by the Euler-Lagrange equations of the cut model,

@@ -60,7 +60,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class Iterate:
-    """One accepted iterate of a solver: unknowns, cost, gradient norm, and evaluations and seconds since the start."""
+    """One accepted iterate of a solver, with cost, gradient norm, evaluations and seconds since the start."""
 
     iteration: int
     cost: float
@@ -106,7 +106,7 @@ class EstimateChecks:
 
 @dataclass(frozen=True, repr=False)
 class Solution(ReprMixin):
-    """Solution of an estimation problem: estimates, covariance, goodness of fit and history.
+    """Solution of an estimation problem, with estimates, covariance, goodness of fit and history.
 
     Attributes
     ----------
@@ -167,12 +167,12 @@ class Solution(ReprMixin):
 
     @property
     def std(self) -> dict[str, float]:
-        """Standard deviation of every shared free parameter, by name."""
+        """Standard deviation of every shared free parameter."""
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
 
     @cached_property
     def episode_predictions(self) -> tuple[EpisodePrediction | str, ...]:
-        """Prediction of each recording from its torques minus their offsets, or a message why the rollout fails."""
+        """Prediction of each recording from its torques minus their offsets. A failed rollout gives a message."""
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
         problem = problem_whitened_by_sensor_noise(self.problem)
@@ -184,13 +184,13 @@ class Solution(ReprMixin):
         return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
-        """Measured and predicted samples of every channel of the recordings at the estimate; empty if not evaluated."""
+        """Measured and predicted samples of all recorded channels at the estimate. Empty if not evaluated."""
         pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
         known = [(episode, result) for episode, result in pairs if not isinstance(result, str)]
         return tuple(sample for pair in known for sample in channel_predictions(*pair))
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """Parameters as a pandas data frame, free ones first: value, std, lower, upper, unit, verdict, free, initial.
+        """Convert the parameters to a pandas data frame with value, std, lower, upper, unit, verdict, free, initial.
 
         `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known. Raises
         `ConfigError` where pandas is not installed.
@@ -209,12 +209,12 @@ IterationCallback = Callable[[Iterate], None]
 
 
 class StopSearch(Exception):  # noqa: N818
-    """Exception that a callback raises to end a search at its last iterate; its text is the solution's message."""
+    """Raised by a callback to end a search at its last iterate. Its text is the solution's message."""
 
 
 @dataclass(frozen=True)
 class SolverResult:
-    """Raw result of a solver: status, best unknown vector, history, and the equilibria there (None if unknown)."""
+    """Raw result of a solver. It holds status, best unknown vector, history and equilibria there (None if unknown)."""
 
     status: Status
     message: str
@@ -229,7 +229,7 @@ class SolverResult:
 
 @runtime_checkable
 class Solver(Protocol):
-    """Interface of a solver: a frozen dataclass of settings, registered under its name.
+    """Interface of a solver. A solver is a frozen dataclass of settings, registered under its name.
 
     It may say besides whether it needs a rollout from its start (`needs_rollout`, True), whether it can whiten
     residuals by process noise (`uses_process_noise_covariance`, False) or has the errors of torques as unknowns
@@ -238,18 +238,18 @@ class Solver(Protocol):
 
     @property
     def name(self) -> str:
-        """Name under which the solver is registered."""
+        """Registered name of the solver."""
         ...
 
     def minimize_cost(
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
     ) -> SolverResult:
-        """Minimise the problem's cost from the unknown vector `start`; `callback` receives each accepted iterate."""
+        """Minimise the problem's cost from the unknown vector `start`. `callback` receives accepted iterates."""
         ...
 
 
 class SolverWithCheckedSettings:
-    """Base of the package's own solvers, whose settings are checked against their annotated bounds."""
+    """Base of the package's own solvers. It checks settings against their annotated bounds."""
 
     name: ClassVar[str]
 
@@ -263,7 +263,7 @@ _DEFAULT_SOLVER = "gauss_newton"
 
 @dataclass
 class AcceptedIterateRecorder:
-    """Recorder of a solver's accepted iterates, number of evaluations and time; it passes iterates to a callback."""
+    """Records a solver's accepted iterates, evaluations and time, and passes iterates to a callback."""
 
     callback: IterationCallback | None
     start_time: float = field(default_factory=time.perf_counter)
@@ -271,7 +271,7 @@ class AcceptedIterateRecorder:
     history: list[Iterate] = field(default_factory=list)
 
     def record_iterate(self, cost: float, x: Array, gradient: float, note: str = "") -> None:
-        """Append an accepted iterate to the history and pass it to the callback."""
+        """Add an accepted iterate to the history and pass it to the callback."""
         seconds = time.perf_counter() - self.start_time
         self.history.append(Iterate(len(self.history), cost, x.copy(), gradient, self.n_evaluations, seconds, note))
         if self.callback is not None:
@@ -280,7 +280,7 @@ class AcceptedIterateRecorder:
     def solver_result_with_iterates(
         self, status: Status, message: str, x: Array, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> SolverResult:
-        """Solver result of a search that ended at the unknown vector `x`, with the iterates recorded so far."""
+        """Make the result of a search that ended at `x`, with the iterates recorded so far."""
         return SolverResult(status, message, x, tuple(self.history), self.n_evaluations, equilibrium_guesses)
 
 
@@ -318,7 +318,7 @@ def solve(
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     restarts: bool = True,
 ) -> Solution:
-    """Fit an estimation problem and return estimates with the uncertainty that data and misfit leave, and verdicts.
+    """Fit an estimation problem and return estimates with uncertainties and verdicts.
 
     `yid_ocp.solve` (`analysis.estimation`) adds the discretisation's error and checks of the fit. Free effects
     begin off their neutral value (`unknowns_with_neutral_effects_activated`) without a start. Where the rollout
@@ -587,6 +587,6 @@ def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
 
 
 def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
-    """Infinity norm of the scaled gradient without components that push against a bound."""
+    """Infinity norm of the scaled gradient, without components that push against a bound."""
     free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))

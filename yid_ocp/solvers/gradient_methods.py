@@ -1,4 +1,4 @@
-"""Methods that follow derivatives of a rollout: Gauss-Newton, L-BFGS-B, steepest descent of Caldwell et al. (2014)."""
+"""Solvers that follow rollout gradients: Gauss-Newton, L-BFGS-B, and steepest descent of Caldwell et al. (2014)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _LOWEST = "the cost cannot be lowered any further"
 @SOLVERS.register("gauss_newton")
 @dataclass(frozen=True)
 class GaussNewton(SolverWithCheckedSettings):
-    """Gauss-Newton method: minimise 1/2 |r(x)|^2 by bounded, damped linear least-squares steps.
+    """Gauss-Newton method with bounded, damped linear least-squares steps on the cost 1/2 |r(x)|^2.
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised (Nocedal and Wright 2006, Numerical Optimization, chapter 10,
@@ -75,7 +75,7 @@ class GaussNewton(SolverWithCheckedSettings):
         callback: IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may replace `problem.evaluate`."""
+        """Minimize the cost from `start` by Gauss-Newton steps. `evaluate` may replace `problem.evaluate`."""
         evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
         recorder, x = AcceptedIterateRecorder(callback), start.copy()
@@ -150,7 +150,7 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
 @SOLVERS.register("single_shooting")
 @dataclass(frozen=True)
 class SingleShooting(SolverWithCheckedSettings):
-    """Single shooting: minimise the cost with SciPy's L-BFGS-B on unknowns scaled to order one.
+    """Single shooting with SciPy's L-BFGS-B on unknowns scaled to order one.
 
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
     """
@@ -204,7 +204,7 @@ class SingleShooting(SolverWithCheckedSettings):
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
 class SteepestDescent(SolverWithCheckedSettings):
-    """Projected steepest descent: x <- P(x - s g), P the projection on the bounds, s by Armijo backtracking.
+    """Projected steepest descent with Armijo backtracking: x <- P(x - s g), where P projects on the bounds.
 
     The gradient comes from the adjoint. Unscaled on purpose, as in the paper. The first length tried in an
     iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's from the change of the gradient

@@ -39,7 +39,7 @@ _EQUILIBRIUM_SPACING = 0.1
 
 @dataclass(frozen=True)
 class UnknownsAndNodeStateGuess:
-    """Guess of the unknown vector, and of each recording's initial state, node states and constraint multipliers."""
+    """Guess of the unknowns, with each recording's initial state, node states and constraint multipliers."""
 
     x: Array
     initial_states: tuple[InitialStateWithSensitivity, ...]
@@ -144,7 +144,7 @@ def _resting(
 
 
 def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array) -> Array:
-    """Initial unknown vector (nx,) at which every free effect is slightly active.
+    """Initial unknown vector (nx,) with every free effect slightly active.
 
     At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the
     slope by its amplitude is that of whatever shape the settings name: a spring that would have to push from there

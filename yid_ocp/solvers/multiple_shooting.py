@@ -1,4 +1,4 @@
-"""Multiple shooting: node states as unknowns, in one program for IPOPT or condensed onto the parameters."""
+"""Multiple shooting with node states as unknowns, by IPOPT or condensed onto the parameters."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _CLOSED_DEFECT = 1e-7
 @SOLVERS.register("multiple_shooting")
 @dataclass(frozen=True)
 class MultipleShooting(SolverWithCheckedSettings):
-    """Multiple shooting: minimize 1/2 |r|^2 over parameters and node states, subject to the equations of motion.
+    """Multiple shooting, which minimises 1/2 |r|^2 over parameters and node states under the equations of motion.
 
     IPOPT solves the program of `transcribe`, with the DEL equations of every step as constraints. Defects are scaled to
     order one, the cost by its initial value, and IPOPT's own scaling is off. In these units its first bound
@@ -110,13 +110,13 @@ class MultipleShooting(SolverWithCheckedSettings):
 
     @property
     def estimates_torque_errors(self) -> bool:
-        """Whether the torque errors are estimated as unknowns of the program."""
+        """Whether torque errors are unknowns of the program."""
         return not self.condensing
 
     def minimize_cost(
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` with IPOPT, or by condensed Gauss-Newton steps."""
+        """Minimize the problem's cost from `start` by IPOPT or condensed Gauss-Newton steps."""
         if self.condensing:
             return self._by_condensing(problem, start, AcceptedIterateRecorder(callback))
         told: tuple[str, ...] = ()

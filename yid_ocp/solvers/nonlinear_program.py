@@ -1,4 +1,4 @@
-"""Nonlinear program in CasADi, composed of residual and constraint terms.
+"""General nonlinear program in CasADi, composed of residual and constraint terms.
 
     min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
 
@@ -47,7 +47,7 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function y(v; d, s) of local variables v, data d and shared data s (columns), with its derivatives.
+    """Symbolic function y(v; d, s) with its derivatives. Columns v are local variables, d data and s shared data.
 
     The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. Derivatives may be
     compiled; the value stays CasADi's own, so that whoever builds upon it can differentiate it.
@@ -95,7 +95,7 @@ class LocalVariableFunction:
 
 @dataclass(frozen=True)
 class MappedFunctionTerm:
-    """Function of a few unknowns that a nonlinear program evaluates at K places, for example at every time step."""
+    """A function of few unknowns that a nonlinear program evaluates at K places, for example at every time step."""
 
     name: str
     row_names: tuple[str, ...]  # of the ny outputs
@@ -106,7 +106,7 @@ class MappedFunctionTerm:
 
     @property
     def n_values(self) -> int:
-        """Number of output values at all places together, ny K."""
+        """Number ny K of output values at all places together."""
         return len(self.row_names) * len(self.variable_indices)
 
     def _map_over_places(self, function: ca.Function, w: ca.MX, p: ca.MX, *more: ca.MX) -> ca.MX:
@@ -177,7 +177,7 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Jacobian (nr, nw) of the residuals r with respect to the program's unknowns w, sparse."""
+        """Sparse Jacobian (nr, nw) of the residuals r by the program's unknowns w."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
         matrix = self._residual_jacobian_by_term_values(p)
@@ -196,7 +196,7 @@ class ResidualTerm:
         return r if math.isinf(limit) else ca.fmax(ca.fmin(r, limit), -limit)
 
     def loss_hessian_residual_weights(self, r: ca.MX, exact: bool) -> ca.MX | None:
-        """Weight of each residual in the Hessian of the loss; None if all weights are one.
+        """Weight of each residual in the Hessian of the loss. None if all weights are one.
 
         Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
         """
@@ -210,7 +210,7 @@ class ResidualTerm:
 
 @dataclass(frozen=True)
 class GaussNewtonHessianRidge:
-    """Curvature added to the Gauss-Newton Hessian, not the cost: factor * mean square residual / max(|w_i|, scale_i)^2.
+    """Curvature added to the Gauss-Newton Hessian only: factor * mean square residual / max(|w_i|, scale_i)^2.
 
     Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
     The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.
@@ -255,7 +255,7 @@ class _VectorBlock:
 
 @dataclass
 class ProgramVectorLayout:
-    """Layout of a program's variables or parameters: blocks one after the other, with values and bounds."""
+    """Layout of a program's variables or parameters in successive blocks, with values and bounds."""
 
     size: int = 0
     blocks: dict[str, _VectorBlock] = field(default_factory=dict)
@@ -266,7 +266,7 @@ class ProgramVectorLayout:
     def append_values(
         self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf
     ) -> IntArray:
-        """Append values with their bounds and return their indices in the vector."""
+        """Append values with their bounds. The result is their indices in the vector."""
         self.values.append(values)
         self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
         self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
@@ -274,12 +274,12 @@ class ProgramVectorLayout:
         return np.arange(self.size - len(values), self.size)
 
     def register_block(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Register indices of the vector as a named block; do nothing if there are no indices."""
+        """Register indices of the vector as a named block. No indices, no block."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
     def append_block(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IntArray:
-        """Append a named block, column by column, and return its indices, shape (rows, columns)."""
+        """Append a named block column by column. The result is its indices, shape (rows, columns)."""
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table
         index = self.append_values(table.ravel(order="F")).reshape(table.shape, order="F")
@@ -297,7 +297,7 @@ class _UserTerms(NamedTuple):
 
 
 def available_memory_bytes() -> float:
-    """Available memory [bytes]; infinite where the system does not report it."""
+    """Available memory [bytes]. Infinite where the system does not report it."""
     told = Path("/proc/meminfo")
     lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
     found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
@@ -306,7 +306,7 @@ def available_memory_bytes() -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NonlinearProgram(ReprMixin):
-    """Nonlinear program min f(w, p) subject to bounds and constraints, in CasADi.
+    """Nonlinear program in CasADi: minimise f(w, p) subject to bounds and constraints.
 
     `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
     is short for `nlp["q[NAME]"]`.
@@ -331,7 +331,7 @@ class NonlinearProgram(ReprMixin):
         return ReprLineAndTableRows(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
     def named_block(self, name: str) -> _VectorBlock:
-        """Indices, row names and unit of a named block; with one recording, `[NAME]` may be left out.
+        """Find a named block's indices, row names and unit. With one recording, `[NAME]` may be left out.
 
         Raises `SolverError` where there is none, or more than one.
         """
@@ -351,7 +351,7 @@ class NonlinearProgram(ReprMixin):
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 
     def variable_names(self) -> tuple[str, ...]:
-        """Names of all unknowns w, made of block, row and, if there are several, column."""
+        """Names of all unknowns w, composed of block, row and, if there are several, column."""
         named = np.full(self.w.numel(), "", dtype=object)
         for name, block in self.variables.items():
             for row, places in zip(block.row_names, block.index, strict=True):
@@ -360,14 +360,14 @@ class NonlinearProgram(ReprMixin):
         return tuple(named)
 
     def constraint_names(self) -> tuple[str, ...]:
-        """Names of all constraint rows of `g`: term, row and place; `added.I` for rows of `with_user_terms`."""
+        """Names of all constraint rows: term, row and place. Rows of `with_user_terms` are `added.I`."""
         places = ((t, k) for t in self.constraint_terms for k in range(len(t.variable_indices)))
         terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
 
     @_ThreadSafeCachedProperty
     def f(self) -> ca.MX:
-        """Symbolic objective f(w, p), a scalar."""
+        """Symbolic scalar objective f(w, p)."""
         return sum((*self._losses, *(extra.objective for extra in self.user_terms)), ca.MX(0))
 
     @_ThreadSafeCachedProperty
@@ -378,12 +378,12 @@ class NonlinearProgram(ReprMixin):
 
     @property
     def nlp(self) -> dict[str, ca.MX]:
-        """The program as the dictionary (x, p, f, g) that `casadi.nlpsol` takes."""
+        """The program as a dictionary (x, p, f, g) for `casadi.nlpsol`."""
         return {"x": self.w, "p": self.p, "f": self.f, "g": self.g}
 
     @property
     def solver_arguments(self) -> dict[str, Array]:
-        """Arguments for calling a CasADi solver: initial guess, parameter values and bounds."""
+        """Initial guess, parameter values and bounds with which a CasADi solver is called."""
         zero = np.zeros(sum(term.n_values for term in self.constraint_terms))
         low, high = ([zero, *(getattr(extra, side) for extra in self.user_terms)] for side in ("lower", "upper"))
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
@@ -408,12 +408,12 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def jac_r(self) -> ca.MX:
-        """Jacobian of all residuals r with respect to the unknowns w, sparse."""
+        """Sparse Jacobian of all residuals r by the unknowns w."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
     @_ThreadSafeCachedProperty
     def jac_g(self) -> ca.MX:
-        """Jacobian of the constraints g with respect to the unknowns w, sparse."""
+        """Sparse Jacobian of the constraints g by the unknowns w."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
             row, column = term._jacobian_nonzero_indices()
@@ -427,7 +427,7 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def grad_f(self) -> ca.MX:
-        """Gradient of the objective f with respect to the unknowns w, shape (nw, 1)."""
+        """Gradient of the objective f by the unknowns w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
         for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
@@ -436,7 +436,7 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def lam_f(self) -> ca.MX:
-        """Symbolic factor on the objective f in the Lagrangian, in which `hessian` is expressed."""
+        """Symbolic factor on the objective f in the Lagrangian of `hessian`."""
         return ca.MX.sym("lam_f")
 
     @_ThreadSafeCachedProperty
@@ -449,7 +449,7 @@ class NonlinearProgram(ReprMixin):
         return {}
 
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
-        """Hessian of the Lagrangian lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
+        """Sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
 
         Gauss-Newton leaves out the curvature of residuals and of `constraint_terms`, not of what was added.
         """
@@ -500,7 +500,7 @@ class NonlinearProgram(ReprMixin):
         return ca.MX(pattern, factor * 2 * sum(self._losses, ca.MX(0)) / count / size**2)
 
     def estimated_solver_memory(self, hessian: HessianKind = "gauss_newton") -> float:
-        """Estimated additional memory of an interior-point method with a direct linear solver [bytes]."""
+        """Estimate the additional memory of an interior-point method with a direct linear solver [bytes]."""
         return _BYTES_PER_ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
 
     def with_user_terms(
@@ -510,7 +510,7 @@ class NonlinearProgram(ReprMixin):
         lower: ArrayLike = 0.0,
         upper: ArrayLike = 0.0,
     ) -> NonlinearProgram:
-        """The program with an additional objective term and constraint rows, which are expressions of `w` and `p`.
+        """Add an objective term and constraint rows, which are expressions of `w` and `p`.
 
         Rows without bounds are equalities to zero. Raises `SolverError` for expressions of other symbols, or bounds of
         another number than rows.
@@ -532,7 +532,7 @@ class NonlinearProgram(ReprMixin):
         return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)))
 
     def make_solver(self, plugin: str = "ipopt", hessian: HessianKind = "gauss_newton", **options: Any) -> ca.Function:
-        """Make a `casadi.nlpsol` solver with the program's assembled derivatives, to be called with `solver_arguments`.
+        """Make a `casadi.nlpsol` solver with the program's derivatives. Call it with `solver_arguments`.
 
         `plugin` is any of CasADi's, `options` those of `casadi.nlpsol`. Raises `SolverError` where CasADi does not have
         the plug-in, or refuses the options.

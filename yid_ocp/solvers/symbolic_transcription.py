@@ -98,7 +98,7 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
-    """Raise `SolverError` if an effect changes recorded inputs or times; solvers with node states do not support it."""
+    """Reject effects on recorded inputs or times (`SolverError`). Solvers with node states do not support them."""
     if not problem.has_no_input_corrections:
         message = "an effect changes recorded inputs, times or what the tracking filter follows"
         allowed = "effects of the mechanics and of what sensors read"
@@ -121,7 +121,7 @@ def _check_transcribable(problem: EstimationProblem) -> None:
 
 
 def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
-    """Unknown vector (nx,) of the estimation problem that corresponds to the program's variables `w`."""
+    """Convert the program's variables `w` to the unknown vector of the estimation problem, shape (nx,)."""
     x = problem.initial_unknowns.copy()
     shared, own = len(problem.shared_parameters), len(problem.local_parameters)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0

@@ -1,4 +1,4 @@
-"""From a depth camera's clouds to measured points of the object; and a virtual camera that makes such clouds."""
+"""Measure an object's points in a depth camera's clouds, and simulate such clouds with a virtual camera."""
 
 from yid_ocp.vision.calibration import CameraCalibration as CameraCalibration
 from yid_ocp.vision.calibration import CameraCalibrationOptions as CameraCalibrationOptions

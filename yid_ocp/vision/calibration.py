@@ -1,4 +1,4 @@
-"""Calibration of the camera of a sequence from the arm that it sees: pose, depth and clock, and frames stamped late.
+"""Calibrate a sequence's camera (pose, depth, clock) from the visible arm, and find late frame stamps.
 
 What stays uncertain is an error common to all frames, and enters the standard deviation of every point. A frame whose
 own clock offset is another than the common one was stamped late. Offset and latency are one number, stamp minus joint
@@ -56,7 +56,7 @@ _MAX_CLOCK_STEP = 0.05  # of an offset in one iteration [s]
 
 @dataclass(frozen=True)
 class CameraClockOptions:
-    """Settings of the estimation of the camera clock's offset and drift relative to the joints' clock."""
+    """Settings for the estimation of the camera clock's offset and drift relative to the joints' clock."""
 
     initial_offset: Annotated[float, OptionInfo("stamp minus joint time, as far as known", "s")] = 0.0
     search_half_width: Annotated[
@@ -92,7 +92,7 @@ class _StampDelay(NamedTuple):
 def stamp_delay_beyond_clock_offset(
     arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
-    """Delay of a frame's stamp [s] beyond the common clock offset, from the robot among world points (N, 3) [m].
+    """Estimate a frame's stamp delay beyond the common clock offset [s] from the robot in world points (N, 3) [m].
 
     None where the arm is not in view. Where the misfit is not much larger than the `usual` one of other frames [m^2],
     the offset is looked for nearby only.
@@ -155,7 +155,7 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
 
 
 def is_frame_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
-    """Whether a frame's time stamp is significantly late or early, beyond the offset common to all frames."""
+    """Whether a frame's stamp is significantly late or early, beyond the offset common to all frames."""
     return abs(own.delay) > max(options.max_frame_offset_deviation, _STAMP_ERROR_STDS * own.std)
 
 
@@ -174,7 +174,7 @@ _CONTRADICTION_STDS = 3.0  # standard deviations
 
 @dataclass(frozen=True)
 class CameraCalibrationOptions:
-    """Priors of the camera calibration, and how the visible arm is used for it."""
+    """Priors of the camera calibration, and settings for the use of the visible arm."""
 
     fix_pose: Annotated[
         bool,
@@ -212,7 +212,7 @@ class CameraCalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """Result of a camera calibration: camera state with covariance, prior state, arm visibility, message."""
+    """Result of a camera calibration, with camera state, covariance, prior state, arm visibility and message."""
 
     camera_state: CameraState  # what is used: pose, depth, clock
     prior_state: CameraState
@@ -230,7 +230,7 @@ class CameraCalibration:
         return self.camera_state.pose[:3, 3]
 
     def point_std_from_calibration(self, points: Array, velocity: Array, stamps: Array) -> Array:
-        """Standard deviations (N, 3) [m] of points due to the camera's uncertain pose, depth and clock.
+        """Standard deviations of points from the camera's uncertain pose, depth and clock, (N, 3) [m].
 
         The same error for all of them, as far as they stand at one place; `velocity` (N, 3) [m/s], `stamps` (N,) [s].
         """
@@ -247,7 +247,7 @@ class CameraCalibration:
 
 
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
-    """Camera calibration that takes the given pose and clock offset without estimation, with the reason."""
+    """Make a calibration from the given pose and clock offset without estimation. `reason` says why."""
     text = f"clock offset {1e3 * options.initial_offset:.0f} ms as given" + (f": {reason}" if reason else "")
     state = CameraState(pose, clock_offset=options.initial_offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
@@ -263,7 +263,7 @@ def calibrate_camera(
     clock: CameraClockOptions,
     source: str = "sequence",
 ) -> CameraCalibration:
-    """Estimate a camera's pose, depth and clock from frames that show the arm, from a given pose (4, 4).
+    """Estimate a camera's pose, depth and clock from frames that show the arm, starting at a pose (4, 4).
 
     The frames are thinned, the robot and what is about it among the points; `source` says where they come from.
     `DataError` where the arm is not seen, does not lie where the camera sees something, or moves too little to tell the

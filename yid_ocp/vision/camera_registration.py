@@ -1,4 +1,4 @@
-"""Registration of a camera's pose, depth and clock to the robot that it sees.
+"""Register a camera's pose, depth and clock to the robot that it sees.
 
 A point p that the camera measured at its time s should lie on the robot's surface at the joint angles of that time:
 
@@ -73,7 +73,7 @@ class CameraState:
     clock_reference_stamp: float = 0.0  # s0 [s]
 
     def measured_to_world_points(self, points: Array) -> Array:
-        """Measured points of the camera's frame transformed to the world, both shape (N, 3) [m]."""
+        """Transform measured points (N, 3) from the camera's frame to the world [m]."""
         placed = np.asarray(points @ self.pose[:3, :3].T)
         if self.depth_scale != 1.0 or self.depth_offset != 0.0:
             placed *= (self.depth_scale + self.depth_offset / points[:, 2])[:, None]
@@ -81,17 +81,17 @@ class CameraState:
         return placed
 
     def world_to_measured_points(self, points: Array) -> Array:
-        """World points as the camera would measure them, both shape (N, 3) [m]."""
+        """Transform world points (N, 3) to what the camera would measure [m]."""
         own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         return np.asarray(own * ((1.0 - self.depth_offset / own[:, 2:3]) / self.depth_scale))
 
     def stamps_to_joint_clock(self, stamp: ArrayLike) -> Array:
-        """Camera time stamps converted to the clock of the joint recording [s]."""
+        """Convert camera time stamps to the clock of the joint recording [s]."""
         at = np.asarray(stamp, float)
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
     def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
-        """Jacobian of world points, shape (N, 3), with respect to pose and depth, shape (N, 3, 8)."""
+        """Jacobian of world points (N, 3) by pose and depth, shape (N, 3, 8)."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
@@ -104,7 +104,7 @@ class CameraState:
         return result
 
     def with_state_increment(self, change: Array) -> CameraState:
-        """State after a change: rotation (world axes), translation, log depth scale, depth and clock offset, drift."""
+        """Add a change: rotation (world axes), translation, log depth scale, depth and clock offset, drift."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
@@ -115,7 +115,7 @@ class CameraState:
         )
 
     def difference_from(self, other: CameraState) -> Array:
-        """Difference from another state (this minus other), shape (10,)."""
+        """Subtract another state from this one, shape (10,)."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
         clock = self.clock_offset - other.clock_offset, self.clock_drift - other.clock_drift
@@ -124,7 +124,7 @@ class CameraState:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFrame:
-    """One frame: its stamp [s] and points in the camera's frame, shape (N, 3) [m]."""
+    """One frame with its stamp [s] and points in the camera's frame, shape (N, 3) [m]."""
 
     stamp: float
     points: Array
@@ -162,7 +162,7 @@ class ArmSurface:
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
     def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
-        """World points of moving surfaces that an unobstructed camera sees, and the surface part of each."""
+        """World points on moving surfaces that an unobstructed camera sees, and the surface part of each."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _MIN_INCIDENCE_COSINE) & (part >= 0) & self._moving[part]
@@ -180,7 +180,7 @@ class ArmSurface:
     def match_points_to_surface(
         self, points: Array, origin: Array, t: float, reach: float, along: bool
     ) -> _SurfaceMatches:
-        """Matches of world points to the arm's surface, along camera rays or at the nearest surface."""
+        """Match world points to the arm's surface, along camera rays or to the nearest surface."""
         q = self.configuration_at(t)
         if along:
             ahead = points - origin
@@ -241,7 +241,7 @@ class RobustCostDerivatives:
     score_covariance: Array
 
     def data_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
-        """Weighted Hessian and gradient of the data, and the weight; `precision`: inverse covariance of the prior."""
+        """Weighted Hessian and gradient of the data, and the weight. `precision` is the prior's inverse covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
         excess = np.linalg.solve(whole, self.score_covariance * np.outer(scale, scale))
@@ -249,7 +249,7 @@ class RobustCostDerivatives:
         return weight * self.hessian, weight * self.gradient, weight
 
     def state_covariance(self, precision: Array) -> Array:
-        """Covariance of the minimum of data and prior, shape (10, 10)."""
+        """Covariance of the state that minimises data and prior cost, shape (10, 10)."""
         hessian, _, weight = self.data_hessian_gradient_and_weight(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
@@ -289,7 +289,7 @@ def _at_least(least: Array, matrix: Array) -> Array:
 def initial_camera_states(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], told: CameraState, search: float, most: int
 ) -> list[CameraState]:
-    """Candidate camera states at which the arm's visible surface lies on the clouds, best first.
+    """Candidate camera states that place the arm's visible surface on the clouds, best first.
 
     So many at most, at least `_MIN_START_SEPARATION` from one another, with clock offsets up to `search` [s] from the
     stated one.
@@ -363,7 +363,7 @@ def _add_costs(
 
 @dataclass(frozen=True)
 class SurfaceVisibilityFractions:
-    """Shares of the arm's surface in view that a cloud contains, that are occluded, or that are seen through."""
+    """Fractions of the arm's surface in view that a cloud contains, occludes or sees through."""
 
     there: float  # a cloud has it
     covered: float  # something is before it
@@ -374,7 +374,7 @@ class SurfaceVisibilityFractions:
 def pooled_surface_visibility_fractions(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
 ) -> SurfaceVisibilityFractions:
-    """Shares of the arm's surface in view that clouds contain within `within` [m], occlude, or see through."""
+    """Fractions of the arm's surface in view that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)
     for glimpse in glimpses:
         points, _ = arm.visible_surface_points(state, glimpse.stamp)

@@ -1,4 +1,4 @@
-"""The object's shape from a cloud: equation (3) of the source paper, robust and with derivatives.
+"""Robust fit of the object's shape to a cloud with derivatives, equation (3) of Caldwell et al. (2014).
 
     q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
 
@@ -105,7 +105,7 @@ class ShapeFitOptions:
 
 
 class ShapeFitter:
-    """Fitter of an object's configuration to camera points; parameters that are not given are nominal.
+    """Fits an object's configuration to camera points. Parameters that are not given are nominal.
 
     Beside the bends, `loose` joints are sought with next to no prior: see `initial_shapes.system_with_free_root`.
     `DataError` for a system without an object.
@@ -184,7 +184,7 @@ class ShapeFitter:
         return np.array(self._corners(q)[0]).reshape(-1, 2, 3)
 
     def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
-        """Fit the object's shape in one frame; `q_known` (n,) holds the robot's configuration, `starts` first guesses.
+        """Fit the object's shape in one frame, from guesses `starts` and the robot's configuration `q_known` (n,).
 
         The passes on the nodes, which cost little, run from all starts (rest where absent), the others from the best
         that was found. `DataError` where there is no point.
@@ -286,7 +286,7 @@ class ShapeFitter:
 
     @property
     def max_informative_surface_distance(self) -> float:
-        """Distance from the surface beyond which a point carries no information on the shape [m]."""
+        """Distance from the surface beyond which points carry no information on the shape [m]."""
         return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _MAX_POINT_DISTANCE_SCALES
 
     def _tasks(
@@ -406,7 +406,7 @@ class ShapeFitter:
         return LocalQuadraticModel(cost, gradient, hessian)
 
     def shape_fit_initial_guesses(self) -> ShapeFitInitialGuesses:
-        """Finder of initial shapes for a system with a free root (`initial_shapes.system_with_free_root`)."""
+        """Make a finder of initial shapes for a system with a free root (`initial_shapes.system_with_free_root`)."""
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
         return ShapeFitInitialGuesses(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
 

@@ -1,4 +1,4 @@
-"""A folder of clouds or depth images with time stamps and the camera (`yid-frames/1`), and the files in it.
+"""Read and write folders of clouds or depth images with time stamps and a camera (`yid-frames/1`).
 
 PLY files are read without a library in C: damage must not end the process. Turk (1994), The PLY polygon file format.
 """
@@ -216,7 +216,7 @@ _CAMERA_FILE_KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_uni
 def read_frame_folder(
     folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None
 ) -> FrameSequence:
-    """Frame sequence of a folder of point clouds or depth images, loaded one frame at a time.
+    """Read a folder of point clouds or depth images as a frame sequence, one frame at a time.
 
     The folder holds `camera.json` (`yid-frames/1`: `pose` 4x4, `frame` "camera" or "world" of the clouds, `unit` "m" or
     "mm" of the clouds, `intrinsics` and `depth_unit` [m] of depth images), `timestamps.csv` (columns `file`, `t` [s])
@@ -254,7 +254,7 @@ def read_frame_folder(
 
 
 def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) -> None:
-    """Write a frame sequence as binary PLY clouds for `read_frame_folder`; `OutputError` where that is not possible."""
+    """Write a frame sequence as binary PLY clouds for `read_frame_folder`. `OutputError` where that is not possible."""
     path, o3d = files.make_folder(folder), import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):
@@ -276,7 +276,7 @@ def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) 
 
 
 def metres_per_unit(unit: str, where: str) -> float:
-    """Size of a cloud's length unit [m]; `DataError` for an unknown one."""
+    """Convert a cloud's length unit to metres [m]. `DataError` for an unknown one."""
     if unit not in _METRES_PER_UNIT:
         raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_error_arguments(unit, _METRES_PER_UNIT))
     return _METRES_PER_UNIT[unit]

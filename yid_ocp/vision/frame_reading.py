@@ -1,4 +1,4 @@
-"""Frame sequences from a folder, a bag of ROS 1 or ROS 2, an MCAP file, a RealSense or an Azure Kinect recording.
+"""Read frame sequences from a folder, a ROS bag, an MCAP file, or a RealSense or Azure Kinect recording.
 
 Of a bag, `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`; its messages
 are read when they are needed.
@@ -213,7 +213,7 @@ _BAG_SUFFIXES, _AZURE_KINECT_SUFFIX = (".bag", ".mcap", ".db3"), ".mkv"
 def read_frames(
     path: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None, topic: str | None = None
 ) -> FrameSequence:
-    """Frame sequence of a folder or file of a depth camera, loaded one frame at a time.
+    """Read a frame sequence from a folder or file of a depth camera, one frame at a time.
 
     `path`: a folder (`read_frame_folder`), a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file, of which `topic`
     names the clouds or depth images, or an Azure Kinect's `.mkv`, where the build of Open3D reads it. The camera's

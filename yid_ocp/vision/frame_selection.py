@@ -1,4 +1,4 @@
-"""Settings of tracking, good frames and the object's root end in them, and uncertainty of their points."""
+"""Select good frames, the object's root end in them, and the uncertainty of their points."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _RootPlacement = Literal["model", "fixed", "free"]
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Settings that turn a frame sequence into measured points and select its good frames."""
+    """Settings for turning a frame sequence into measured points and selecting its good frames."""
 
     filters: Annotated[CloudFilterOptions, OptionInfo("what counts as the object")] = field(
         default_factory=CloudFilterOptions
@@ -127,7 +127,7 @@ _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # of a normal variable, in stand
 
 
 def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
-    """Reason to reject a frame by its own fit, without comparison with other frames; empty for a good one."""
+    """Reason to reject a frame by its own fit, without comparison with other frames. Empty for a good one."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
@@ -152,7 +152,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
 
 
 def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
-    """All frames; those that deviate from the other good frames are marked as dropped."""
+    """Mark frames that deviate from the other good frames as dropped. All frames are returned."""
     fits = _good_fits(frames)
     if not fits:
         return list(frames)
@@ -184,7 +184,7 @@ def tracked_states_and_points(
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Times, configurations, positions, their standard deviations and the shared part, as in `TrackResult`.
+    """Collect times, configurations, positions, their standard deviations and the shared part for `TrackResult`.
 
     Of the points in `columns` of the system's in the good frames. `DataError` without a good frame, or where no point
     is known well enough in any.
@@ -255,7 +255,7 @@ _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends, by which one i
 
 
 def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
-    """Frames whose fits have the same end of the object as root, and a text on how that end was chosen.
+    """Make the object's root the same end in all fits. A text says how that end was chosen.
 
     Where a shape fits as well with its root at another end, the ends are followed from frame to frame first. Then the
     root is the one that stays in its place, if it is fixed, or the higher one.
@@ -323,7 +323,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
 
 
 def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
-    """Whether a shape of links (K, 2, 3) and radii (K,) [m] touches itself at parts that are far apart along it."""
+    """Whether links (K, 2, 3) with radii (K,) [m] touch each other at parts that are far apart along the shape."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
     edges = np.where(near < _TOUCHING_DISTANCE, 1e-6, 0.0)  # zero is no way

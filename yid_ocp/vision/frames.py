@@ -1,4 +1,4 @@
-"""Frames of a depth camera: clouds with time stamps, the lens (a depth image's points), and what hides what.
+"""Frames of a depth camera, with clouds, time stamps, the lens and occlusion.
 
 With x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and theta = atan r, a point appears at u = fx x' + cx, v = fy y' + cy, where
 
@@ -40,7 +40,7 @@ _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """Intrinsics of a camera (x right, y down, z ahead); `DataError` for an unknown distortion model.
+    """Intrinsics of a camera (x right, y down, z ahead). `DataError` for an unknown distortion model.
 
     Focal lengths and principal point [pixels] of  u = fx x/z + cx,  v = fy y/z + cy  without distortion.
     """
@@ -65,7 +65,7 @@ class CameraIntrinsics:
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal: float) -> CameraIntrinsics:
-        """Intrinsics with square pixels and a centred principal point, from a horizontal field of view [rad]."""
+        """Make intrinsics from a horizontal field of view [rad], with square pixels and centred principal point."""
         focal = 0.5 * width / math.tan(0.5 * horizontal)
         return CameraIntrinsics(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
 
@@ -76,11 +76,11 @@ class CameraIntrinsics:
 
     @property
     def pixel_rays_at_unit_depth(self) -> Array:
-        """Direction of every pixel with z = 1, shape (height, width, 3); NaN where the lens shows none."""
+        """Direction of every pixel with z = 1, shape (height, width, 3). NaN where the lens shows none."""
         return _rays(self)
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
-        """Points (N, 3) in the camera's frame, row by row, of a depth image (height, width) along the optical axis [m].
+        """Convert a depth image (height, width) [m] to points (N, 3) in the camera's frame, row by row.
 
         Zero or NaN is where nothing was measured; errors as `measured_depth_mask`.
         """
@@ -92,7 +92,7 @@ class CameraIntrinsics:
         return points
 
     def measured_depth_mask(self, depth: Array) -> BoolArray:
-        """Whether each pixel of a depth image is measured, shape (height, width); `DataError` for another size."""
+        """Mask of measured pixels in a depth image, shape (height, width). `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
         return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays_at_unit_depth[..., 0]))
@@ -149,7 +149,7 @@ XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58
 
 @cache
 def import_open3d() -> ModuleType:
-    """The open3d package; `DataError` where it is not installed or cannot be loaded."""
+    """Import open3d. `DataError` where it is not installed or cannot be loaded."""
     hint = "pip install 'yid-ocp[vision]'"
     with contextlib.suppress(ImportError, OSError):  # the system may have its own
         # the wheel of open3d wants the system's libusb, which a bare machine does not have
@@ -165,7 +165,7 @@ def import_open3d() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """Point clouds of one camera with stamps, names and camera pose; each cloud is loaded on demand."""
+    """Point clouds of one camera with stamps, names and camera pose. Each cloud is loaded on demand."""
 
     stamps: Array  # (M,), as the camera gave them, in the order of the frames: neither sorted nor unique [s]
     frame_names: tuple[str, ...]
@@ -181,14 +181,14 @@ class FrameSequence:
         return len(self.frame_names)
 
     def load_world_cloud(self, index: int) -> Array:
-        """Cloud of a frame in the world, shape (N, 3) [m]; `DataError` where it cannot be read."""
+        """Load a frame's cloud in the world, shape (N, 3) [m]. `DataError` where it cannot be read."""
         return self.load_cloud(index) @ self.camera_pose[:3, :3].T + self.camera_pose[:3, 3]
 
     @staticmethod
     def from_clouds(
         t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence"
     ) -> FrameSequence:
-        """A frame sequence of clouds in memory, each (N, 3) in the camera's frame [m], at stamps `t` (M,) [s]."""
+        """Make a frame sequence from clouds in memory, each (N, 3) in the camera's frame [m], at `t` (M,) [s]."""
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
         camera = validated_camera_pose(pose, source)
@@ -205,7 +205,7 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 
 
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
-    """A camera's pose as an array; `DataError` where it is missing or not a rigid transform."""
+    """Check a camera's pose. `DataError` where it is missing or not a rigid transform."""
     hint = "give the camera in the world as a 4x4 matrix, x right, y down, z ahead, translation in metres"
     if pose is None:
         raise DataError("the pose of the camera is missing", where=where, hint=hint)
@@ -235,7 +235,7 @@ _MIN_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 @dataclass(frozen=True, eq=False)
 class OcclusionMap:
-    """Map of what the surfaces in a frame hide, made from all points that the camera measured."""
+    """Map of what the surfaces in a frame hide, computed from all measured points."""
 
     points: Array  # (N, 3), in the world, before anything is left out [m]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world
@@ -245,7 +245,7 @@ class OcclusionMap:
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def is_hidden(self, places: Array, radius: Array, margin: float) -> BoolArray:
-        """Whether world places (S, 3) are occluded, lie in the shadow of something nearer, or are outside the image.
+        """Whether world places (S, 3) are occluded, shadowed by something nearer, or outside the image.
 
         What is nearer to the camera than a place by more than its radius (S,), by which it reaches about its line of
         sight, and a margin stands before it, all in [m].

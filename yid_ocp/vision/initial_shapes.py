@@ -1,4 +1,4 @@
-"""Initial shapes for the shape fit, from the centerline of the object in the cloud.
+"""Find initial shapes for the shape fit from the object's centerline in the cloud.
 
 The graph of a cloud's nearest points is cut into slices of equal distance along it from one end; touching parts of
 neighbouring slices make a graph of their own (Reeb's), whose cycles are loops of the object. Its ends are given to the
@@ -83,7 +83,7 @@ class _Centerline:
 
 
 def cloud_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
-    """Centerline of the object in a cloud, a tree of nodes with its loops; empty for too few points.
+    """Compute the centerline of the object in a cloud, a tree of nodes with loops. Empty for too few points.
 
     `diameter` is that of its thickest tube [m]; parts further apart than `gap` [m] do not hang together.
     """
@@ -199,7 +199,7 @@ _WHOLE_OBJECT_TOLERANCE = 0.08  # of the object, by which a course may be off th
 
 @dataclass(frozen=True, eq=False)
 class ObservedObjectEnd:
-    """Observed position of one end of an object along its own direction."""
+    """Observed position of one end of an object, along its own direction."""
 
     link_end_index: int  # among the links' starts and ends, in this order link by link
     direction: Array  # (3,), unit vector along the object
@@ -216,7 +216,7 @@ class _InitialShape(NamedTuple):
 
 
 def system_with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
-    """System without grasps whose object has six free root joints (position [m], x-y-z angles), and their names."""
+    """Make a system without grasps whose object has six named free root joints (position [m], x-y-z angles)."""
     tree = system.numeric_mechanism(values)
     q = ca.SX.sym("q", system.n_coordinates)
     base = tree.joint_index(next(s for s in system.segment_layouts if s.parent_segment is None).link_joints[0][0])
@@ -238,7 +238,7 @@ class _Link(NamedTuple):
 
 
 class ShapeFitInitialGuesses:
-    """Finder of object shapes along a centerline, with some joints bent from rest (n,); `lengths` of links [m]."""
+    """Finds object shapes along a centerline. Some joints are bent from rest (n,); `lengths` are of links [m]."""
 
     def __init__(
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]
@@ -271,7 +271,7 @@ class ShapeFitInitialGuesses:
         np.fill_diagonal(self._end_distances, 0.0)
 
     def initial_shapes_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
-        """Initial shapes that follow a centerline whose ends are as far apart as the object's.
+        """Find initial shapes that follow a centerline whose ends are as far apart as the object's.
 
         `DataError` where it has other ends than the object, or is not as long: part of the object is hidden, or
         something else hangs together with it.

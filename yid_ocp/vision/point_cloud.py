@@ -1,4 +1,4 @@
-"""The object's points in a cloud: pass-through, voxels, robot self-filter and outliers; and the cloud's skeleton."""
+"""Filter the object's points in a cloud, and compute the cloud's skeleton."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MAD_TO_STD = 1.4826  # from the median absolute deviation of a normal distribut
 
 @dataclass(frozen=True, eq=False)
 class WeightedCloud:
-    """Point cloud whose weights are the numbers of camera points that each point represents."""
+    """Point cloud with weights. A weight is the number of camera points that a point represents."""
 
     points: Array  # (N, 3), in the world [m]
     point_weights: Array  # (N,), how many of the camera's points each one represents
@@ -40,7 +40,7 @@ class WeightedCloud:
         return len(self.points)
 
     def select(self, mask: BoolArray | IntArray) -> WeightedCloud:
-        """The points that a mask or a list of indices selects."""
+        """Select points by a mask or a list of indices."""
         return WeightedCloud(self.points[mask], self.point_weights[mask])
 
 
@@ -116,7 +116,7 @@ class CloudFilterOptions:
 
 
 class ReachableObjectRegion:
-    """Region that the object can reach, by its branches and the floor; for a root `anywhere`, by the options."""
+    """Region that the object's branches can reach above the floor. For a root `anywhere` the options define it."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class ReachableObjectRegion:
         self._base = np.mean(bases, axis=0) if bases else None
 
     def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
-        """Function: which points (N, 3) are in the region, for a configuration (n,) and camera position (3,) [m]."""
+        """Make a test of whether points (N, 3) are in the region. Configuration (n,), camera position (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:
@@ -180,7 +180,7 @@ def _square_distances(points: Array, place: Array) -> Array:
 
 
 def voxel_averages(points: Array, size: float) -> WeightedCloud:
-    """Mean of the points (N, 3) in every cube of a grid of edge `size` [m], weighted by how many are in it."""
+    """Average the points (N, 3) in each voxel of edge `size` [m]. Weights are the numbers of points."""
     if not len(points):
         return WeightedCloud(np.empty((0, 3)), np.empty(0))
     cell = np.floor((points - points.min(0)) / size).astype(np.int64)
@@ -194,7 +194,7 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
 def is_statistical_inlier(
     cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None
 ) -> BoolArray:
-    """Whether points are inliers of statistical outlier removal, shape (N,); False outside the mask `asked`.
+    """Find the inliers of statistical outlier removal, shape (N,). False outside the mask `asked`.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
     median absolute deviation turned into a standard deviation. Both are weighted, so that wrong points, each alone in
@@ -218,7 +218,7 @@ def is_statistical_inlier(
 
 
 def has_wanted_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
-    """Whether points have one of the wanted colours, shape (N,).
+    """Whether each point has one of the wanted colours, shape (N,).
 
     Colours are red, green and blue, 0 to 255 (sRGB), shapes (N, 3) and (C, 3). `angle` is the largest between two of
     them as directions of linear light, which brightness does not change [rad].
@@ -264,7 +264,7 @@ class SkeletonOptions:
 
 @dataclass(frozen=True, eq=False)
 class CloudSkeleton:
-    """Skeleton of a cloud: nodes, spanning forest between them, and the node to which each point belongs."""
+    """Skeleton of a cloud, with nodes, a spanning forest between them, and the node of each point."""
 
     nodes: Array  # (K, 3), centroids of the kept segments, in the order of the walk [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
@@ -338,7 +338,7 @@ _DEFAULT_OPTIONS = SkeletonOptions()
 def extract_skeleton(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULT_OPTIONS
 ) -> CloudSkeleton:
-    """Skeleton of a cloud without connected parts that hold too few points, begun at the lowest point."""
+    """Extract the skeleton of a cloud from the lowest point on. Connected parts with too few points are left out."""
     nodes, size, label = _thin_to_nodes(cloud, rng, options)
     edges, part = _spanning_forest(nodes, options)
     if not len(nodes):

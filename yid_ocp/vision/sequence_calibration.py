@@ -1,4 +1,4 @@
-"""Calibration shared by all frames of a sequence: the camera, background, foreign objects and the object's dimensions.
+"""Calibration shared by all frames of a sequence: camera, background, foreign objects and object dimensions.
 
 Of every frame the least cost about the sizes x (logarithms of lengths and radii over the model's), the bends following,
 is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). Together, with a wide prior P, the frames fitted anew at every x,
@@ -40,7 +40,7 @@ _MAD_TO_STD = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class BackgroundPoints:
-    """Points of the static scene, and the distance within which a cloud's points are removed as background."""
+    """Points of the static scene. Cloud points within a distance of them are removed as background."""
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3), in the world [m]
     match_distance: float = 0.0  # distance at which a point belongs to it [m]
@@ -50,7 +50,7 @@ class BackgroundPoints:
         return cKDTree(self.points)
 
     def is_near_background(self, points: Array, beyond: float = 0.0) -> BoolArray:
-        """Whether points, shape (N, 3), lie within `match_distance + beyond` [m] of the background, shape (N,)."""
+        """Whether points (N, 3) lie within `match_distance + beyond` of the background [m]."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
@@ -64,7 +64,7 @@ class BackgroundPoints:
     def from_point_clouds(
         clouds: Sequence[Array], voxel: float, noise: float, shapes: Sequence[TubeLinks] | None = None, near: float = 0
     ) -> BackgroundPoints:
-        """Background: world points (N, 3) of an empty scene, or points static in most frames and off fitted shapes.
+        """Find background in world clouds (N, 3): an empty scene, or points static in most frames, off fitted shapes.
 
         Counted in cubes of an edge `voxel`, with points of standard deviation `noise`; what ever was nearer than `near`
         to the surface of a tube may be the object's, all in [m].
@@ -83,7 +83,7 @@ class BackgroundPoints:
 
 @dataclass(frozen=True, eq=False)
 class ForeignObject:
-    """Something seen in several frames that is neither robot nor modelled object: place, size, motion, advice."""
+    """An object seen in several frames that is neither robot nor modelled object."""
 
     centre: Array  # (3,), in the world, in the median frame [m]
     size: Array  # (3,) [m]
@@ -178,7 +178,7 @@ _OUTLIER_END_STDS = 3.0  # robust standard deviations from the other frames' end
 
 @dataclass(frozen=True, eq=False)
 class TubeDimensionEstimates:
-    """Tube lengths and radii estimated from the frames, compared with the model."""
+    """Tube lengths and radii estimated from frames, compared with the model."""
 
     names: tuple[str, ...]  # `T1.length` and so on: lengths of all segments, then their radii
     model_values: Array  # (2 s,), the model's values [m]
@@ -194,18 +194,18 @@ class TubeDimensionEstimates:
 
     @property
     def determined_dimension_mask(self) -> BoolArray:
-        """Mask of the dimensions that the frames determine, shape (2 s,) for s tubes."""
+        """Mask of the dimensions of s tubes that the frames determine, shape (2 s,)."""
         return np.asarray((self.dimension_log_ratio_std < _MAX_KNOWN_LOG_STD) & (self.n_frames > 0))
 
     @property
     def contradicted_model_value_mask(self) -> BoolArray:
-        """Mask of the model's values that contradict the frames, shape (2 s,) for s tubes."""
+        """Mask of the model's dimensions of s tubes that contradict the frames, shape (2 s,)."""
         off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
         return np.asarray(self.determined_dimension_mask & off)
 
     @property
     def contradiction_message(self) -> str:
-        """Text on model values that contradict the frames and are not estimated instead; empty if there are none."""
+        """Describe model values that contradict the frames and are not estimated instead. Empty if there are none."""
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
             f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
@@ -215,7 +215,7 @@ class TubeDimensionEstimates:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """One message for every contradicted or estimated dimension: the value that fits, with its interval."""
+        """One message per contradicted or estimated dimension, with the fitting value and its interval."""
         lines = []
         for i, name in enumerate(self.names):
             value = 1e3 * self.model_values[i] * math.exp(self.log_ratio[i])
@@ -230,7 +230,7 @@ class TubeDimensionEstimates:
         return tuple(lines)
 
     def point_std_due_to_dimensions(self, points: Array) -> Array:
-        """Stds (np, 3) [m] of points due to wrong or uncertain tube dimensions; `points`: derivatives (np, 3, 2 s).
+        """Stds of points from wrong or uncertain tube dimensions, (np, 3) [m]. `points`: derivatives (np, 3, 2 s).
 
         The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.
         """
@@ -241,7 +241,7 @@ class TubeDimensionEstimates:
         return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
 
     def parameter_values(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
-        """Parameter values with the estimated sizes in place of the model's."""
+        """Replace the model's sizes in the parameter values by the estimated ones."""
         return _changed(system, given, np.where(self.estimated_dimension_mask, self.log_ratio, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""Assessment of a shape by a frame's cloud: own points, foreign points, and links without points.
+"""Assess a shape by a frame's cloud: own points, foreign points, and links without points.
 
 Of the points that are not near the tubes' surface, those that hang together and are as many as a piece of tube as long
 as it is wide would have are a thing. Where a thing's surface goes on from the shape's, points within two tubes' reach
@@ -50,7 +50,7 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Projections of points (N, 3) on the nearest of links (K, 2, 3), nearest to `share` of the radius (K,) [m].
+    """Project points (N, 3) on the nearest of links (K, 2, 3), nearest to `share` of the radius (K,) [m].
 
     Index of the link and place along it from 0 to 1, both (N,), unit vectors (N, 3) from the centre line to the points,
     and distances (N,) from it [m].
@@ -76,7 +76,7 @@ def link_axes(link_ends: Array) -> Array:
 
 
 def link_normals_perpendicular_to_sight(link_ends: Array, camera: Array) -> Array:
-    """Unit vectors (K, 3) perpendicular to links (K, 2, 3) and to the sight of a camera at (3,)."""
+    """Unit vectors perpendicular to links (K, 2, 3) and to the sight of a camera at (3,), shape (K, 3)."""
     across = np.cross(link_ends[:, 1] - link_ends[:, 0], link_ends.mean(axis=1) - camera)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None])
 
@@ -97,7 +97,7 @@ class ForeignCluster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQuality:
-    """Fit quality of a shape in one frame: noise, distances, coverage of links, end offsets, foreign clusters."""
+    """Fit quality of a shape in one frame: noise, distances, link coverage, end offsets and foreign clusters."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
@@ -109,14 +109,14 @@ class ShapeFitQuality:
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
     def covered_fraction_of_visible_links(self, lengths: Array) -> float:
-        """Share of the visible length of links, lengths (K,) [m], with points of their own; 0 if none is visible."""
+        """Fraction of the visible length of links, lengths (K,) [m], with own points. 0 if none is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQualityAndPointClasses(ShapeFitQuality):
-    """Fit quality of a shape, and which of the frame's points are its own, contested or foreign."""
+    """Fit quality of a shape, with classes of the frame's points: own, contested or foreign."""
 
     # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
     is_own: BoolArray
@@ -127,7 +127,7 @@ class ShapeFitQualityAndPointClasses(ShapeFitQuality):
 
 @dataclass(frozen=True, eq=False)
 class ProcessedFrameCloud:
-    """Filtered points and skeleton nodes of one frame, with the camera's position and the occlusion map."""
+    """Filtered points and skeleton nodes of one frame, with camera position and occlusion map."""
 
     points: Array  # (N, 3), surface points in the world [m]
     point_weights: Array  # (N,)
@@ -159,7 +159,7 @@ class ProcessedFrameCloud:
 def fit_quality_and_point_classes(
     tubes: TubeLinks, seen: ProcessedFrameCloud, near: float
 ) -> ShapeFitQualityAndPointClasses:
-    """Classify a frame's points by a fitted shape and assess its coverage; points beyond `near` [m] are ignored."""
+    """Classify a frame's points by a fitted shape and assess its coverage. Points beyond `near` [m] are ignored."""
     link, along, normal, distance = tube_link_projections(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
@@ -213,7 +213,7 @@ def fit_quality_and_point_classes(
 
 
 def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
-    """Masks of skeleton nodes (K,) and of points by nearest node (N,): the cloud there is as narrow as the tube.
+    """Masks of skeleton nodes (K,) and of points by nearest node (N,) where the cloud is as narrow as the tube.
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
     spread as far in two.
@@ -329,7 +329,7 @@ class _SurfaceResiduals(NamedTuple):
 def nearest_surface_residuals(
     corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
 ) -> _SurfaceResiduals:
-    """Residuals e = |p - c| - f r of points p (N, 3) at `share` f of a link's radius r; c: nearest axis point.
+    """Residuals e = |p - c| - f r of points p (N, 3). c is the nearest axis point, f = `share` of the radius r.
 
     Links are (K, 2, 3), radii (K,), the camera (3,) [m]. A point that only the far side of a tube is near to counts
     from the near side.
@@ -344,7 +344,7 @@ def nearest_surface_residuals(
 
 
 def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
-    """Errors of points along the line of sight from the tubes; parameters as of `nearest_surface_residuals`.
+    """Errors of points along the line of sight from the tubes. Parameters are those of `nearest_surface_residuals`.
 
     Across the sight a point stands where its pixel does, by u from the axis; towards the camera the surface lies at
     sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it

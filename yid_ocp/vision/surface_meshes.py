@@ -1,4 +1,4 @@
-"""Surfaces of robot, tubes and surroundings, and a virtual depth camera that sees them.
+"""Surface meshes of robot, tubes and surroundings, and a virtual depth camera that sees them.
 
 Each surface is in a joint's moving frame. Noise and steps of the camera, a structured-light sensor, are even in the
 pattern's disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
@@ -51,7 +51,7 @@ _MIN_PROJECTED_DISTANCE = 0.05  # [m]; closer than this a box is not projected b
 
 @dataclass(frozen=True)
 class ExtraMesh:
-    """Mesh that the robot's URDF does not have, such as a gripper's body, a table or a camera stand."""
+    """A mesh missing from the robot's URDF, such as a gripper's body, a table or a camera stand."""
 
     parent_frame: Annotated[str | None, OptionInfo("link of the robot that carries it; null for the world")] = None
     mesh: Annotated[str | None, OptionInfo("file that trimesh reads, in metres: STL, OBJ, DAE", is_path=True)] = None
@@ -69,7 +69,7 @@ class ExtraMesh:
 
 @dataclass(frozen=True)
 class ObservedScene:
-    """Robot and object that a camera looks at."""
+    """Robot and object in a camera's view."""
 
     system: System
     robot_urdf: str | Path | None = None  # for the robot's meshes (`package:baxter`); None for the object alone
@@ -79,19 +79,19 @@ class ObservedScene:
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Triangles: `vertices` (V, 3) [m], `faces` (F, 3) indices."""
+    """A mesh of triangles: `vertices` (V, 3) [m] and `faces` (F, 3), which are indices."""
 
     vertices: Array
     faces: IntArray
 
     def transformed(self, pose: ArrayLike) -> TriangleMesh:
-        """Mesh transformed by a pose, shape (4, 4)."""
+        """Transform the mesh by a pose, shape (4, 4)."""
         matrix = np.asarray(pose, float)
         return TriangleMesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
 
     @staticmethod
     def concatenate(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-        """One mesh with the triangles of all given meshes."""
+        """Concatenate meshes into one."""
         shifts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         faces = [part.faces + shift for part, shift in zip(parts, shifts, strict=True)]
         return TriangleMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
@@ -102,14 +102,14 @@ class TriangleMesh:
 
     @staticmethod
     def box(size: ArrayLike) -> TriangleMesh:
-        """A box about the origin; `size` (3,) [m]."""
+        """Make a box of `size` (3,) about the origin [m]."""
         from trimesh import creation
 
         return TriangleMesh._of(creation.box(np.asarray(size, float)))
 
     @staticmethod
     def cylinder(radius: float, low: float, high: float) -> TriangleMesh:
-        """A closed cylinder about z from `low` to `high` [m]."""
+        """Make a closed cylinder about z from `low` to `high` [m]."""
         from trimesh import creation
 
         middle = homogeneous_transform(np.eye(3), (0.0, 0.0, 0.5 * (low + high)))
@@ -117,7 +117,7 @@ class TriangleMesh:
 
     @staticmethod
     def sphere(radius: float) -> TriangleMesh:
-        """A sphere about the origin."""
+        """Make a sphere about the origin."""
         from trimesh import creation
 
         polar = np.linspace(0.0, np.pi, _TUBE_FACETS // 2 + 1)
@@ -167,7 +167,7 @@ class ArticulatedSurfaces:
     def is_within_surface_distance(
         self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
     ) -> BoolArray:
-        """Whether world points (N, 3) are within `reach` [m] of any, or any moving, surface at a configuration."""
+        """Whether world points (N, 3) are within `reach` of any, or any moving, surface at a configuration [m]."""
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
             asked = np.flatnonzero(~result)
@@ -178,7 +178,7 @@ class ArticulatedSurfaces:
         return result
 
     def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
-        """Distance [m] to the nearest moving surface, normal towards the point, part; inf, 0, -1 beyond `within`."""
+        """Distance [m], normal towards the point and part of the nearest moving surface. inf, 0, -1 beyond `within`."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
@@ -202,7 +202,7 @@ class ArticulatedSurfaces:
     def render_depth_incidence_and_part(
         self, pinhole: CameraIntrinsics, pose: ArrayLike, q: ArrayLike
     ) -> tuple[Array, Array, IntArray]:
-        """Noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
+        """Render noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
 
         All have shape (height, width): infinite, 0 and -1 where there is nothing. `pose` (4, 4) is in the world.
         """
@@ -224,7 +224,7 @@ class ArticulatedSurfaces:
         return depth, cosine, owner
 
     def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, IntArray]:
-        """First intersection of rays from one place (3,) in the world along directions (N, 3) with any surface.
+        """Find the first intersection of rays from one world place (3,) along directions (N, 3) with any surface.
 
         Distances (N,) in lengths of the directions, unit normals (N, 3) towards the origin, and parts (N,); infinite,
         zero and -1 for rays that meet nothing.
@@ -268,7 +268,7 @@ def _tensor(values: NDArray[Any]) -> Any:
 def load_robot_meshes_by_joint(
     urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual"
 ) -> dict[int, TriangleMesh]:
-    """Meshes of a robot's links by the joint that carries them (-1: immobile), in that joint's frame.
+    """Load meshes of a robot's links by the joint that carries them (-1: immobile), in that joint's frame.
 
     The numeric mechanism was read from the URDF file, or `package:baxter`, alone or joined with others. `ModelError`
     where there is no such file, a mesh is missing or cannot be read, or there is no mesh at all.
@@ -317,7 +317,7 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
 
 
 def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
-    """Meshes that the URDF does not have, by the index of the joint that carries them, -1 for the world.
+    """Load meshes missing from the URDF by the index of the joint that carries them (-1: the world).
 
     `ConfigError` where there is no such link, or not exactly one shape; `ModelError` for a file that cannot be read.
     """
@@ -381,7 +381,7 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
 def tube_link_lengths_and_radii(
     system: System, values: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Array, float]]:
-    """Link lengths and radius of every tube [m], by segment name."""
+    """Link lengths and radius of every tube, by segment name [m]."""
     segments, theta = system.segment_layouts, system.parameters.vector(values)
     sizes = [ca.densify(ca.vertcat(*segment.link_lengths, segment.radius)) for segment in segments]
     numbers = [
@@ -414,7 +414,7 @@ _PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
 
 @dataclass(frozen=True)
 class DepthSensorModel:
-    """Sensor model of a structured-light depth camera; the defaults are an Asus Xtion Pro Live."""
+    """Sensor model of a structured-light depth camera. The defaults are an Asus Xtion Pro Live."""
 
     intrinsics: CameraIntrinsics = XTION_INTRINSICS
     baseline: float = 0.075  # between projector and camera, along x [m]
@@ -480,7 +480,7 @@ class DepthSensorModel:
 
 @dataclass(frozen=True)
 class CameraTimingModel:
-    """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
+    """Timing model of a camera with frame rate, dropped frames and errors of time stamps."""
 
     mean_rate: float = 3.0  # [Hz]
     dropped_fraction: float = 0.0  # of the frames, which never arrive
@@ -509,7 +509,7 @@ class VirtualFramesWithTruth:
 
 @dataclass(frozen=True, eq=False)
 class VirtualCameraSetup:
-    """Virtual depth camera: sensor model, pose and frame timing."""
+    """Virtual depth camera with sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # an Asus Xtion Pro Live where absent
@@ -520,7 +520,7 @@ class VirtualCameraSetup:
 def render_virtual_frames(
     scene: ObservedScene, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
 ) -> VirtualFramesWithTruth:
-    """Frames that a virtual camera takes of a motion; each is rendered on loading, the same every time.
+    """Render the frames that a virtual camera takes of a motion. A frame is rendered on loading, reproducibly.
 
     Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
     Where there is a robot, the foam Y stands on a floor, and a wall stands behind Baxter. `DataError` or

@@ -1,4 +1,4 @@
-"""Tracking of an object's points in a frame sequence: filter, skeleton, shape fit and selection of frames.
+"""Track an object's points in a frame sequence, from filtering to shape fit and frame selection.
 
 A first pass over some frames finds what is common to the sequence. A second one takes frame by frame and keeps no
 cloud; every frame ends as a fitted shape or with the reason why it was dropped.
@@ -101,7 +101,7 @@ class _Look(NamedTuple):
 
 
 class FrameTracker:
-    """Tracker that processes the frames of a sequence one by one, in any process; arguments of `track_object`.
+    """Processes the frames of a sequence one by one, in any process. Arguments are those of `track_object`.
 
     `frame_order` are all frames by their stamps, `calibration_frames` those from which the camera is calibrated.
     """
@@ -164,7 +164,7 @@ class FrameTracker:
         return q
 
     def estimate_sequence_calibration(self) -> SequenceCalibration:
-        """Calibration shared by the sequence, estimated from some of its frames."""
+        """Estimate the calibration shared by the sequence from some of its frames."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
         seen = (
@@ -289,7 +289,7 @@ class FrameTracker:
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
     def process_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
-        """Report of one frame, independent of other frames."""
+        """Process one frame, independent of other frames, and return its report."""
         work, look = self._look(index, common.camera_calibration, common.background)
         if look is None:
             return work.report
@@ -309,7 +309,7 @@ class FrameTracker:
         return work.report
 
     def frame_processing_stages(self, frame: FrameReport, common: SequenceCalibration) -> FrameProcessingStages | None:
-        """Processing stages of a frame, for figures; None if its cloud cannot be read."""
+        """Processing stages of a frame, for figures. None if its cloud cannot be read."""
         calibration = common.camera_calibration
         try:
             cloud = calibration.camera_state.measured_to_world_points(self.sequence.load_cloud(frame.index))
@@ -320,20 +320,20 @@ class FrameTracker:
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
     def unprocessed_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
-        """Report of a frame before processing, with the reason if it is dropped."""
+        """Make a frame's report before processing, with the reason if it is dropped."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def mark_outlying_frames_and_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
-        """Frames with outlying ones dropped, and how the root end was chosen."""
+        """Drop outlying frames, and choose the root end with a note on how."""
         rooted, note = frame_selection.with_consistent_root_end(frames, self.options)
         return frame_selection.mark_outlying_frames(rooted, self.options), note
 
     def track_result_from_frame_reports(
         self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration
     ) -> TrackResult:
-        """Tracking result of the frames; `DataError` if none is good."""
+        """Make the tracking result from frame reports. `DataError` if no frame is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
         of = common, things, self.options, self.sequence.source
@@ -351,7 +351,7 @@ class FrameTracker:
         )
 
     def foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
-        """Foreign objects seen in the fitted frames."""
+        """Find foreign objects in the fitted frames."""
         fitted = [(frame.joint_time, frame.shape_fit) for frame in frames if frame.shape_fit is not None]
         if not fitted:
             return ()

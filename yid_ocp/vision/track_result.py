@@ -1,4 +1,4 @@
-"""Results of tracking: a report of every frame, shapes and points of the good ones, and figures of both."""
+"""Results of tracking: frame reports, shapes and points of the good frames, and figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _CAMERA_POINT_GROUP = "points_camera"
 
 @dataclass(frozen=True, eq=False)
 class FrameReport:
-    """Report of one frame: why it was dropped, or its fitted shape."""
+    """Report of one frame. It holds the fitted shape or why the frame was dropped."""
 
     index: int  # of the sequence
     name: str
@@ -47,13 +47,13 @@ class FrameReport:
 
 
 def count_drop_reasons(frames: Iterable[FrameReport]) -> dict[str, int]:
-    """Number of frames dropped for each reason; numbers in the reasons are left out."""
+    """Count dropped frames for each reason. Numbers in the reasons are left out."""
     return dict(Counter(frame.drop_reason.partition(":")[0] for frame in frames if not frame.is_good).most_common())
 
 
 @dataclass(frozen=True, eq=False)
 class FrameProcessingStages:
-    """Processing stages of one frame, for figures; stages that a dropped frame did not reach are None."""
+    """Processing stages of one frame, for figures. Stages that a dropped frame did not reach are None."""
 
     report: FrameReport
     camera_position: Array  # (3,) [m]
@@ -64,7 +64,7 @@ class FrameProcessingStages:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """Result of tracking: shapes and points of the good frames."""
+    """Result of tracking with shapes and points of the good frames."""
 
     point_names: tuple[str, ...]  # points written down
     t: Array  # (M,), times of the good frames on the joints' clock [s]
@@ -80,13 +80,13 @@ class TrackResult:
     _place: Callable[[Array], Array]  # from a configuration to the points
 
     def configuration_at_time(self, t: float) -> Array:
-        """Configuration at any time by a cubic spline through the good frames', constant beyond them, shape (n,)."""
+        """Configuration at any time by a cubic spline through the good frames, shape (n,). Constant beyond them."""
         if len(self.t) < 2:
             return self.configurations[0].copy()
         return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
 
     def point_positions_at_time(self, t: float) -> Array:
-        """Positions of the tracked points at any time, at `configuration_at_time`, shape (np, 3) [m]."""
+        """Positions of the tracked points at any time, from `configuration_at_time`, shape (np, 3) [m]."""
         return self._place(self.configuration_at_time(t))
 
     @property
@@ -96,18 +96,18 @@ class TrackResult:
 
     @property
     def dimension_and_foreign_object_notes(self) -> tuple[str, ...]:
-        """Messages about the object's dimensions and foreign objects."""
+        """Messages about the object's dimensions and about foreign objects."""
         return (*self.dimensions.messages, *(thing.text for thing in self.foreign_objects))
 
     def to_point_group(self) -> PointGroup:
-        """The points as a group of a recording, called `points_camera`."""
+        """Convert the points to a group `points_camera` of a recording."""
         pose, words = self.camera_calibration.camera_state.pose, "depth camera, fitted shape"
         if np.nanmax(self.shared_std) > 0:
             words += f"; of std, {1e3 * np.nanmedian(self.shared_std):.1f} mm (median) are one error of all frames"
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
-        """A recording (None: an empty one) with these points as `points_camera`; errors as `validated_recording`."""
+        """Add these points to a recording (None: an empty one) as `points_camera`. Errors: `validated_recording`."""
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
         count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
@@ -196,7 +196,7 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
 
 
 def write_tracked_points_plot(track: TrackResult, file: str | os.PathLike[str]) -> None:
-    """Write a picture of the points over time, two standard deviations and the spline; errors as `atomic_write`."""
+    """Plot the points over time with two standard deviations and the spline. Errors are as in `atomic_write`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 2.2 * len(track.point_names) + 0.8), layout="constrained")

@@ -1,4 +1,4 @@
-"""The kinds of flexible objects, one file each: settings, geometry, refinement, clamps, and what `init` writes."""
+"""Kinds of flexible objects, one file each: settings, geometry, refinement, clamps and `init` templates."""
 
 from importlib import import_module
 from pkgutil import iter_modules

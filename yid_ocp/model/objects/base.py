@@ -34,7 +34,7 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Settings of an object's mount: parent frame, and position and orientation of the object's root in it."""
+    """Mount of an object, with the parent frame and the pose of the object's root in it."""
 
     parent_frame: Annotated[str | None, OptionInfo("frame or clamp that carries it; the world when absent")] = None
     xyz: Annotated[_Vector3, OptionInfo("position in that frame", "m")] = (0.0, 0.0, 0.0)
@@ -42,13 +42,13 @@ class MountSettings:
 
     @property
     def pose(self) -> Array:
-        """Pose of the object's root in the parent frame as a homogeneous matrix, shape (4, 4)."""
+        """Pose of the object's root in the parent frame, a homogeneous matrix (4, 4)."""
         return transform_from_xyz_rpy(self.xyz, self.rpy)
 
 
 @dataclass(frozen=True)
 class ClampPoseDefinition:
-    """Definition of a clamp's pose from two measured points: origin at the first, z axis towards the second.
+    """Defines a clamp's pose from two measured points. The first is the origin, the z axis points to the second.
 
     With `level` the third angle is zero (x axis across world y); with `transported` the clamp never turns about its own
     z axis, from `level` at the first node on.
@@ -62,7 +62,7 @@ class ClampPoseDefinition:
 
 @dataclass(frozen=True)
 class CableTopology:
-    """Topology of a branched cable: vertices along the parent and child branches, and their undeformed positions."""
+    """Vertices of a branched cable along the parent and child branches, and their undeformed positions."""
 
     parent_branch_vertex_names: tuple[str, ...]  # from clamp to clamp; the clamps hold the first and last two vertices
     vertex_names_by_child_branch: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
@@ -96,27 +96,27 @@ class CableTopology:
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
-        """Names of the four clamped vertices, the first and last two of the parent branch."""
+        """Names of the four clamped vertices. They are the first and last two of the parent branch."""
         return (*self.parent_branch_vertex_names[:2], *self.parent_branch_vertex_names[-2:])
 
     @property
     def free_vertex_names(self) -> tuple[str, ...]:
-        """Names of the vertices that no clamp holds; predictions are evaluated at them."""
+        """Names of the vertices that no clamp holds. Predictions are evaluated there."""
         return tuple(vertex for vertex in self.vertex_names if vertex not in self.clamped_vertex_names)
 
     @property
     def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
-        """Vertex names of every branch by segment name, the parent branch first."""
+        """Vertex names of every branch, by segment name. The parent branch comes first."""
         return {self.parent_segment: self.parent_branch_vertex_names, **self.vertex_names_by_child_branch}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of vertex names, one for every edge, branch by branch."""
+        """Pairs of vertex names, one pair for each edge. Edges are ordered by branch."""
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
     def clamp_pose_definitions_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
-        """Definitions of the poses of the two clamps, at the start and at the end."""
+        """Pose definitions of the two clamps at the start and the end."""
         a, b, *_, y, z = self.parent_branch_vertex_names
         start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
         return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
@@ -131,7 +131,7 @@ class CableTopology:
 
 @dataclass(frozen=True)
 class InitCommandObject:
-    """An object from the command line of `init`: its settings, and start values of its free parameters."""
+    """An object from the command line of `init`, with start values of its free parameters."""
 
     settings: ObjectKind  # without its mount
     start_values: Mapping[str, tuple[float, str]]  # where the search for each free parameter starts, with a comment
@@ -142,7 +142,7 @@ class InitCommandObject:
 
 @dataclass(frozen=True)
 class InitCommandObjectFactory:
-    """Template for one word of `init --object`: how the object is built and which numbers it requires.
+    """Template for one word of `init --object`.
 
     `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
     `ConfigError` where something is missing.
@@ -156,7 +156,7 @@ class InitCommandObjectFactory:
 
 
 def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
-    """The numbers that an object requires, in the order of `meanings`; `ConfigError` if one is missing."""
+    """Get the numbers that an object requires, in the order of `meanings`. `ConfigError` if one is missing."""
     for name, meaning in meanings.items():
         if name not in numbers:
             flag, value = (f"--{name}", " NUMBER") if name in SIZE_DESCRIPTIONS else ("--number", f" {name}=NUMBER")
@@ -165,7 +165,7 @@ def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Map
 
 
 def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
-    """Parse the comma-separated numbers in a flag's value; `ConfigError` unless they are finite and `count` many."""
+    """Parse the comma-separated numbers of a flag. `ConfigError` unless there are `count` finite ones."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -177,7 +177,7 @@ def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
 
 
 def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
-    """Start values (with comment) of each segment's bending rigidity, ratio x weight x length^2, and of its damping."""
+    """Start values of each segment's bending rigidity (ratio x weight x length^2) and damping, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
@@ -188,7 +188,7 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectKind:
-    """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`; its fields are the object's settings.
+    """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
     A class overrides `kind`, and `build_segments` or `build`, and what else differs; one that is a system of its own is
     a `ClampedObject` as well.
@@ -202,37 +202,37 @@ class ObjectKind:
     kind: Annotated[str, OptionInfo("what the object is")]
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the object's segments, parents first; each link is divided into `link_division` at equal stiffness."""
+        """Build the object's segments, parents first. Each link becomes `link_division` links, at equal stiffness."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """Build the flexible object, not yet placed, with each link divided into `link_division` links."""
+        """Build the flexible object, not yet placed. Each link becomes `link_division` links."""
         return flexible_object(self.build_segments(damping, link_division))
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
-        """Frame that carries the object's root (None: world), and the root's pose in it, (4, 4) (None: identity)."""
+        """Frame that carries the object's root (None: world), and the root's pose in it (None: identity), (4, 4)."""
         return None, None
 
     @property
     def is_root_fixed_in_world(self) -> bool:
-        """Whether the object's root is fixed to the world: no robot frame or clamp moves it."""
+        """Whether the object's root is fixed in the world, on no robot frame or clamp."""
         return False
 
     @property
     def n_links_per_segment_or_total(self) -> int | None:
-        """Number of links per segment, or in total if segments differ; None if the object has no such segments."""
+        """Number of links per segment, or in total if segments differ. None without such segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.build_segments()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
-        """Factor on a per-joint parameter that keeps its segment's stiffness if each link is divided; 1 for others."""
+        """Factor on a per-joint parameter that keeps segment stiffness when links are divided. Others: 1."""
         owner, _, quantity = parameter.rpartition(".")
         per_joint = {segment.name for segment in self.build_segments() if not segment.stiffness_given_as_rigidity}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
-        """Paths of the input files named in the object's settings, by settings key."""
+        """Paths of the input files that the object's settings name, by settings key."""
         own: Any = type(self)
         return {
             key: getattr(self, option.field_name)
@@ -241,28 +241,28 @@ class ObjectKind:
         }
 
     def with_file_names_only(self) -> ObjectKind:
-        """The same object with file names in place of paths, for comparison with another run's object."""
+        """Replace paths by file names, so that objects of different runs can be compared."""
         names = {key: Path(file).name for key, file in self.input_file_paths().items()}
         return replace(self, **names)
 
 
 @runtime_checkable
 class ClampedObject(Protocol):
-    """Interface of objects, such as a cable, that form a whole system with clamps that follow measured points."""
+    """Interface of objects that form a whole system with clamps, such as a cable. The clamps follow measured points."""
 
     def topology(self) -> CableTopology:
-        """The object's vertices and clamps; `DataError` or `ModelError` if they are inconsistent."""
+        """The object's vertices and clamps. `DataError` or `ModelError` if they are inconsistent."""
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
-        """Build the system of object and clamps from the measured edge lengths [m] and gravity [m/s^2]."""
+        """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Parameter values by name from one recording's edge lengths [m]; empty if all recordings share the lengths."""
+        """Parameter values from one recording's edge lengths [m]. Empty if all recordings share lengths."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountedObjectKind(ObjectKind):
-    """Base class of objects whose root is mounted on a frame of a robot or clamp, or in the world."""
+    """Base class of objects mounted on a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
@@ -285,5 +285,5 @@ OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
 def init_command_object_factories() -> dict[str, InitCommandObjectFactory]:
-    """Templates of all object kinds, by their word for `init --object`."""
+    """Templates of all object kinds, keyed by their word for `init --object`."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_factories.items()}

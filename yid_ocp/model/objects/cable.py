@@ -55,7 +55,7 @@ START_SPEED_PARAMETER_NAME = "start.speed"
 
 @dataclass(frozen=True)
 class CableBranchOptions:
-    """Nominal properties of one cable branch: rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m]."""
+    """Nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
 
     bend_rigidity: float = 1.5e-3  # in a configuration this and the next two are set under `parameters`
     twist_rigidity: float = 1.0e-3
@@ -66,7 +66,7 @@ class CableBranchOptions:
 
 @dataclass(frozen=True)
 class CableOptions:
-    """Options of a cable's model: its branches' properties, clamps, rest shape, link lengths and gravity.
+    """Settings of a cable's model.
 
     By `shape_memory_fraction` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness),
     the load being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
@@ -110,7 +110,7 @@ class CableOptions:
 
 
 def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
-    """Read vertex positions [m] by name from a CSV table with columns point, x, y, z; `DataError` for another file."""
+    """Read vertex positions [m] from a CSV table with columns point, x, y, z. `DataError` for another file."""
     try:
         rows = csv.DictReader(read_input_text(Path(path)).splitlines())
         return {row["point"]: np.array([float(row[axis]) for axis in "xyz"]) for row in rows}
@@ -120,7 +120,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
 
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-    """Values of a cable's length parameters by name, from the lengths [m] of its edges."""
+    """Values of a cable's length parameters from its edge lengths [m]."""
     values = {
         f"{START_CLAMP}.length": lengths[cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[1]]
     }
@@ -134,7 +134,7 @@ def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[st
 def clamped_cable_system(
     lengths: Mapping[tuple[str, str], float], cable: CableTopology, options: CableOptions | None = None
 ) -> System:
-    """Build the system of a cable held by two clamps, from the lengths [m] of all its edges.
+    """Build the system of a cable held by two clamps from the lengths of all its edges [m].
 
     Prescribed are the twelve coordinates of `clamp_start` and `clamp_end`. Frames: every vertex by its name,
     `junction_CHILD`, and `last_edge`. Parameters: those of each segment (`parent.bend`, ...), `clamp_start.length`,
@@ -280,7 +280,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
 @OBJECT_KINDS.register("cable")
 @dataclass(frozen=True, kw_only=True)
 class Cable(CableOptions, ObjectKind):
-    """A branched cable held at both ends by clamps that follow measured points; recordings give its edge lengths."""
+    """A branched cable held by clamps at two ends. The clamps follow measured points; recordings give edge lengths."""
 
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: cable": """\

@@ -1,4 +1,4 @@
-"""The foam letter Y of Caldwell et al. (ISER 2014): three tubes of four links each, standing on the ground."""
+"""The foam letter Y of Caldwell et al. (ISER 2014). Three tubes of four links each stand on the ground."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trun
 
 
 def foam_y_segments() -> tuple[Segment, ...]:
-    """Segments of the source paper's foam Y: trunk T1, and branches T2 and T3, 45 degrees towards +y and -y."""
+    """Segments of the foam Y. Branches T2 and T3 leave the trunk T1 at 45 degrees, towards +y and -y."""
     lean = math.radians(45.0)
     return (
         Segment("T1", 0.813, 0.064, 0.032),
@@ -29,7 +29,7 @@ def foam_y_segments() -> tuple[Segment, ...]:
 
 
 def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
-    """The source paper's foam Y with its foot at (0.85, 0, -0.93) m; joint stiffnesses do not depend on `links`."""
+    """Build the foam Y with its foot at (0.85, 0, -0.93) m. Joint stiffnesses do not depend on `links`."""
     segments = [replace(segment, links=links) for segment in foam_y_segments()]
     return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 
@@ -44,7 +44,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
 class FoamY(MountedObjectKind):
-    """The foam letter Y of Caldwell et al. (2014); without a mount its foot is at the default place."""
+    """The foam letter Y of Caldwell et al. (2014). Without a mount its foot is at the default place."""
 
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
         "foam_y": InitCommandObjectFactory(4, _init_object)
@@ -66,7 +66,7 @@ model:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the three tubes; nominal joint stiffnesses are those for four links, for any value of `links`."""
+        """Build the three tubes. Nominal joint stiffnesses are those for four links, whatever `links` is."""
         n = link_division
         links = self.links * n
         return [

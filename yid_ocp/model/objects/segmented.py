@@ -1,4 +1,4 @@
-"""Objects of segments: a cable, beam or tree as chains of rigid links, each described in the configuration."""
+"""Flexible objects described in the configuration segment by segment, such as cables, beams and trees."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 
 @dataclass(frozen=True, kw_only=True)
 class FlexibleSegmentSettings:
-    """Settings of one segment (tube, branch, beam) of rigid links; stiffness and damping are set in `parameters`."""
+    """Settings of one segment of rigid links. Stiffness and damping are set in `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed if link_lengths is given", "m")] = (
         None
@@ -54,7 +54,7 @@ class FlexibleSegmentSettings:
     )
 
     def segment(self, name: str, damping: float, link_division: int) -> Segment:
-        """Build the `Segment` with a name; each link is divided into `link_division` at equal segment stiffness."""
+        """Build the named `Segment`. Each link becomes `link_division` links at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
             hint = "set length or link_lengths"
             raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)

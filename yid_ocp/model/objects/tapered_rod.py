@@ -1,4 +1,4 @@
-"""A round rod that becomes thinner from base to tip, or thicker, such as a fishing rod or a branch."""
+"""A round rod with linearly changing radius, such as a fishing rod or a branch."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 @OBJECT_KINDS.register("tapered_rod")
 @dataclass(frozen=True, kw_only=True)
 class TaperedRod(MountedObjectKind):
-    """A solid round rod whose radius changes linearly from its clamped base to its tip; the segment is called `rod`.
+    """A solid round rod whose radius changes linearly from the clamped base to the tip. The segment is called `rod`.
 
     `rod.bend`, `rod.twist` and `rod.damping` are per curvature at the base; a section of radius r has (r/base radius)^4
     of them. `rod.taper` is the tip's radius over the base's.
@@ -60,7 +60,7 @@ parameters:
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the rod as one segment with the base's radius; `build` then tapers its links."""
+        """Build the rod as one segment with the base's radius. `build` then tapers its links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
         rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_given_as_rigidity=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
