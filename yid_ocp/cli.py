@@ -62,15 +62,15 @@ def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None
     parser.add_argument("config", metavar="CONFIG.yaml", help=what, nargs="?" if optional else None)
     parser.add_argument("--out", metavar="DIR", help="run folder to make (default: runs/NAME-DATE-TIME)")
     text = "set a setting, for example problem.time_step=0.005; a section, 'solver={max_iterations: 9}', merges with "
-    text += "what stands there, an empty one empties it"
+    text += "the existing one, and an empty one clears it"
     _repeated(parser, "--set", "KEY=VALUE", text, "overrides")
     _printing(parser, "run folder's path")
 
 
 def _printing(parser: argparse.ArgumentParser, path: str) -> None:
     _switch(parser, "--quiet", f"print nothing but the {path}")
-    _switch(parser, "--verbose", "list every iteration, also on a terminal, where one line is renewed otherwise")
-    _switch(parser, "--json", "print the result as JSON, errors as well, and nothing else on standard output")
+    _switch(parser, "--verbose", "list every iteration (on a terminal, one line is updated by default)")
+    _switch(parser, "--json", "print only the result, or an error, as JSON on standard output")
 
 
 def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
@@ -79,7 +79,7 @@ def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     _setting(parser, "--strict", "recordings.strict=true", text)
 
 
-def _working(parser: argparse.ArgumentParser, absent: str = "as many as there are processors") -> None:
+def _working(parser: argparse.ArgumentParser, absent: str = "one for each processor") -> None:
     text = f"processes that share the work; {absent} when absent"
     parser.add_argument("--workers", metavar="N", type=int, help=text)
     text = "HOST:PORT of a Dask scheduler, or its scheduler file, whose workers do the work instead"
@@ -94,19 +94,19 @@ def _solve(parser: argparse.ArgumentParser) -> None:
 
 def _diagnose(parser: argparse.ArgumentParser) -> None:
     _doubting(parser, optional=True)
-    text = "run folder of an earlier solve or diagnose of the same model: ask what differs since"
+    text = "run folder of an earlier solve or diagnose of the same model: report what changed since"
     _repeated(parser, "--baseline", "RUN", text)
 
 
 def _identifiability(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
     _switch(parser, "--what-if", "rank changes of the experiment; takes a few minutes")
-    text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all if they are few"
+    text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all, if few"
     parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)
-    _switch(parser, "--initial", "judge at the initial values, without solving")
+    _switch(parser, "--initial", "analyse the initial values, without solving")
     _switch(parser, "--unknown-start", "also estimate the initial states, regardless of the settings")
     _working(parser, "this process alone")
-    _switch(parser, "--unknown-grasp", "judge with the places of grasps estimated along")
+    _switch(parser, "--unknown-grasp", "also estimate offsets of the grasps")
 
 
 def _overrides(parser: argparse.ArgumentParser) -> None:
@@ -116,24 +116,24 @@ def _overrides(parser: argparse.ArgumentParser) -> None:
 
 
 def _blind(parser: argparse.ArgumentParser) -> None:
-    text = "settings of experiments, which are varied as far as there are cases for it; embedded ones when absent"
+    text = "settings of experiments, varied if there are enough cases; embedded ones when absent"
     parser.add_argument("configs", metavar="CONFIG.yaml", nargs="*", help=text)
-    parser.add_argument("--out", metavar="DIR", help="folder of the proof; the same one again does what is not done")
+    parser.add_argument("--out", metavar="DIR", help="folder of the proof; an existing one is completed")
     parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
-    text = "draw an ensemble to set thresholds by, other cases than those that are reported for the same seed"
+    text = "draw an ensemble for setting thresholds, with other cases than the reported one of the same seed"
     _switch(parser, "--calibration", text)
-    text = "judge the finished cases of a proof again, by the thresholds of --set, without a refit"
+    text = "score the finished cases of a proof again with the thresholds of --set, without a refit"
     parser.add_argument("--rescore", metavar="DIR", help=text)
     _overrides(parser)
 
 
 def _batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("configs", metavar="CONFIG.yaml", nargs="+", help="settings of one run each")
-    text = "pattern of recordings in quotes, such as 'fleet/*.h5': a run of every configuration for each of them"
+    text = "pattern of recordings in quotes, such as 'fleet/*.h5': every configuration runs for each of them"
     parser.add_argument("--recordings", metavar="GLOB", help=text)
     parser.add_argument("--command", dest="each", choices=("solve", "diagnose"), default="solve", help="to run")
-    text = "folder of all runs (default: runs/batch-DATE-TIME); the same one again does what is not done yet"
+    text = "folder of all runs (default: runs/batch-DATE-TIME); an existing one is completed"
     parser.add_argument("--out", metavar="DIR", help=text)
     _overrides(parser)
 
@@ -165,8 +165,8 @@ def _import(parser: argparse.ArgumentParser) -> None:
     files += "such as joints and motion capture, become one recording"
     parser.add_argument("files", metavar="FILE", nargs="+", help=files)
     parser.add_argument("--out", metavar="RECORDING.h5", help="recording to write; needed without --preview")
-    _switch(parser, "--preview", "show what there is, and the command that imports it, and write nothing")
-    text = "its section `import` sets the options; flags override it"
+    _switch(parser, "--preview", "show the content and the import command, and write nothing")
+    text = "configuration whose section `import` sets the options; flags override it"
     parser.add_argument("--config", metavar="CONFIG.yaml", help=text)
     _importing(parser)
     _printing(parser, "recording's path")
@@ -174,55 +174,55 @@ def _import(parser: argparse.ArgumentParser) -> None:
 
 def _importing(parser: argparse.ArgumentParser) -> None:
     """Flags that are keys of the section `import`; a list may be split by commas, and its flag repeated."""
-    group = parser.add_argument_group("how files of other tools are read")
+    group = parser.add_argument_group("reading files of other tools")
     listed = (
-        ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are put on one clock"),
-        ("--field", "fields", "CHANNEL=/TOPIC.FIELD", "of a bag: array of any message, joints are called 1, 2, ..."),
-        ("--joints", "joints", "NAME[=NEW]", "joints to keep, in this order, and what they are called in the URDF"),
+        ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are merged on one clock"),
+        ("--field", "fields", "CHANNEL=/TOPIC.FIELD", "of a bag: array of any message; joints are named 1, 2, ..."),
+        ("--joints", "joints", "NAME[=NEW]", "joints to keep, in this order, and their names in the URDF"),
         ("--points", "points", "SOURCE=POINT", "topic, TOPIC:FRAME of /tf, marker or stem, and its point: cable:100%%"),
         ("--columns", "columns", "COLUMN=MEANING", "of a table: t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),
-        ("--units", "units", "UNIT", "deg, mm, ms, or QUANTITY=UNIT, of what is not SI"),
+        ("--units", "units", "UNIT", "units that are not SI: deg, mm, ms, or QUANTITY=UNIT"),
         ("--torque-constants", "torque_constants", "JOINT=N_M_PER_A", "where the efforts are currents; * is any text"),
-        ("--clock-offset", "clock_offsets", "FILE=SECONDS", "of several files: added to the times of one, by its stem"),
+        ("--clock-offset", "clock_offsets", "FILE=SECONDS", "of several files: added to the times of the named one"),
         ("--gears", "gears", "JOINT=RATIO", "turns of the motor per turn of the joint"),
     )
     for flag, key, shape, text in listed:
         group.add_argument(flag, dest=key, metavar=f"{shape},...", action="append", default=[], help=text)
     text = "of a bag: topic of joint states whose positions are commands"
     group.add_argument("--command-topic", metavar="TOPIC", help=text)
-    text = "of a bag: make points so far along the axes of every pose [m]"
+    text = "of a bag: make points at this distance along the axes of every pose [m]"
     group.add_argument("--pose-axis-point-distance", type=float, metavar="METRES", help=text)
-    text = "of a table: its first row holds numbers"
+    text = "of a table: the first row holds numbers, not names"
     group.add_argument("--no-header", dest="header", action="store_const", const=False, help=text)
-    text = "of a table: leave lines that are no numbers out, and count them"
+    text = "of a table: skip and count lines that are not numbers"
     group.add_argument("--skip-bad-lines", action="store_const", const=True, help=text)
-    group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: between its cells")
-    group.add_argument("--episode", type=int, metavar="NUMBER", help="of a LeRobot dataset; 0 when absent")
+    group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: character between cells")
+    group.add_argument("--episode", type=int, metavar="NUMBER", help="episode of a LeRobot dataset; 0 when absent")
     group.add_argument("--clock", choices=("recorded", "nominal"), help="of a table: whether its times were measured")
-    group.add_argument("--point-sensor-name", metavar="TEXT", help="what saw the points")
+    group.add_argument("--point-sensor-name", metavar="TEXT", help="name of the sensor of the points")
     group.add_argument("--frame", metavar="TEXT", help="frame of reference of the points, of a table or C3D file")
 
 
 def _init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("robot", metavar="ROBOT", help="URDF or MJCF file, or package:NAME such as package:ur5")
-    text = "recordings of it, or files that `import` understands; several: the last ones are held out"
+    text = "recordings, or files for `import`; of several the last ones are held out"
     parser.add_argument("files", metavar="FILE", nargs="+", help=text)
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
-    _switch(parser, "--replace", "write over files that are there")
-    text = "what is held, such as cable, beam, tree or foam_y; an unknown word lists all; "
+    _switch(parser, "--replace", "overwrite existing files")
+    text = "held object, such as cable, beam, tree or foam_y; an unknown word lists all; "
     text += "without it the arm alone, with a payload"
     parser.add_argument("--object", metavar="KIND", help=text)
     for name, unit in (("length", "m"), ("mass", "kg"), ("radius", "m")):
-        text = f"of the object, of each equal branch [{unit}]"
+        text = f"{name} of the object, or of each equal branch [{unit}]"
         parser.add_argument(f"--{name}", type=float, metavar="NUMBER", help=text)
     parser.add_argument("--section", metavar="X,Y", help="extents of a rectangular cross section [m], not a radius")
-    _repeated(parser, "--number", "NAME=VALUE", "further number of some kinds of objects; an unknown name lists them")
+    _repeated(parser, "--number", "NAME=VALUE", "further number of an object; an unknown name lists them")
     parser.add_argument("--links", type=int, metavar="NUMBER", help="rigid links of each segment")
-    parser.add_argument("--branches", type=int, metavar="NUMBER", help="of a tree: equal ones, in a star")
+    parser.add_argument("--branches", type=int, metavar="NUMBER", help="of a tree: number of equal branches in a star")
     text = "of a tree: NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW]; NAME@PARENT grows on PARENT's end"
     _repeated(parser, "--branch", "BRANCH", text)
-    parser.add_argument("--holder", metavar="FRAME", help="of the robot, that carries the object's root")
-    _repeated(parser, "--grasp", "FRAME=POINT", "what else holds it, such as right_gripper=w_cable")
+    parser.add_argument("--holder", metavar="FRAME", help="frame of the robot that carries the object's root")
+    _repeated(parser, "--grasp", "FRAME=POINT", "further grasp, such as right_gripper=w_cable")
     _importing(parser)
     _printing(parser, "configuration's path")
 
@@ -231,11 +231,11 @@ def _export(parser: argparse.ArgumentParser) -> None:
     text = "recording to write as CSV or MCAP, or run folder of solve or diagnose whose model or signals to write"
     parser.add_argument("source", metavar="RECORDING.h5|RUN", help=text)
     text = "of a recording: csv (default) or mcap; of a run: mjcf (default), urdf, sdf, yaml for a configuration that "
-    text += "starts at the estimates, or mcap for what was measured, predicted and left over"
+    text += "starts at the estimates, or mcap for measurements, predictions and residuals"
     parser.add_argument("--format", metavar="FORMAT", help=text)
     text = "folder for CSV or MCAP files, or file for the model; its manifest is written next to it"
     parser.add_argument("--out", metavar="PATH", required=True, help=text)
-    text = "write a model although the format cannot hold all of it; the manifest lists what is omitted"
+    text = "write a model even if the format cannot hold all of it; the manifest lists omissions"
     parser.add_argument("--lossy", action="store_true", help=text)
     _printing(parser, "files' paths")
 
@@ -243,7 +243,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
 def _report(parser: argparse.ArgumentParser) -> None:
     text = "run folders of solve or diagnose, in the order of time; two of the same recordings are overlaid"
     parser.add_argument("runs", metavar="RUN", nargs="+", help=text)
-    parser.add_argument("--out", metavar="DIR", help="folder to make (default: one of this time in runs)")
+    parser.add_argument("--out", metavar="DIR", help="folder to make (default: a dated one in runs)")
     _printing(parser, "folder's path")
 
 
@@ -318,24 +318,24 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 # -- commands ---------------------------------------------------------------------------------------------------------
 
 _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and experiments that would determine more"
-_SAID_BLIND = "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted"
-_SAID_REPORT = "compare runs of one model: what drifted, which run to distrust; overlay two of the same recordings"
-_SAID_COMPLETION = "print what makes a shell complete commands, options, files and settings"
+_SAID_BLIND = "test the diagnosis on synthetic recordings with sealed effects; resumes an interrupted test"
+_SAID_REPORT = "compare runs of one model: changed parameters, deviating runs; overlay two of the same recordings"
+_SAID_COMPLETION = "print a script that completes commands, options, files and settings in a shell"
 _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"
 COMMANDS = tuple(
     _CliCommand(*row)
     for row in (
         ("init", "write a commented configuration from a robot and recordings of it", "init", _init),
         ("solve", "estimate the free parameters from recordings", "solve", _solve),
-        ("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
+        ("compare", "run several methods on one problem and compare their results", "compare", _doubting),
         ("identifiability", _SAID_IDENTIFIABILITY, "identifiability", _identifiability),
-        ("friction", "say which law of friction the recordings warrant", "friction", _doubting),
-        ("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
+        ("friction", "choose the friction law that the recordings justify", "friction", _doubting),
+        ("diagnose", "test for a gap between model and recordings, and name its cause", "diagnose", _diagnose),
         ("blind", _SAID_BLIND, "blind", _blind),
         ("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
         ("report", _SAID_REPORT, "run_history", _report),
         ("plan", "plan a motion of the arms with the identified model", "plan", _configured),
-        ("simulate", "write what the model says would be recorded", "simulate", _simulate),
+        ("simulate", "simulate a recording with the model", "simulate", _simulate),
         ("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
         ("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
         ("track", "measure the object's points in the frames of a depth camera", "track", _track),
@@ -374,7 +374,7 @@ class _Parser(argparse.ArgumentParser):
         raise ConfigError(message, where=self.prog, hint=self._help())
 
     def _help(self) -> str:
-        return f"{self.prog} --help says what it takes"
+        return f"see {self.prog} --help"
 
 
 def build_argument_parser() -> argparse.ArgumentParser:

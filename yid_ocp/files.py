@@ -48,11 +48,11 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         raise DataError("the file cannot be read (Permission denied)", where=str(path), allowed=allowed, hint=hint)
     if not stat.S_ISREG(info.st_mode):
         what = "this is a folder" if stat.S_ISDIR(info.st_mode) else "this is a pipe or a device"
-        raise DataError(what, where=str(path), allowed=allowed, hint="copy what it gives into a file")
+        raise DataError(what, where=str(path), allowed=allowed, hint="copy its output into a file")
     if max_bytes is not None and info.st_size > max_bytes:
-        what = f"the file has {info.st_size / 2**20:.0f} MiB, more than can be meant"
+        what = f"the file has {info.st_size / 2**20:.0f} MiB, more than allowed"
         allowed = f"at most {max_bytes / 2**20:.0f} MiB"
-        raise DataError(what, where=str(path), allowed=allowed, hint="see whether it is the right file")
+        raise DataError(what, where=str(path), allowed=allowed, hint="check that it is the right file")
     return path
 
 
@@ -82,7 +82,7 @@ def check_max_input_numbers(count: int, where: str) -> None:
     """Raise `DataError` if an input file holds or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
         allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
-        what = f"the file holds {count / 1e6:.0f} million numbers, more than can be meant"
+        what = f"the file holds {count / 1e6:.0f} million numbers, more than allowed"
         raise DataError(what, where=where, allowed=allowed, hint="cut it into several shorter recordings")
 
 

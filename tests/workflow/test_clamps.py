@@ -110,7 +110,7 @@ def test_a_moved_clamp_carries_the_object_and_stands_in_what_is_simulated(tmp_pa
 
 def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):
     run = settings(tmp_path, None, ("recordings.estimate=[]", "model.frames={}"))
-    with pytest.raises(ConfigError, match="nothing moves an object without a robot"):
+    with pytest.raises(ConfigError, match="an object without a robot needs a recording that moves it"):
         run_simulate(run, tmp_path / "made")
 
 

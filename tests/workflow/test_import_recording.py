@@ -180,7 +180,7 @@ def test_no_command_is_suggested_that_would_fail(odd: Path, capsys: pytest.Captu
     (odd / "run.csv").write_text("t,bend\n0,1\n1,2\n")
     assert main(["import", "run.csv", "--preview"]) == 0
     told = capsys.readouterr().out
-    assert "to import it, something has to be said first" in told
+    assert "the import needs more information" in told
     assert "yid-ocp import" not in told
 
 

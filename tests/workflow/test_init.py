@@ -118,7 +118,7 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
 ) -> None:
     """Arm, unbent object and markers in motion, markers under the names of their frames, so that lines join the two."""
     assert init(*CABLE) == 0
-    assert "picture of what was guessed: run.html" in capsys.readouterr().out
+    assert "picture of the guesses: run.html" in capsys.readouterr().out
     page = Path("run.html").read_text()
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
     model, measured = scene["scenes"][0]["motions"]

@@ -80,7 +80,7 @@ def batch_runs_from_configs(
     if recordings is not None:
         files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
         if not files:
-            advice = "put the pattern in quotes, so that the shell leaves it alone, and check the folder"
+            advice = "put the pattern in quotes, so that the shell does not expand it, and check the folder"
             allowed = "a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder"
             raise ConfigError("no recording matches", where=f"--recordings {recordings}", allowed=allowed, hint=advice)
         entries = []
@@ -205,8 +205,8 @@ def _folder(path: Path) -> Path:
     folder = path.expanduser().absolute()
     try:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / _TASKS_FOLDER).is_dir():
-            allowed = "a new name, an empty folder, or the folder of a batch, which goes on"
-            what = "the folder holds something that is no batch"
+            allowed = "a new name, an empty folder, or the folder of a batch to complete"
+            what = "the folder is not empty and not a batch"
             raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another name with --out")
         (folder / _RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:

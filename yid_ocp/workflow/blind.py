@@ -109,7 +109,7 @@ def run_blind(
         progress.begin_stage("scoring")
         best = proof.best_closures(cases, labels, answers)
     except KeyboardInterrupt:
-        log.warning("finished cases are in %s; the same command goes on with the others", proof.folder)
+        log.warning("finished cases are in %s; the same command resumes with the others", proof.folder)
         raise
     marks = [
         blind_scores.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
@@ -440,7 +440,7 @@ class _BlindExperiment:
         varied, run = EXPERIMENT_VARIATIONS[self.variation], load_config(self.config_file)
         first = read_recordings_of_role(run, count=1)
         if not first:
-            what = "there is no recording that says where the arms begin"
+            what = "there is no recording with the start of the arms"
             raise run.config_error(what, "recordings", "estimate", hint="list one")
         system = build_system(self.simulation_settings())
         vision = not varied.is_without_object and any(group.pose is not None for group in first[0].points)
@@ -455,7 +455,7 @@ class _BlindExperiment:
                 continue  # the motion throws the object about; draw another
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
-        hint = "an object that is thrown about needs more damping, or a start of its arms in which it hangs calm"
+        hint = "give the object more damping, or start the arms where it hangs at rest"
         what = f"none of {blind.MAX_CASE_DRAWS} motions can be simulated"
         raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
 

@@ -209,11 +209,11 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
 def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
     if said.kind != "law":
         if said.table is not None or said.depends_on is not None:
-            raise ConfigError(f"{said.kind} has no table", hint="a law has; its kind is law")
+            raise ConfigError(f"{said.kind} has no table", hint="only a law has it; its kind is law")
         return make_effect(said.kind, said.location, system, dict(said.values))
     if said.table is None or said.depends_on is None or said.values:
-        hint = "state depends_on and table, and no values: they stand in the table"
-        raise ConfigError("a law needs its table and what it depends on", hint=hint)
+        hint = "state depends_on and table, and no values"
+        raise ConfigError("a law needs table and depends_on", hint=hint)
     return make_law(said.location, system, read_law_tables(Path(said.table), said.depends_on))
 
 
@@ -429,7 +429,7 @@ def marker_positions_from_reference_pose(
     if not names:
         return {}
     if run.model.object is not None and not run.model.object.is_root_fixed_in_world:
-        what = "the object moves with what carries it, so `marker_reference_pose` does not say where it was"
+        what = "the object's mount moves, so `marker_reference_pose` does not determine its place"
         where = ("model", "frames", names[0], "marker_reference_pose")
         hint, allowed = f"give model.frames.{names[0]}.xyz instead", "an object whose mount stands in the world"
         raise run.config_error(what, *where, allowed=allowed, hint=hint)
@@ -444,7 +444,7 @@ def marker_positions_from_reference_pose(
         group = recording.points[0].names if recording.points else ()
         if recording.marker_reference_pose is None:
             hint = f"record them, or give model.frames.{names[0]}.xyz in place of marker_reference_pose: true"
-            what = "the recording does not say where its markers were while the object was held straight"
+            what = "the recording has no positions of its markers with the object held straight"
             allowed = "positions of the points of its first group, shape (np, 3) [m]"
             raise DataError(what, where=f"{recording.name}: straight", allowed=allowed, hint=hint)
         found[recording.name] = {}

@@ -214,7 +214,7 @@ def _refuse_losses(
     lost += [f"grasp {name}" for name in grasps]
     if lost and not is_lossy:
         what = f"{form.upper()} cannot hold {', '.join(lost)}"
-        hint = "accept a file without them by --lossy; its manifest says why of each"
+        hint = "accept a file without them by --lossy; its manifest has the reasons"
         raise ConfigError(what, where=f"--format {form}", allowed="a format that holds all, or --lossy", hint=hint)
 
 

@@ -39,7 +39,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             if len(kinds) < 2:
                 allowed = "two recordings or more in which the motors are on"
                 hint = "list more under recordings.estimate or recordings.held_out"
-                what = "a law is judged by motions it was not fitted to, and there is one"
+                what = "a law is tested on motions that are not fitted, and there is only one motion"
                 raise DataError(what, allowed=allowed, hint=hint)
             solution = solve(problem, run.solver, restarts=False)
             if solution.status == Status.FAILED:
@@ -48,7 +48,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             fits.append(friction_ladder.cross_validate_friction_law(law, problem, solution, kinds))
             solved[law] = (settings, problem, solution)
         if not fits:
-            raise DataError("no friction law could be fitted", hint="look at `yid-ocp check` of this configuration")
+            raise DataError("no friction law could be fitted", hint="run `yid-ocp check` with this configuration")
         best = friction_ladder.simplest_fit_within_std_error(fits, kinds)
         settings, problem, solution = solved[best.law]
         names = friction_parameter_names(settings, problem.system.parameters)

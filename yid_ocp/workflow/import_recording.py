@@ -66,7 +66,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         return _preview(arguments, asked)
     if arguments.out is None:
         allowed = "--out RECORDING.h5, or --preview to look only"
-        raise ConfigError("nothing says where to write the recording", where="--out", allowed=allowed)
+        raise ConfigError("the recording to write is not named", where="--out", allowed=allowed)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
     with stderr_progress_display(arguments) as progress:
@@ -75,7 +75,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         if len(files) > 1:
             recording = replace(_merged(files, options, offsets, progress), name=Path(arguments.out).stem)
         elif offsets:
-            raise ConfigError("a clock offset is between files, and there is one", where="--clock-offset")
+            raise ConfigError("a clock offset needs several files", where="--clock-offset")
         else:
             recording = read_third_party_recording(files[0], options, progress)
         write_recording(recording, arguments.out)
@@ -137,7 +137,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
             recording = read_any(files[0], progress=progress, **options)
     except DataError as error:
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
-        return ["", f"to import it, something has to be said first: {error.what}", *more]
+        return ["", f"the import needs more information: {error.what}", *more]
     doubts = recording_doubt_lines(recording)
     what = "it" if len(files) == 1 else "them as one recording"
     return [*doubts, "", f"to import {what}:", f"  {_import_command_line(files, options)}"]

@@ -191,7 +191,7 @@ def _summary_lines(
     ]
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
-    picture = [f"picture of what was guessed: {out.with_suffix('.html')}"] if has_picture else []
+    picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
     for signals, kinds in effect_kinds_without_recorded_signals(recordings).items():
         lines.append(f"diagnose does not try {', '.join(kinds)}: nothing was recorded of {signals}")
     lines += [*picture, "", f"next: yid-ocp check {out}, then yid-ocp solve {out}"]
@@ -263,7 +263,7 @@ def _config_lines(
     yield ""
     yield "problem:"
     step, cutoff = f"{proposal.time_step:g}", f"{proposal.path_cutoff:.3g}"
-    yield _line("  ", "time_step", step, "[s]; `check` says how far estimates move with half of it")
+    yield _line("  ", "time_step", step, "[s]; `check` reports the effect of half of it")
     yield _line("  ", "initial_state", proposal.initial_state, proposal.initial_state_reason)
     yield _line("  ", "path_cutoff", cutoff, "low-pass of prescribed motion [Hz], above what the arm does")
     yield ""
@@ -316,15 +316,15 @@ def _arms(proposal: ProposedConfigChoices) -> Iterator[str]:
     if unused or not set(proposal.unrecorded_joints) <= set(proposal.joints):
         yield "    # all other joints of the URDF stay at zero; another value: locked_joints: {JOINT: VALUE} [rad or m]"
     yield _line("    ", "mode", mode, proposal.arm_mode_reason)
-    other = "prescribed moves it as its encoders say"
+    other = "prescribed: the arm follows its encoders"
     if mode == "prescribed":
-        other = "driven moves the arm by its efforts instead, under a tracking filter: for efforts one trusts"
+        other = "driven: its efforts move the arm, with a tracking filter; for reliable efforts"
     yield f"{' ' * _COMMENT_COLUMN}# {other}"
     if mode == "servo":
         yield _line("    ", "servo", "", "their gains, dampings, delays and limits are parameters, below")
         held = "until the next; interpolated: straight lines in between"
         yield _line("      ", "command_interpolation", "held", held)
-        carried = "true where the controller carries the arm's own weight"
+        carried = "true if the controller compensates the arm's weight"
         yield _line("      ", "has_gravity_compensation", "false", carried)
         known = f"{{kind: dc, preset: {proposal.motor_preset or next(iter(MOTOR_PRESETS))}}}"
         words = "published figures to begin with"
@@ -348,12 +348,12 @@ def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterato
         yield f"    mount: {{parent_frame: {_text(holder)}, xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}}"
     yield from _settings_lines("    ", item.settings)
     if grasps:
-        yield _line("  ", "grasp", "", "what else holds it: point 3, axis 5, weld 6 equations")
+        yield _line("  ", "grasp", "", "further grasp: point 3, axis 5, weld 6 equations")
     for i, (frame, point) in enumerate(grasps.items()):
         yield f"    grasp_{i + 1}: {{holder_frame: {_text(frame)}, held_frame: {_text(point)}, kind: point}}"
     dampings = [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")]
     if dampings:
-        yield _line("  ", "damping", f"{{object: {max(dampings):.2g}}}", "where the search for it starts [N m^2 s]")
+        yield _line("  ", "damping", f"{{object: {max(dampings):.2g}}}", "initial value of the search [N m^2 s]")
     else:
         yield _line("  ", "damping", "0.05", "viscous, of every coordinate [N m s/rad]")
     tips = [f"w_{segment.name}" for segment in item.settings.build_segments()]
@@ -361,7 +361,7 @@ def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterato
     marked = [place.frame for places in of_points for place in places if place.frame]
     wanted = dict.fromkeys([*tips, *marked, *grasps.values()])
     if set(wanted) > set(tips):
-        yield from _listed("  ", "points", wanted, "frames that sensors may see; NAME:40% along a segment")
+        yield from _listed("  ", "points", wanted, "frames for sensors; NAME:40% along a segment")
 
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
@@ -399,7 +399,7 @@ def _friction(proposal: ProposedConfigChoices) -> Iterator[str]:
 def _effects(proposal: ProposedConfigChoices) -> Iterator[str]:
     kinds: dict[str, str] = {}
     if proposal.arm_mode == "servo" or (proposal.is_identified_from_efforts and not proposal.has_object):
-        kinds["rotor_inertia"] = "what rotors add through their gears"
+        kinds["rotor_inertia"] = "inertia of the rotors after their gears"
     if proposal.is_identified_from_efforts and "joints.effort" in proposal.noise_by_group:
         kinds["effort_offset"] = "the zero of every torque sensor"
     if not kinds:
@@ -418,9 +418,9 @@ def _recording_lines(files: Sequence[str], imports: Mapping[str, Any]) -> Iterat
     yield "recordings:"
     yield from _listed("  ", "estimate", files[: len(files) - held], "to estimate on")
     if held:
-        yield from _listed("  ", "held_out", files[-held:], "only predicted, to see whether the model is right")
+        yield from _listed("  ", "held_out", files[-held:], "only predicted, to test the model")
     else:
-        yield "  # record a second motion and list it here: without one nothing shows whether the model is right"
+        yield "  # record a second motion and list it here: it tests whether the model is right"
         yield "  held_out: []"
     if imports:
         yield ""

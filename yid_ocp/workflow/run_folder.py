@@ -203,7 +203,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
             allowed, hint = "no such folder, or one that a run left", "move it away, or choose another --out"
-            what = "a hidden folder of this run's name is not a run's"
+            what = "the hidden folder with this run's name was not made by a run"
             raise OutputError(what, where=str(temporary), allowed=allowed, hint=hint)
         lock = _locked(temporary)
         if lock is None:
@@ -214,7 +214,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
             continue
         _remove_all_but_lock(temporary)
         return target, lock
-    hint, allowed = "choose another name with --out, or wait for the other run", "a name of its own for every run"
+    hint, allowed = "choose another name with --out, or wait for the other run", "another name for every run"
     raise OutputError("another run is making this folder", where=str(targets[0]), allowed=allowed, hint=hint)
 
 
@@ -278,7 +278,7 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
         return [parent / name for name in (stem, *(f"{stem}-{i}" for i in range(2, _NAMES)))]
     allowed = "a new name, or an empty folder"
     if not str(out).strip() or "\0" in str(out):
-        raise OutputError("this is no name of a folder", where="--out", allowed=allowed)
+        raise OutputError("this is not a valid folder name", where="--out", allowed=allowed)
     try:
         target = Path(out).expanduser().absolute()
         is_link, is_folder = target.is_symlink(), target.is_dir()

@@ -116,7 +116,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
-        raise DataError("the file is no result of a run", where=str(file), hint="run it again")
+        raise DataError("the file is not a result of a run", where=str(file), hint="run it again")
     if result.get("format") in _OLD_FORMATS:
         what = f"the run is of an earlier version ({result['format']}), whose keys had other names"
         what, hint = f"{what}; {_RENAMED_KEYS_HINT}", "diagnose again with this version"
@@ -241,7 +241,7 @@ def require_recordings_not_in_baseline(
             what = f"{episode.name} is a recording of the baseline too, and would count twice"
             if not runs or run.recordings.reference_recordings:
                 where = ("recordings", "reference_recordings")
-                what = f"{episode.name} is among the recordings made without what is looked for"
+                what = f"{episode.name} is one of the reference recordings"
             raise run.config_error(what, *where, allowed="recordings of another time")
 
 

@@ -72,9 +72,9 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
     if run.model.robot is None:
-        allowed = "a recording whose start, clamps and times are taken over"
+        allowed = "a recording with the start, clamps and times to use"
         hint = "list one, or set model.robot for a virtual experiment"
-        what = "nothing moves an object without a robot by itself"
+        what = "an object without a robot needs a recording that moves it"
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint=hint)
     progress.begin_stage("simulating a virtual experiment in MuJoCo")
     simulation = SimulationOptions(run.problem.duration or _DEFAULT_DURATION)

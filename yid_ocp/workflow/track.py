@@ -76,7 +76,7 @@ def _run_track(
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.settings, system)
                 doubts = [] if recording is None else recording_quality_issues_with_model(run, system, recording)
-                progress.begin_stage("finding what is common to the frames")
+                progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_sequence_calibration()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
