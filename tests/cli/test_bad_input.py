@@ -26,7 +26,7 @@ def test_very_many_keys_are_refused_before_the_work(cli, tmp_path):
     (tmp_path / "long.yaml").write_text("".join(f"k{i}: 1\n" for i in range(50_000)))
     assert_refused(cli("check", tmp_path / "long.yaml"), "more than 20000 entries", "long.yaml, line")
     (tmp_path / "long.yaml").write_text("# " + "x" * (1 << 20))
-    assert_refused(cli("check", tmp_path / "long.yaml"), "more than can be meant", "at most 1 MiB")
+    assert_refused(cli("check", tmp_path / "long.yaml"), "more than allowed", "at most 1 MiB")
 
 
 def test_a_path_with_a_nul_is_refused(cli, pendulum, tmp_path):

@@ -408,4 +408,4 @@ def test_metadata_of_a_bag_that_take_long_are_refused(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap folder", arm_and_camera())
     with (path / "metadata.yaml").open("a") as file:
         file.write("more: [" + "1, " * 100_000 + "1]\n")
-    refused(path, "more than can be meant")
+    refused(path, "more than allowed")

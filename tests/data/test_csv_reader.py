@@ -158,7 +158,7 @@ def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monk
     with file.open("a") as more:
         more.write("9,9\n")
     for read in (read_csv, preview_file):
-        with pytest.raises(DataError, match="more than can be meant"):
+        with pytest.raises(DataError, match="more than allowed"):
             read(file)
 
 

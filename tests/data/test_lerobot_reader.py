@@ -204,7 +204,7 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
 def test_a_table_too_large_or_damaged_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists
-    with pytest.raises(DataError, match="more than can be meant"):
+    with pytest.raises(DataError, match="more than allowed"):
         read_lerobot_episode(path)
     (path / FIRST).write_bytes(b"PAR1 and no more")
     with pytest.raises(DataError, match="table of the episode cannot be read"):

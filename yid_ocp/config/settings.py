@@ -62,7 +62,7 @@ class _FrameSettings(MountSettings):
 class _MeasuredClampSettings:
     """A massless clamp frame whose prescribed motion follows two recorded points."""
 
-    origin_point_name: Annotated[str, OptionInfo("point at which the clamp's origin sits")]
+    origin_point_name: Annotated[str, OptionInfo("point at the clamp's origin")]
     z_axis_point_name: Annotated[str, OptionInfo("point to which its z axis looks, never along the world's x axis")]
     roll_convention: Annotated[
         Literal["level", "transported"],
@@ -87,7 +87,7 @@ class _JointSpringSettings:
     """A spring and damper on one joint of the robot."""
 
     stiffness: Annotated[float, Ge(0), OptionInfo("stiffness", "N m/rad or N/m")]
-    rest_position: Annotated[float, OptionInfo("coordinate at which it is relaxed", "rad or m")] = 0.0
+    rest_position: Annotated[float, OptionInfo("coordinate at which the spring has no torque", "rad or m")] = 0.0
     damping: Annotated[float | None, Ge(0), OptionInfo("viscous; model.damping when absent", "N m s/rad or N s/m")] = (
         None
     )
@@ -100,7 +100,7 @@ class EffectSettings:
     kind: Annotated[str, OptionInfo("kelvin_voigt, joint_coulomb, ..., or law")]
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
     values: Annotated[Mapping[str, float], OptionInfo("quantities that are not neutral")] = field(default_factory=dict)
-    depends_on: Annotated[LawDependence | None, OptionInfo("what the torque of a law depends on")] = None
+    depends_on: Annotated[LawDependence | None, OptionInfo("quantities of a law")] = None
     table: Annotated[_FilePath | None, OptionInfo("table of a law, as law.csv of a diagnosis")] = None
 
 
@@ -125,7 +125,7 @@ class JointActuationSettings:
         default_factory=dict
     )
     exclude_links: Annotated[
-        _Names, OptionInfo("links of the URDF left out with all that hangs on them, such as a hand not mounted")
+        _Names, OptionInfo("links of the URDF to exclude with all links on them, such as a hand that is not mounted")
     ] = ()
 
 
@@ -156,14 +156,12 @@ class ModelSettings:
     ] = None
     moving_clamps: Annotated[
         Mapping[str, _MeasuredClampSettings],
-        OptionInfo("what moves an object without a robot, by name; a cable has its own at both ends"),
+        OptionInfo("clamps that move an object without a robot, by name; a cable has its own at both ends"),
     ] = field(default_factory=dict)
     arms: Annotated[JointActuationSettings, OptionInfo("the robot's joints")] = JointActuationSettings()
     frames: Annotated[
         Mapping[str, _FrameSettings],
-        OptionInfo(
-            "more frames, by name, on robot, object or world: a tool's tip, the middle of what a hand holds, a marker"
-        ),
+        OptionInfo("further frames, by name, on robot, object or world: a tool's tip, a marker"),
     ] = field(default_factory=dict)
     object: Annotated[
         ObjectKind | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
@@ -201,13 +199,13 @@ class RecordingsSettings:
     """Recordings for estimation, held-out prediction and reference."""
 
     estimate: Annotated[_Recordings, OptionInfo("to estimate on")] = ()
-    held_out: Annotated[_Recordings, OptionInfo("only predicted, never touched by the fit")] = ()
+    held_out: Annotated[_Recordings, OptionInfo("only predicted, never fitted")] = ()
     reference_recordings: Annotated[
         _Recordings,
-        OptionInfo("made without what a diagnosis finds, which it then predicts; those of its baseline when absent"),
+        OptionInfo("recordings without the diagnosed effect, predicted as a test; those of the baseline when absent"),
     ] = ()
     strict: Annotated[
-        bool, OptionInfo("whether any doubt about a recording stops the run; --strict on the command line")
+        bool, OptionInfo("whether any issue of a recording stops the run; --strict on the command line")
     ] = False
 
 
@@ -216,7 +214,7 @@ class ImportSettings:
     """Conversion of another tool's file by `import`; a command-line flag overrides its key here."""
 
     joint_topics: Annotated[
-        _Names | None, OptionInfo("of a bag: topics of joint states, put on one clock; all when absent")
+        _Names | None, OptionInfo("of a bag: topics of joint states, merged on one clock; all when absent")
     ] = None
     command_topic: Annotated[
         str | None, OptionInfo("of a bag: topic of joint states whose positions are commands, not measurements")
@@ -235,7 +233,7 @@ class ImportSettings:
         float | None,
         Gt(0),
         Le(10),
-        OptionInfo("how far along a pose's axes points NAME_x, NAME_y, NAME_z are made", "m"),
+        OptionInfo("distance of the points NAME_x, NAME_y, NAME_z along the axes of a pose", "m"),
     ] = None
     columns: Annotated[
         _Texts, OptionInfo("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip")
@@ -243,7 +241,7 @@ class ImportSettings:
     header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2 and so on")] = (
         None
     )
-    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether lines that are no numbers are left out")] = (
+    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether lines that are not numbers are skipped")] = (
         None
     )
     delimiter: Annotated[
@@ -263,11 +261,11 @@ class ImportSettings:
         _Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent")
     ] = None
     clock_offsets: Annotated[
-        _Numbers, OptionInfo("of several files: what is added to the times of each, by the stem of its name", "s")
+        _Numbers, OptionInfo("of several files: time added to those of each file, by the stem of its name", "s")
     ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
     clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
-    point_sensor_name: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
+    point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor of the points")] = None
     frame: Annotated[str | None, OptionInfo("frame of reference of the points, of a table or C3D file")] = None
 
 
@@ -275,13 +273,13 @@ class ImportSettings:
 class ParameterSettings:
     """Initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
 
-    initial: Annotated[float | None, OptionInfo("value, or where the search starts", "that of the parameter")] = None
+    initial: Annotated[float | None, OptionInfo("value, or start of the search", "that of the parameter")] = None
     bounds: Annotated[tuple[float, float] | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
     free: Annotated[bool | None, OptionInfo("whether it is estimated")] = None
     prior_std: Annotated[
         float | None, Gt(0), OptionInfo("standard deviation of a Gaussian prior", "that of the parameter")
     ] = None
-    per_recording: Annotated[bool | None, OptionInfo("whether it has a value of its own in every recording")] = None
+    per_recording: Annotated[bool | None, OptionInfo("whether it has a separate value in every recording")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,7 +314,7 @@ class DiagnosisSettings(Thresholds):
         float,
         Gt(0),
         Le(1),
-        OptionInfo("part of all stated std, torques' included, that is noise, the rest represents model error"),
+        OptionInfo("part of all stated std, torques' included, that is noise; the rest represents model error"),
     ] = 1.0
     baseline: Annotated[
         tuple[_FilePath, ...],
@@ -352,12 +350,10 @@ class _CompareSettings:
     time_budget: Annotated[
         float | None,
         Gt(0),
-        OptionInfo(
-            "time of all methods together, beyond which they are stopped; the answer of `solve` takes more", "s"
-        ),
+        OptionInfo("time for all methods together, without the run of `solve`", "s"),
     ] = 300.0
     reference_paper_experiment_name: Annotated[
-        str | None, OptionInfo("experiment of the source paper whose result is shown for comparison")
+        str | None, OptionInfo("experiment of Caldwell et al. (2014) whose result is shown for comparison")
     ] = None
 
 
@@ -371,13 +367,13 @@ class _VirtualFramesSettings:
         float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
     ] = 0.11
     gripper_start_offsets: Annotated[
-        Mapping[str, _Vector3], OptionInfo("by grasp: where it starts beside the end of the undeformed object", "m")
+        Mapping[str, _Vector3], OptionInfo("by grasp: its start relative to the end of the undeformed object", "m")
     ] = field(default_factory=dict)
     camera_position: Annotated[_Vector3, OptionInfo("the camera's pose", "m")] = (2.6, 0.0, 0.45)
     camera_target: Annotated[_Vector3, OptionInfo("where it looks", "m")] = (0.85, 0.0, -0.1)
     frame_rate: Annotated[float, Gt(0), Le(60), OptionInfo("mean rate of frames", "Hz")] = 3.0
     dropped_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
-    latency: Annotated[float, OptionInfo("stamp minus time of the picture", "s")] = 0.0
+    latency: Annotated[float, OptionInfo("stamp minus time of the image", "s")] = 0.0
     latency_std: Annotated[float, Ge(0), OptionInfo("standard deviation of the latency", "s")] = 0.0
     outlier_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of pixels with a wrong depth")] = 0.0
 
@@ -392,9 +388,7 @@ class _TrackSettings:
             "folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"
         ),
     ] = None
-    frame_topic: Annotated[str | None, OptionInfo("of the clouds or depth images in a bag, where it has several")] = (
-        None
-    )
+    frame_topic: Annotated[str | None, OptionInfo("topic of the clouds or depth images, if a bag has several")] = None
     camera_pose: Annotated[
         tuple[_Vector4, _Vector4, _Vector4, _Vector4] | None,
         OptionInfo("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
@@ -412,8 +406,8 @@ class _TrackSettings:
     write_virtual_frames: Annotated[
         bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")
     ] = False
-    n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("frames of which every stage is drawn")] = 2
-    options: Annotated[TrackOptions, OptionInfo("filters, skeleton, fit, clock and what counts as good")] = field(
+    n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("number of frames of which every stage is drawn")] = 2
+    options: Annotated[TrackOptions, OptionInfo("filters, skeleton, fit, clock and acceptance of frames")] = field(
         default_factory=TrackOptions
     )
 
@@ -435,14 +429,12 @@ class _PlanSettings(PlanOptions):
 class OutputSettings:
     """Settings of run folders, the report and the discretisation check."""
 
-    runs_folder: Annotated[
-        _FilePath | None, OptionInfo("in which run folders are made; `runs` in the working folder")
-    ] = None
+    runs_folder: Annotated[_FilePath | None, OptionInfo("folder of run folders; `runs` in the working folder")] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
     discretisation_check_mode: Annotated[
         Literal["none", "time_step", "both"] | None,
         OptionInfo(
-            "what `solve` refines to see how far estimates move: the time step, the links as well; both for an object "
+            "refinement by which `solve` tests the estimates: the time step, or the links too; both for an object "
             "of segments and the time step for any other when absent"
         ),
     ] = None
@@ -458,7 +450,7 @@ class RunSettings:
     ] = ()
     model: Annotated[ModelSettings, OptionInfo("the kind of synthetic world")] = ModelSettings()
     recordings: Annotated[RecordingsSettings, OptionInfo("the data")] = RecordingsSettings()
-    import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()
+    import_: Annotated[ImportSettings, OptionInfo("conversion of other tools' files to recordings")] = ImportSettings()
     sensors: Annotated[
         Mapping[str, SensorOptions],
         OptionInfo("by group of the recordings: points, joints.effort, motors.current, wrist.force"),
@@ -466,13 +458,13 @@ class RunSettings:
     parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
         default_factory=dict
     )
-    problem: Annotated[ProblemSettings, OptionInfo("what is compared with the recordings and how")] = ProblemSettings()
+    problem: Annotated[ProblemSettings, OptionInfo("residual of the estimation problem")] = ProblemSettings()
     solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("how the cost is lowered")] = field(
         default_factory=GaussNewton
     )
     compare: Annotated[_CompareSettings, OptionInfo("which methods are compared")] = _CompareSettings()
     diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = DiagnosisSettings()
-    track: Annotated[_TrackSettings, OptionInfo("how a camera's frames are tracked")] = _TrackSettings()
+    track: Annotated[_TrackSettings, OptionInfo("tracking of a camera's frames")] = _TrackSettings()
     plan: Annotated[_PlanSettings, OptionInfo("which motion is planned")] = _PlanSettings()
     output: Annotated[OutputSettings, OptionInfo("where results go")] = OutputSettings()
     name: str = "run"  # stem of the configuration file

@@ -73,7 +73,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
             start, stop = float(t[begin]), float(t[end])
             what = f"{channel} repeats one value for {stop - start:.3g} s"
             what += f", while its velocity turns it by {turned:.2g} rad" if turned > unseen else ""
-            advice = "leave that stretch or that channel out, and look at the sensor"
+            advice = "exclude this part or this channel, and check the sensor"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
@@ -146,7 +146,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
             what = f"{channel} moves in steps of {step:.3g}, which is noise of {size:.2g}"
             what += f"; {stated:.2g} is stated" if stated else ""
             ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
-            advice, line = "state the noise that the steps make, or record with more digits", f"{setting}: {size:.2g}"
+            advice, line = "state the noise of the steps, or record with more digits", f"{setting}: {size:.2g}"
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
@@ -198,7 +198,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
         what = f"{channel} has noise of {seen_of[channel]:.2g} or less; {stated:.2g} is stated"
         what += f", and so for {len(low)} of {len(entries)} channels" if len(low) > 1 else ""
         ratio = stated / most[channel]
-        advice = "state the noise that is there: as stated every ± is too wide, and a small gap is not seen"
+        advice = "state the actual noise: as stated every ± is too wide, and a small gap is not detected"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
         yield Issue("noise_overstated", what, "warning", ratio, advice, "", group, channel, setting=setting)
@@ -331,40 +331,40 @@ class Issue:
 ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = {
     "time_unit": "times are not in seconds",
     "time_scale": "the clock runs too fast or too slowly",
-    "clock_base": "clocks of two groups have nothing in common",
+    "clock_base": "clocks of two groups do not overlap",
     "clock_offset": "the clock of one group is late or early",
     "clock_drift": "the clocks of two groups run apart",
     "clock_jump": "the clock jumps",
-    "gap": "a gap in what drives the model",
+    "gap": "a gap in the data that drive the model",
     "dropped_samples": "many samples are missing",
     "few_samples": "too few samples",
     "standstill": "nothing moves",
     "stuck": "a channel repeats one value",
     "quantised": "a channel has steps larger than its noise",
-    "saturated": "a channel is cut off at its extreme",
+    "saturated": "a channel is saturated",
     "noise": "more noise than stated",
     "noise_overstated": "less noise than stated",
     "same_data": "the same data twice",
     "degrees": "angles are in degrees",
-    "angle_scale": "an angle is multiplied by something",
+    "angle_scale": "an angle has the wrong scale",
     "angle_sign": "an angle has the wrong sign",
     "swapped_joints": "two joints are exchanged",
     "angle_limits": "angles are beyond the joint's limits",
-    "speed_limits": "joints turn faster than they can",
+    "speed_limits": "joints exceed their speed limit",
     "effort_zero": "efforts are zero",
     "effort_sign": "an effort has the wrong sign",
-    "effort_gain": "an effort is multiplied by something",
+    "effort_gain": "an effort has the wrong scale",
     "effort_offset": "an effort's zero is off",
     "effort_lag": "efforts are late",
-    "effort_limits": "efforts are larger than the joint can bear",
-    "effort_unlike": "efforts are not those of this robot",
+    "effort_limits": "efforts exceed the joint's limit",
+    "effort_unlike": "efforts do not fit this robot",
     "point_scale": "lengths are not in metres",
-    "point_mirrored": "points are mirrored or their axes exchanged",
+    "point_mirrored": "points are mirrored or have swapped axes",
     "point_frame": "points are in another frame",
     "point_swapped": "two points are exchanged",
-    "point_reach": "points are where the object cannot be",
+    "point_reach": "points are beyond the object's reach",
     "encoder_offset": "an encoder's zero is off",
-    "point_unlike": "points are not where the robot holds them",
+    "point_unlike": "points do not fit the robot's motion",
     "weak_excitation": "the motion is too weak to determine the free parameters",
     "worse_than_guess": "a prediction without a model has a smaller error",
 }

@@ -101,9 +101,9 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         jumped = fastest * length > _MIN_JUMP_ROTATION and bool(at_once)
     what = f"nothing was recorded of what drives the model for {length:.3g} s"
     if jumped:
-        what = f"the clock jumps by {length - median_sample_period(t):.3g} s while the joints go on as if it had not"
+        what = f"the clock jumps by {length - median_sample_period(t):.3g} s while the joints continue smoothly"
     cause, group = "clock_jump" if jumped else "gap", "joints" if joints is not None else ""
-    advice = "find what lost the samples, or list the part that is wanted as a recording of its own"
+    advice = "find the cause of the loss, or list the wanted part as a separate recording"
     what, begin, end = f"{what}; {said}", float(t[gap]), float(t[gap + 1])
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
@@ -195,7 +195,7 @@ def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
     missing = float(np.sum(small - 1) / np.sum(small))
     if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
         what = f"{100 * missing:.2g} % of the samples of a clock of {1 / base:.4g} Hz are missing"
-        advice = "find what lost them; between those that are left the recorded torques are interpolated"
+        advice = "find the cause; torques are interpolated between the remaining samples"
         ratio = missing / QUALITY_LIMITS.max_missing_fraction
         yield Issue("dropped_samples", what, "warning", ratio, advice, "", "joints", "t")
 

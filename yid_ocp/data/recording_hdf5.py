@@ -326,7 +326,7 @@ def _foreign(group: h5py.Group, depth: int = 0) -> str:
 
 
 def _excess(file: h5py.File) -> str:
-    """Whether a file declares more than can be meant, whatever its types and its compression make of it in the file."""
+    """Whether a file declares more than allowed, whatever its types and its compression make of it in the file."""
     numbers = 0.0
 
     def count(name: str, item: h5py.Group | h5py.Dataset) -> None:

@@ -345,6 +345,6 @@ def _samples(
     found.sort(key=lambda data: bool(data.sensor.effort_joints))
     samples = tuple(measurements_located_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
-        what = "the recording holds no measurement that the model could be compared with"
+        what = "the recording has no measurement of the model"
         raise DataError(what, where=recording.name, hint="check `sensors` and the names of the recorded points")
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples

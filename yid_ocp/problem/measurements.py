@@ -55,7 +55,7 @@ def recording_time_grid(recording: Recording, time_step: float, duration: float 
     if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):
         what = f"{span:.3g} s of data, {len(t)} samples, are {steps:.3g} time steps of {time_step:g} s"
         allowed = f"at most {_MAX_STEPS}, and {_MAX_STEPS_PER_SAMPLE} from one sample to the next"
-        hint = "see whether times are in seconds and the clock does not jump; else cut the recording"
+        hint = "check that times are in seconds and the clock does not jump, or cut the recording"
         raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
     if steps < 2:
         what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"

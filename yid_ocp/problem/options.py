@@ -114,7 +114,7 @@ class ProblemOptions:
     huber_threshold: Annotated[
         float,
         Gt(0),
-        OptionInfo("residual, in standard deviations, from which the cost grows linearly; .inf for squares"),
+        OptionInfo("residual in standard deviations above which the cost is linear; .inf for squares"),
     ] = float("inf")
     path_cutoff: Annotated[
         float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of the efforts compared with them", "Hz")
@@ -139,7 +139,7 @@ class ProblemOptions:
     initial_velocity_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an estimated start", "rad/s")] = 0.2
     duration: Annotated[float | None, Gt(0), OptionInfo("use only the first seconds of every recording", "s")] = None
     initial_state_fit_window: Annotated[
-        float, Gt(0), OptionInfo("how long the measured points that fix a fitted start may reach", "s")
+        float, Gt(0), OptionInfo("duration of the measured points that determine a fitted start", "s")
     ] = 0.02
     start_point_noise_std: Annotated[
         float | None,

@@ -70,9 +70,7 @@ class SensorOptions:
     ] = None
     effort_sampling_kind: Annotated[
         EffortSamplingKind | None,
-        OptionInfo(
-            "what recorded efforts are of the torque that acts, instead of what the recording says (joints.effort only)"
-        ),
+        OptionInfo("relation of recorded efforts to the true torque, instead of the recording's (joints.effort only)"),
     ] = None
     constants: Annotated[
         Mapping[str, float | Mapping[str, float]],
