@@ -112,7 +112,7 @@ def test_what_cannot_be_a_batch_is_refused(pendulum, tmp_path):
         batch_runs_from_configs([pendulum, pendulum])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes").write_text("")
-    with pytest.raises(OutputError, match="no batch"):
+    with pytest.raises(OutputError, match="not a batch"):
         run_batch(batch_runs_from_configs([pendulum]), tmp_path / "full", workers=HERE)
 
 

@@ -74,7 +74,7 @@ def test_every_recording_has_its_own_places_of_markers_in_the_frame_that_carries
 @pytest.mark.parametrize(
     ("overrides", "recording", "kind", "words"),
     [
-        ((), blank(None), DataError, "where its markers were"),
+        ((), blank(None), DataError, "has no positions of its markers"),
         ((), blank(name="elsewhere"), ConfigError, "'mark' is no point"),
         (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "attached to no frame of the object"),
         (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),

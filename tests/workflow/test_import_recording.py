@@ -90,7 +90,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     # file, its text (None: there is no such file), flags, what is said
     "no such file": ("run.csv", None, "", "no such file"),
     "an unknown format": ("run.xlsx", "x", "", "no reader for '.xlsx' files"),
-    "no name to write to": ("run.csv", GOOD, "--out", "nothing says where"),
+    "no name to write to": ("run.csv", GOOD, "--out", "is not named"),
     "an HDF5 that is none": ("run.h5", "x" * 99, "", "not an HDF5 file"),
     "a column that is not there": ("run.csv", GOOD, "--columns q_b=skip", "no column 'q_b'"),
     "more meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t,position:a,skip", "no column '3'"),

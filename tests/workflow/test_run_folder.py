@@ -131,7 +131,7 @@ def test_a_hidden_folder_that_no_run_made_is_not_emptied(settings, tmp_path, kin
         (theirs / "yid-ocp.lock").symlink_to(tmp_path / "lock")
     with atomic_run_folder(settings, tmp_path / "other"):  # which clears away what killed runs left
         assert (theirs / "data").read_text() == "precious"
-    with pytest.raises(OutputError, match="not a run's"), atomic_run_folder(settings, tmp_path / "run"):
+    with pytest.raises(OutputError, match="not made by a run"), atomic_run_folder(settings, tmp_path / "run"):
         pytest.fail("went on")
     assert (theirs / "data").read_text() == "precious"
     assert not (tmp_path / "run").exists()
