@@ -396,8 +396,8 @@ def test_what_does_not_fit_is_refused(make, given, words):
 @pytest.mark.parametrize(
     ("bounds", "words"),
     [
-        ((4.0, 9.0), r"initial value 3 N m/rad of k lies outside its bounds"),
-        ((0.0, 2.0), r"initial value 3 N m/rad of k lies outside its bounds"),
+        ((4.0, 9.0), r"k = 3 N m/rad lies below its lower bound of 4 N m/rad"),
+        ((0.0, 2.0), r"k = 3 N m/rad lies above its upper bound of 2 N m/rad"),
         ((3.0, 3.0), "leave no room"),
     ],
 )

@@ -18,7 +18,8 @@ BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True
 
 def parameter(said: str, value: float = 2.0) -> dict:
     return {
-        "value": value, "std": 0.1, "unit": "N m/rad", "initial": 3.0, "lower": 0.0, "upper": None,
+        "value": value, "std": 0.1, "unit": "N m/rad", "initial": 3.0, "upper": None,
+        "lower": 2.0 if said == "at_bound" else 0.0,
         "free": said != "fixed", "verdict": said, "interval": (0.0, 0.5) if said == "at_bound" else None,
     }  # fmt: skip
 
@@ -90,7 +91,13 @@ def test_a_solve_says_what_is_not_found():
         "converged: done (4 iterations, 1.0 s)",
     ]
     assert not any("p_fixed" in line for line in lines)
-    assert "the search ended at a bound of p_at_bound: what is beyond it was not tried" in lines
+    poor = {"p": parameter("not_trusted", 9.0) | {"upper": 9.0}}
+    for name, side, bound, result in (
+        ("p_at_bound", "lower", "2", solved()), ("p", "upper", "9", solved(parameters=poor, fit=BAD))
+    ):  # fmt: skip
+        said = " ".join(" ".join(told("yid-solve/1", result)).split())
+        assert f"{name} ended at its {side} bound of {bound} N m/rad: nothing beyond was tried; widen " in said
+        assert f"`parameters.{name}.bounds`" in said
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
     lost = solved(parameters={"a": parameter("not_identifiable") | {"std": None}, "b": parameter("identifiable")})
     lines = told("yid-solve/1", lost)
@@ -225,6 +232,7 @@ def test_blocks_on_a_terminal():
 
 
 def test_tables_are_aligned_without_empty_columns():
+    assert terminal.aligned_table_lines([("a", "b"), ("1", "")]) == ["a", "-", "1"], "a head alone is no entry"
     lines = terminal.aligned_table_lines([("a", "", "long head"), ("1", "", "x"), ("22", "", "")])
     assert lines == ["a   long head", "--  ---------", "1   x", "22"]
     recording = Recording(JointGroup(("a", "b"), np.array([0.0, 0.1]), np.zeros((2, 2))))
@@ -258,6 +266,10 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
         (["j1.damping", "tip.mass", "j3.damping", "j2.damping", "j5.damping"], "j1..3.damping, tip.mass, j5.damping"),
         ([f"w{i}.x{j}" for i in range(2) for j in range(9, 12)], "w0.x9..11, w1.x9..11"),
         (["j01.c", "j02.c", "j03.c", ""], "j01.c, j02.c, j03.c, "),
+        (
+            [f"{chr(97 + i)}.gain" for i in range(20)],
+            ", ".join(f"{chr(97 + i)}.gain" for i in range(12)) + " and 8 more",
+        ),
         ([], ""),
     ],
 )

@@ -33,7 +33,11 @@ class Parameter:
         if not math.isfinite(self.value):
             raise ConfigError(f"{self.name} = {self.value} is not a finite number", where=f"parameter {self.name}")
         if not self.lower <= self.value <= self.upper:
-            what, where = f"{self.name} = {self.value:g} {self.unit} lies outside its bounds", f"parameter {self.name}"
+            side, bound = (
+                ("below its lower", self.lower) if self.value < self.lower else ("above its upper", self.upper)
+            )
+            what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
+            where = f"parameter {self.name}"
             allowed = f"{self.lower:g} to {self.upper:g} {self.unit}"
             hint = "change the value, or widen the bounds under `parameters`"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -291,10 +291,7 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
     """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or its bounds coincide."""
     for name in free:
         entry, value = system.parameters[name], theta[system.parameters.index(name)]
-        if not entry.lower <= value <= entry.upper:
-            what = f"initial value {value:g} {entry.unit} of {name} lies outside its bounds"
-            allowed = f"{entry.lower:g} to {entry.upper:g} {entry.unit}"
-            raise ConfigError(what, where=f"parameters.{name}", allowed=allowed)
+        replace(entry, value=float(value))  # it checks its bounds
         if not entry.lower < entry.upper:
             what, hint = f"the bounds of {name} leave no room", "fix the parameter instead of closing its bounds"
             raise ConfigError(what, where=f"parameters.{name}", allowed="lower below upper", hint=hint)

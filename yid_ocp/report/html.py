@@ -105,8 +105,8 @@ def _format_number(value: object, digits: int = 4) -> str:
 def _column_classes(table: SummaryTable) -> list[str]:
     """CSS class of every column (`number`, `long` or `text`); empty for columns without an entry."""
     kinds: list[str] = []
-    for head, *cells in zip(*table.rows, strict=True):
+    for _, *cells in zip(*table.rows, strict=True):
         wide = max(map(len, cells), default=0) > _WRAP_LENGTH
         kind = "number" if all(map(_NUMBER.match, cells)) else "long" if wide else "text"
-        kinds.append(kind if head or any(cells) else "")
+        kinds.append(kind if any(cells) else "")
     return kinds

@@ -195,7 +195,7 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
 
 def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_TABLE_TEXTS}
-    found, weak, bound, lost = (by[v] for v in ("identifiable", "weak", "at_bound", "not_identifiable"))
+    found, weak, lost = (by[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         yield (
             f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value or, near zero, of "
@@ -207,8 +207,13 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
         yield f"only {VERDICT_TABLE_TEXTS['weak']}: {names_by_pattern_text(weak)}"
         if any(free[name]["interval"] is None for name in weak):
             yield "`yid-ocp identifiability` gives intervals that need not be symmetric"
-    if bound:
-        yield f"the search ended at a bound of {names_by_pattern_text(bound)}: what is beyond it was not tried"
+    for name, entry in free.items():
+        for side in ("lower", "upper"):
+            if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
+                what = (
+                    f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}: nothing beyond was tried"
+                )
+                yield f"{what}; widen `parameters.{name}.bounds`, or fix it there if that is a physical limit"
 
 
 @register_summary("yid-identifiability/1")
@@ -406,12 +411,12 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     equations, linear = result["equations"], result["linearisation"]
     size = f"coordinates: {len(roles)} ({', '.join(counts)}), constraints: {equations['sizes']['m']}"
     yield SummaryStatement(size, "verdict")
-    yield SummaryTable([*_dependence_rows(result)], "Where parameters enter, and who sees it", is_key_table=True)
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
         "rows of a step that contain the parameter, and those of them that sensors see to first order; what one unit "
         f"more moves: a reading at most (from rest, within {seconds:.2g} s), all readings together (recordings)"
     )
+    yield SummaryTable([*_dependence_rows(result)], "Where parameters enter, and who sees it", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"and {left} more free parameters, in result.json" if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):

@@ -26,6 +26,7 @@ _StatementKind = Literal["note", "verdict", "conclusion"]
 _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings side by side
 _MAX_NUMBERS_BEYOND_MODEL = 6  # numbers that a sentence lists; the table has all
+_MAX_NAMES_IN_LINE = 12  # of parameters; tables have all
 MAX_CHANNELS_SHOWN_SINGLY = 4  # a group of more points is shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
@@ -247,18 +248,21 @@ def _note_lines(notes: Sequence[str]) -> list[str]:
 
 
 def aligned_table_lines(rows: TableRows) -> list[str]:
-    """Text lines of a table with aligned columns, header first; columns without any entry are left out."""
-    columns = [column for column in zip(*rows, strict=True) if any(column)]
+    """Text lines of a table with aligned columns, header first; columns without an entry below it are left out."""
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in columns]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]
     return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
 
 
 def names_by_pattern_text(names: Sequence[str]) -> str:
-    """Names in one line; three or more that differ by one consecutive number are one, as `joint_coulomb@joint1..7`."""
+    """Names in one line; three or more that differ by one consecutive number are one, as `joint_coulomb@joint1..7`.
+
+    Of a long line only the beginning, and how many names are left.
+    """
     parts = [re.split(r"(\d+)", name) for name in names]
     taken: set[int] = set()
-    said = []
+    said, left = list[str](), 0
     for i, own in enumerate(parts):
         if i in taken:
             continue
@@ -274,5 +278,8 @@ def names_by_pattern_text(names: Sequence[str]) -> str:
                 end = parts[run[-1]][at]
                 longest, text = run, "".join([*own[: at + 1], "..", end, *own[at + 1 :]])
         taken.update(longest)
-        said.append(text)
-    return ", ".join(said)
+        if len(said) < _MAX_NAMES_IN_LINE:
+            said.append(text)
+        else:
+            left += len(longest)
+    return ", ".join(said) + (f" and {left} more" if left else "")
