@@ -18,11 +18,11 @@ from yid_ocp.options import Option, dataclass_options, describe_type, mapping_va
 HEAD = """\
 # Settings
 
-Every key of a configuration file. NAME stands for a name of yours or of the model. Units are SI and stand in brackets;
-`needed` keys have no default, and where none is shown it is nothing at all (`null`). Any key may be set on the command
-line as well, `--set problem.time_step=0.005`; a section merges with what stands there, key by key, and an empty one
-empties it. How to choose links, time step and split: [choosing.md](../howto/choosing.md); recordings and their units:
-[recordings.md](recordings.md). This page is made from the code; CONTRIBUTING.md has the command.
+This page lists every key of a configuration file. NAME is a name of yours or of the model. Units are SI, in brackets.
+`needed` keys have no default; an empty default is `null`. Any key can be set on the command line, as in
+`--set problem.time_step=0.005`. A section merges with the existing one, key by key, and an empty one clears it. How to
+choose links, time step and split: [choosing.md](../howto/choosing.md). Recordings and their units:
+[recordings.md](recordings.md). This page is generated from the code; CONTRIBUTING.md has the command.
 """
 
 
