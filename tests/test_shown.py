@@ -1,12 +1,15 @@
 """Objects in a line and in a notebook's cell."""
 
+import inspect
 import re
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 from small_problems import joints, pendulum_step, recording, seen, taken
 
 import yid_ocp as yid
+from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.display import _MAX_TABLE_ROWS, ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.model import Segment, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -60,7 +63,7 @@ def shown(urdf_folder):
     things += [
         seen_channel,
         yid.identifiability(problem, solution),
-        yid.NamedStepEquations.from_equations(step.equations),
+        NamedStepEquations.from_equations(step.equations),
     ]
     return {type(thing).__name__: thing for thing in things}
 
@@ -83,6 +86,20 @@ def test_public_objects_are_short(shown, name, words):
     html = shown[name]._repr_html_()
     assert html.startswith(f"<p><b>{name}</b>: ")
     assert len(re.findall("<tr>", html)) <= _MAX_TABLE_ROWS + 2
+
+
+def test_results_state_shapes_and_units(shown):
+    """Of what a function of the front door returns: in its docstring, where a notebook's help looks."""
+    functions = {name: entry for name in yid.__all__ if inspect.isfunction(entry := getattr(yid, name))}
+    results = {get_type_hints(entry).get("return") for entry in functions.values()} - {type(None)}
+    assert {yid.Solution, yid.DiagnosisResult, yid.Recording} <= results
+    settings = {"RunSettings", "Step", "NonlinearProgram", "FlexibleObject", "System", "EstimationProblem"}
+    for result in results:
+        if result.__name__ not in settings:
+            text = inspect.getdoc(result)
+            assert re.search(r"\[(1|s|m|rad|nat|N m)|unit", text), result
+            if result.__name__ != "ExperimentRanking":  # it has no arrays
+                assert re.search(r"\(\w+( \+ 1)?, ?\w*\)|shape", text), result
 
 
 def test_all_public_classes_that_hold_arrays_show_themselves():

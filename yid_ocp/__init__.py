@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from yid_ocp.analysis.estimation import solve as solve
     from yid_ocp.analysis.identifiability import identifiability as identifiability
-    from yid_ocp.analysis.step_symbols import NamedStepEquations as NamedStepEquations
     from yid_ocp.analysis.what_if import what_if as what_if
     from yid_ocp.config.reader import load_config as load_config
     from yid_ocp.data import Recording as Recording
@@ -23,9 +22,7 @@ if TYPE_CHECKING:
     from yid_ocp.errors import YidError as YidError
     from yid_ocp.integrator.step import compile_step as compile_step
     from yid_ocp.integrator.step import simulate as simulate
-    from yid_ocp.model import FlexibleObject as FlexibleObject
     from yid_ocp.model import Grasp as Grasp
-    from yid_ocp.model import Mechanism as Mechanism
     from yid_ocp.model import Segment as Segment
     from yid_ocp.model import System as System
     from yid_ocp.model import flexible_object as flexible_object
@@ -38,7 +35,6 @@ if TYPE_CHECKING:
     from yid_ocp.solvers import Solution as Solution
     from yid_ocp.solvers import Status as Status
     from yid_ocp.solvers import SteepestDescent as SteepestDescent
-    from yid_ocp.solvers.nonlinear_program import NonlinearProgram as NonlinearProgram
     from yid_ocp.solvers.symbolic_transcription import transcribe as transcribe
     from yid_ocp.workflow.build import load_system as load_system
     from yid_ocp.workflow.build_problem import load_problem as load_problem
@@ -50,16 +46,14 @@ if TYPE_CHECKING:
 _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.estimation": ("solve",),
     "analysis.identifiability": ("identifiability",),
-    "analysis.step_symbols": ("NamedStepEquations",),
     "analysis.what_if": ("what_if",),
     "config.reader": ("load_config",),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
     "diagnosis": ("DiagnosisResult", "diagnose"),
     "errors": ("YidError",),
     "integrator.step": ("compile_step", "simulate"),
-    "model": ("FlexibleObject", "Grasp", "Mechanism", "Segment", "System", "flexible_object"),
+    "model": ("Grasp", "Segment", "System", "flexible_object"),
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
-    "solvers.nonlinear_program": ("NonlinearProgram",),
     "solvers.symbolic_transcription": ("transcribe",),
     "workflow.run_history": ("read_estimates",),
     "workflow.build": ("load_system",),

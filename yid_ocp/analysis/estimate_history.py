@@ -24,7 +24,8 @@ _MIN_CORRELATION_EIGENVALUE = 1e-12  # what is known better than that follows fr
 class RunEstimates(ReprMixin):
     """Estimates of n parameters from one run, with their covariance.
 
-    Where a fit is not adequate, the model does not explain the run's recordings; the covariance includes the misfit.
+    Values (n,) and covariance (n, n) are in the parameters' `units`. Where a fit is not adequate, the model does not
+    explain the run's recordings; the covariance includes the misfit.
     """
 
     run_name: str

@@ -95,7 +95,11 @@ class _ParameterDirection:
 
 @dataclass(frozen=True, repr=False)
 class IdentifiabilityResult(ReprMixin):
-    """Identifiability of p free parameters, with correlations, Fisher information and uncertain directions."""
+    """Identifiability of p free parameters, with correlations, Fisher information and uncertain directions.
+
+    Values and standard deviations in `parameters` are in each one's `unit`, relative ones, correlations (p, p) and the
+    Fisher information (p, p) of relative changes have none [1].
+    """
 
     parameters: Mapping[str, ParameterIdentifiability]
     parameter_names: tuple[str, ...]  # in the order of the matrices
@@ -150,6 +154,11 @@ def identifiability(
         Parameters whose interval by profile likelihood is wanted.
     limits : ExcessResidualCriteria, optional
         What makes a residual at a solution more than noise.
+
+    Returns
+    -------
+    IdentifiabilityResult
+        Of p free parameters: verdicts and standard deviations, correlations and Fisher information, shape (p, p).
 
     Raises
     ------

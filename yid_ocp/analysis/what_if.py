@@ -80,7 +80,7 @@ class ExperimentRanking(ReprMixin):
     Single changes come with most identifiable parameters first, then by gain; those that could not be evaluated last.
     `smallest_sufficient_sets` are all sets of fewest changes with which every parameter is identifiable, largest gain
     first; empty where none of up to three changes does it. `greedy_sequence` adds the best single change one after the
-    other.
+    other. Of each, standard deviations are relative to the parameter [1] and the gain is in nat.
     """
 
     unchanged_experiment: ChangedExperimentResult
@@ -130,6 +130,11 @@ def what_if(
         Names of changes to consider, all when absent.
     evaluate_changes : callable, optional
         Does what `evaluate_experiment_change_sets` does, in other processes for example; in this one when absent.
+
+    Returns
+    -------
+    ExperimentRanking
+        Of each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat].
     """
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:

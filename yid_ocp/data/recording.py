@@ -223,6 +223,8 @@ class Recording(ReprMixin):
 
     Attributes
     ----------
+    joints : JointGroup or None
+        Positions, velocities, efforts and commands at M times `t` (M,) [s], shape (M, nj) [rad, rad/s, N m; m, m/s, N].
     points, channel_groups : tuple of PointGroup, tuple of SensorChannelGroup
         What cameras, motion capture or an arm measured of points, and other sensors of anything; on their own clocks.
     name, sha256 : str, str or None

@@ -107,6 +107,11 @@ def diagnose(
         An `EarlierRunsBaseline` may have reference recordings too, made without what is
         looked for; the effects found are taken out for them.
 
+    Returns
+    -------
+    DiagnosisResult
+        Verdict, effects with parameters in their own units, and fractions of the gap [1]; `to_dict` has all with units.
+
     Raises
     ------
     ConfigError, ModelError, DataError, SolverError

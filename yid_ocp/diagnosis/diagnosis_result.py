@@ -54,7 +54,30 @@ class NominalParameterChange:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
-    """Result of a diagnosis: verdict, gap, locations, effects and the statistics on which they are based."""
+    """Result of a diagnosis: verdict, gap, locations, effects and the statistics on which they are based.
+
+    `to_dict` returns it in the format of result.json, where every value has its unit beside it.
+
+    Attributes
+    ----------
+    verdict : str
+        `effect`, `confusable`, `no_gap`, `unknown` or `insufficient_data`.
+    gap_closure : GapClosure
+        Fraction of the held-out gap that the accepted effects close [1], with its 95 % interval.
+    explained_fraction : float
+        What the effects explain over what unknown forces explain [1].
+    noise_floor : tuple of AssumedChannelNoiseLevel
+        Root mean square error by noise alone, in the channel's unit (m, rad or N m).
+    smoother_result : SmoothedUnknownsResult or None
+        Per recording means and standard deviations, shape (J, nd), of nd unknown forces [N m or N], offsets and biases
+        [m] in J intervals, in units of `reference_std` (nd,); None where there is no gap to locate.
+    nominal_model, final_model : RefittedModel
+        `values` and `std` by parameter, each in its own unit (`problem.system.parameters[name].unit`).
+    nominal_changes : tuple of NominalParameterChange
+        Nominal parameters before and after the effects were added, in `unit`.
+    stage_seconds, search_seconds : mapping of str to float, float
+        [s]
+    """
 
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
     smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None where there is no gap to locate

@@ -251,11 +251,16 @@ def simulate(
     Parameters
     ----------
     start : array_like, shape (nx,)
-        Initial (q, p, z).
+        Initial (q, p, z): coordinates [rad or m], momenta [N m s or N s], internal coordinates.
     torque : array_like, shape (N, nu), optional
         Nominal motor torque of every step [N m]; zero when absent.
     path : array_like, shape (N + 1, nc), optional
-        Prescribed coordinates at every node; held at their initial value when absent.
+        Prescribed coordinates at every node [rad or m]; held at their initial value when absent.
+
+    Returns
+    -------
+    Rollout
+        (q, p, z) at every node, shape (N + 1, nx), multipliers (N, m) [N s], efforts (N, nc) and torques (N, nu) [N m].
 
     Raises
     ------

@@ -181,9 +181,10 @@ class RolloutInputs:
 class Rollout:
     """A simulated trajectory, with derivatives (..., d) along d directions on request. NaN follows a failed step.
 
-    (q, p, z) at every node (N + 1, nx), multipliers (N, m) [N s], effort of prescribed coordinates at nodes 0..N-1
-    (N, nc) [N m] and applied torque (N, nu) [N m]. At node 0 the effort assumes that p_0 came from a step before (an
-    `Equilibrium` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
+    (q, p, z) at every node (N + 1, nx) with q in rad or m and p in N m s or N s, multipliers (N, m) [N s], effort
+    of prescribed coordinates at nodes 0..N-1 (N, nc) [N m] and applied torque (N, nu) [N m]. At node 0 the effort
+    assumes that p_0 came from a step before (an `Equilibrium` gives such a p_0); after p_0 = dL/dv it holds only
+    half a step's impulse, half the effort.
     """
 
     state: Array

@@ -113,12 +113,19 @@ class Solution(ReprMixin):
     message : str
         Why it ended, and what to try where it did not converge.
     x : ndarray, shape (nx,)
-        The unknown vector of lowest cost, in the order of `unknown_names`.
+        The unknown vector of lowest cost, in the order of `unknown_names`: parameters in their own units, initial
+        coordinates [rad or m], initial momenta [N m s or N s].
     covariance : ndarray, shape (nx, nx)
-        From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
-        counting the misfit where the model does not explain the data (`uncertainty.misfit_robust_covariance`).
+        In products of the units of `x`. From the data and stated priors (the weak prior excluded), scaled by
+        chi2 per degree of freedom above one, and counting the misfit where the model does not explain the data
+        (`uncertainty.misfit_robust_covariance`).
     parameters : dict of str to ParameterEstimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
+        Value, std, bounds and interval are in the estimate's `unit`.
+    cost : float
+        Half the sum of squared whitened residuals and priors [1].
+    history : tuple of Iterate
+        Cost [1], unknowns (nx,) and seconds [s] of every accepted point.
     wall_time : float
         [s]
     evaluation : Evaluation or None
