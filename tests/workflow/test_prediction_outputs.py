@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import h5py
+import mujoco
 import numpy as np
 import pytest
 from small_problems import pendulum_step, taken
@@ -17,6 +18,9 @@ from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
+from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.system import System
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
@@ -272,6 +276,23 @@ def test_a_group_without_a_sample_has_no_expected_error():
     nothing = SimpleNamespace(sensor=sensor, value=np.zeros((0, 3)), std=np.zeros((0, 3)))
     outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
+
+
+def test_a_spring_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    system = System.build(robot, springs={"elbow": RobotJointSpring(3.0, 0.2)})
+    theta = system.parameters.vector({"elbow.stiffness": 4.0})
+    problem = SimpleNamespace(system=system, theta_and_initial_state_deviation=lambda x, i: (theta, None))
+    found = {"elbow.stiffness": ParameterEstimate(4.0, 0.1, "N m/rad", 3.0, 0.0, np.inf, True, "identifiable")}
+    told = prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
+    [line] = told["mjcf"]
+    joint = line.replace("<joint ", '<joint axis="0 0 1" ')
+    body = f'<body><geom size="1"/>{joint}</body>'
+    model = mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>')
+    assert (model.joint("elbow").stiffness[0], model.qpos_spring[0]) == (4.0, pytest.approx(0.2))
+    lost = {"shoulder.mass": replace(found["elbow.stiffness"], verdict="identifiable")}
+    told = prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=lost), "runs/a")
+    assert told["mjcf"] == []
 
 
 def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():

@@ -67,15 +67,24 @@ def numbers_to_use(problem: EstimationProblem, solution: Solution, folder: str) 
     if not found:
         return {}
     system, theta = problem.system, problem.theta_and_initial_state_deviation(solution.x, 0)[0]
-    joints, lines = [], []
+    joints, lines, found_symbols = [], [], ca.vertcat(*(system.parameters[name].symbol for name in found))
+
+    def numbers(*terms: ca.SX) -> Array:
+        return np.array(ca.Function("k", [system.parameters.symbols], [ca.vertcat(*terms)])(theta)).ravel()
+
+    for spring in system.elastic_joints:
+        terms = spring.stiffness, spring.rest_angle
+        if spring.segment_name == spring.joint_name and ca.depends_on(ca.vertcat(*terms), found_symbols):
+            k, rest = numbers(*terms)
+            note = '<!-- with compiler angle="radian" -->'
+            lines.append(f'<joint name="{spring.joint_name}" stiffness="{k:.4g}" springref="{rest:.4g}"/> {note}')
     for layout in system.segment_layouts:
         for deformation in ("bend", "twist"):
             own = [s for s in system.elastic_joints if (s.segment_name, s.deformation) == (layout.name, deformation)]
-            values, symbols = ca.vertcat(*(spring.stiffness for spring in own)), system.parameters.symbols
-            stiffness = np.array(ca.Function("k", [symbols], [values])(theta))
-            moved = {name for name in found if own and ca.depends_on(values, system.parameters[name].symbol)}
-            if not moved:
+            values = [spring.stiffness for spring in own]
+            if not own or not ca.depends_on(ca.vertcat(*values), found_symbols):
                 continue
+            stiffness = numbers(*values)
             low, high, links = float(stiffness.min()), float(stiffness.max()), len(layout.link_joints)
             known = {"segment": layout.name, "deformation": deformation, "links": links}
             joints.append(known | {"lowest": low, "highest": high})
