@@ -34,7 +34,6 @@ from yid_ocp.diagnosis.blind import scale_parameters_to_more_links
 from yid_ocp.diagnosis.blind_scores import evidence_to_json, judge_recorded_case
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.verdict import failed_transfer_checks
 from yid_ocp.files import make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem
@@ -259,9 +258,7 @@ def run(name: str, seeds: Sequence[int], record: str = "") -> dict[str, str]:
         else ", ".join(entry.effect.label for entry in finding.selected_effects) or "-",
         "why": finding.unknown_reason or "-",
         "explained": f"{100 * finding.explained_fraction:.0f} %" if finding.selected_effects else "-",
-        "apart": ", ".join(
-            f"{entry.effect_label}.{entry.parameter}" for entry in failed_transfer_checks(finding.transfer_checks)
-        )
+        "apart": ", ".join(f"{entry.effect_label}.{entry.parameter}" for entry in finding.failed_transfer_checks)
         or "-",
         "not separable": rivals if finding.accepted_effects and rivals else "-",
         "where": " or ".join([finding.gap_locations[0].location, *finding.gap_locations[0].indistinguishable_from])

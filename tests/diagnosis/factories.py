@@ -21,7 +21,6 @@ from yid_ocp.diagnosis.screening import (
     CandidateScore,
     ConfusabilityMatrix,
     DetectableAmplitudes,
-    GapLocation,
     ScreeningResult,
     _EffectSignature,
 )
@@ -30,7 +29,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult
-from yid_ocp.inference.smoother import SmoothedUnknowns, SmoothedUnknownsResult
+from yid_ocp.inference.smoother import GapLocation, SmoothedUnknowns, SmoothedUnknownsResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, cases, place, smoothed, trace
 
-from yid_ocp.diagnosis.screening import (
+from yid_ocp.inference.smoother import (
     gap_locations_by_smoother_evidence,
     gap_locations_from_effect_closures,
     merge_time_intervals,

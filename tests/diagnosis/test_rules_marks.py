@@ -302,7 +302,7 @@ def diagnosed(decrease=80.0, there=0.5):
     known = {"screening": screening(ranked), "nominal_model": fit((), loss(3.0, 3.2), 100.0, {"k": 2.0})}
     record = SearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
     named = {"single_effect_models": (refits[FRICTION.label],), "selected_effects": (added(FRICTION),)}
-    return finding(**named, record=record, located_gap=LocatedGap((place("elbow"),), "plant", decrease), **known)
+    return finding(**named, record=record, located_gap=LocatedGap((place("elbow"),), decrease), **known)
 
 
 def again(finding, **limits):

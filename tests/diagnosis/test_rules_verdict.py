@@ -11,6 +11,7 @@ from factories import (
     Offset,
     added,
     amplitude,
+    carried,
     cases,
     closed,
     effect,
@@ -20,24 +21,21 @@ from factories import (
     screening,
     shape,
     smoothed,
-    visible,
 )
 
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
+    Judgement,
     LocatedGap,
     NominalEvidence,
     _check_effect_amplitude_transfer,
     _compare,
     _effects_with_transfer_checks,
+    _explained_fraction,
     _inflate_fit_stds_by_disagreement,
-    decide_verdict,
-    find_unknown_verdict_reason,
-    fraction_of_smoother_chi2_decrease,
-    has_significant_gap,
-    is_barely_significant_and_unexplained,
+    _with_verdict,
 )
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import EffectBase
@@ -53,16 +51,20 @@ def scored(*p_values):
     return [score(effect(f"kind{i}@x"), p=p) for i, p in enumerate(p_values)]
 
 
+def seen(tests, scores=(), offsets=False):
+    return NominalEvidence(fit(), *tests, screening(scores), offsets)
+
+
 # -- is there a gap ---------------------------------------------------------------------------------------------------
 
 
 @cases(
     "before, held_out, gap",
     {
-        "sure on the data of the fit": ((0.004, 1.2), (0.5, 1.0), True),
-        "sure on held-out data": ((0.5, 1.0), (0.004, 1.2), True),
-        "two tests: the smaller p counts twice": ((0.006, 1.2), (0.5, 1.0), False),
-        "at the level": ((0.005, 1.2), (0.5, 1.0), False),
+        "sure on the data of the fit": ((4e-5, 1.2), (0.5, 1.0), True),
+        "sure on held-out data": ((0.5, 1.0), (4e-5, 1.2), True),
+        "two tests: the smaller p counts twice": ((6e-5, 1.2), (0.5, 1.0), False),
+        "at the level": ((5e-5, 1.2), (0.5, 1.0), False),
         "sure but small": ((0.0, 1.05), (0.0, 1.09), False),
         "at the smallest gap": ((0.0, 1.1), (0.0, 1.1), False),
         "large on the other data": ((0.0, 1.0), (0.5, 1.11), True),
@@ -72,7 +74,7 @@ def scored(*p_values):
 )
 def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
     tests = [outcome(p=p, chi2=chi2, channels={"a": 1.0}) for p, chi2 in (before, held_out)]
-    assert has_significant_gap(*tests, LIMITS) is gap
+    assert seen(tests).has_gap(LIMITS) is gap
 
 
 @cases(
@@ -91,13 +93,8 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    limits = Thresholds(min_channel_excess_chi2_per_dof=0.03, gap_significance_level_by_candidate=0.01)
-    assert has_significant_gap(*tests, limits, scored(*p_values)) is gap
-
-
-def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
-    sure = Thresholds(gap_significance_level_by_candidate=1e-4, significance_level=0.05)
-    assert [has_significant_gap(outcome(), outcome(chi2=1.2), sure, scored(p)) for p in (9e-5, 0.03)] == [True, False]
+    limits = Thresholds(min_channel_excess_chi2_per_dof=0.03, gap_significance_level=0.01)
+    assert seen(tests, scored(*p_values)).has_gap(limits) is gap
 
 
 @cases(
@@ -111,36 +108,11 @@ def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
 )
 def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(of, p, stated, gap):
     ranked = (score(of("zero", "elbow", Parameters(())), p=p), score(effect("friction@wrist"), p=0.9))
-    assert has_significant_gap(outcome(), outcome(), LIMITS, ranked, stated) is gap
-
-
-SILENT = smoothed({FORCE: 0.0, BIAS: 0.0})
-SPEAKING = smoothed({FORCE: 9.0, BIAS: 0.0}, evidence={"plant": 9.0, "both": 9.0})
-
-
-@cases(
-    "found, p_values, before, held_out, chance",
-    {
-        "barely": (SILENT, (0.5,), 0.003, 0.5, True),
-        "sure": (SILENT, (0.5,), 9e-05, 0.5, False),
-        "sure on held-out data": (SILENT, (0.5,), 0.5, 9e-05, False),
-        "as sure as needed": (SILENT, (0.5,), 0.0001, 0.5, False),
-        "not as sure as needed": (SILENT, (0.5,), 0.00011, 0.5, True),
-        "explained by a candidate": (SILENT, (0.004, 0.9), 0.003, 0.5, False),
-        "best of two tries": (SILENT, (0.006, 0.9), 0.003, 0.5, True),
-        "at the level": (SILENT, (0.005, 0.9), 0.003, 0.5, True),
-        "explained by a force": (SPEAKING, (0.5,), 0.003, 0.5, False),
-    },
-)
-def test_a_barely_significant_excess_without_shape_is_chance(found, p_values, before, held_out, chance):
-    seen = NominalEvidence(fit(), outcome(p=before), outcome(p=held_out), screening(scored(*p_values)), False)
-    located = LocatedGap((), found.plant_or_sensor_origin, 10.0)
-    assert is_barely_significant_and_unexplained(located, seen, LIMITS) is chance
+    assert seen((outcome(), outcome()), ranked, stated).has_gap(LIMITS) is gap
 
 
 # -- the verdict ------------------------------------------------------------------------------------------------------
 
-SEEN, UNSEEN = (visible(ONE),), (visible(ONE, seen=False),)
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)
 NO_INTERVAL, MUCH = closed(0.9, math.nan, math.nan), closed(0.95, 0.9, 0.98)
 ALIKE = (added(ONE, [OTHER]),)
@@ -153,9 +125,6 @@ ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOA
     {
         "an effect": ({}, "effect"),
         "too few samples": ({"enough": False}, "insufficient_data"),
-        "nothing could be seen": ({"visible": UNSEEN}, "insufficient_data"),
-        "no candidate": ({"visible": ()}, "insufficient_data"),
-        "one could be seen": ({"visible": (*UNSEEN, visible(OTHER))}, "effect"),
         "no gap": ({"gap": False}, "no_gap"),
         "nothing added": ({"added": ()}, "unknown"),
         "closure sure by too little, however large": ({"total": closed(0.9, 0.04, 1.0)}, "unknown"),
@@ -183,13 +152,16 @@ ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOA
     },
 )
 def test_the_verdict(changed, verdict):
-    said = {"gap": True, "visible": SEEN, "added": (added(ONE),), "enough": True} | changed
-    assert decide_verdict(said["gap"], said["enough"], said["visible"], reason_of(changed), said["added"]) == verdict
+    assert judged(changed).verdict == verdict
 
 
-def reason_of(changed):
-    said = {"added": (added(ONE),), "total": CERTAIN, "explained": 1.0, "carried": True} | changed
-    return find_unknown_verdict_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"])
+def judged(changed):
+    """The verdict on effects that were added."""
+    said = {"gap": True, "added": (added(ONE),), "enough": True, "total": CERTAIN, "explained": 1.0, "carried": True}
+    said |= changed
+    checks = () if said["carried"] else (carried(),)
+    found = Judgement("", "", (), said["added"], said["total"], said["explained"], checks)
+    return _with_verdict(found, said["gap"], said["enough"], LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +175,7 @@ def reason_of(changed):
     ],
 )
 def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
-    assert reason_of(changed) == reason
+    assert judged(changed).unknown_reason == reason
 
 
 @cases(
@@ -218,11 +190,10 @@ def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
 )
 def test_what_effects_explain_of_what_can_be_explained(costs, decrease, part):
     """Fall of r'r less what one parameter takes, over the smoother's fall less the degrees of freedom that it takes."""
-    nominal, last = fit(cost=costs[0]), added(ONE, fitted=fit([ONE], cost=costs[1]))
-    first = added(OTHER, fitted=fit([OTHER], cost=1e3))
-    found = LocatedGap((), "plant", decrease)
-    assert fraction_of_smoother_chi2_decrease(nominal, (first, last), found) == pytest.approx(part)
-    assert fraction_of_smoother_chi2_decrease(nominal, (first, last), None) == 1.0
+    nominal, last, located = fit(cost=costs[0]), fit([ONE], cost=costs[1]), LocatedGap((), decrease)
+    assert _explained_fraction(nominal, last, located) == pytest.approx(part)
+    assert _explained_fraction(replace(nominal, has_process_noise=True), last, located) == 1.0
+    assert _explained_fraction(nominal, last, None) == 1.0
 
 
 # -- on which side ----------------------------------------------------------------------------------------------------

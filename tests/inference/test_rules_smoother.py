@@ -14,10 +14,13 @@ import threadpoolctl
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.screening import gap_locations_by_smoother_evidence, z_scores_of_smoothed_unknowns
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
-from yid_ocp.inference.smoother import select_and_smooth_unknowns
+from yid_ocp.inference.smoother import (
+    gap_locations_by_smoother_evidence,
+    select_and_smooth_unknowns,
+    z_scores_of_smoothed_unknowns,
+)
 from yid_ocp.inference.smoother_model import (
     _FORCE_POINT,
     LinearResidualModel,

@@ -22,9 +22,7 @@ from yid_ocp.diagnosis.screening import (
     CandidateScore,
     ConfusabilityMatrix,
     DetectableAmplitudes,
-    GapLocation,
     ScreeningResult,
-    gap_locations_from_effect_closures,
 )
 from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -34,6 +32,7 @@ from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
 from yid_ocp.files import dataclass_from_plain_data, to_json_types, to_lossless_plain_data
 from yid_ocp.inference.null_test import NullTestResult
+from yid_ocp.inference.smoother import GapLocation, gap_locations_from_effect_closures
 from yid_ocp.model.parameters import Parameter, Parameters
 
 _FORMAT = "yid-blind/1"
@@ -272,14 +271,12 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
     return replace(
         limits,
         significance_level=sure,
-        gap_significance_level_by_candidate=sure,
-        unexplained_p_factor=1.0,
+        gap_significance_level=sure,
         min_excess_chi2_per_dof=-1.0,
         min_channel_excess_chi2_per_dof=-1.0,
         min_log_bayes_factor=1e-9,
         max_unknown_groups=1,
         min_gap_closed=-math.inf,
-        min_rmse_reduction=-math.inf,
         max_effects=1,
     )
 
@@ -288,12 +285,12 @@ def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
     """chi2/n - 1 by which a residual counts as a gap, if it is significant at all."""
     if said["chi2_per_dof"] is None:
         return math.inf  # it could not be followed at all
-    return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.significance_level else -math.inf
+    return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.gap_significance_level else -math.inf
 
 
 def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
     """That of the worst channel, if any candidate is significant."""
-    is_sure = said["candidate"] < limits.gap_significance_level_by_candidate
+    is_sure = said["candidate"] < limits.gap_significance_level
     return (said["largest_channel"] or 1.0) - 1 if is_sure else -math.inf
 
 
@@ -314,17 +311,6 @@ def _odds(said: _Statistics, limits: Thresholds, truth: str) -> float:
     return 0.5 * (known[truth] - min(known.values())) if known else -math.inf
 
 
-def _lost(said: _Statistics, limits: Thresholds, truth: str) -> float:
-    """Held-out chi2/n by which the true effect alone is behind the best one alone, where that is beyond chance."""
-    known = _rivals(said, limits, truth)
-    if not known:
-        return -math.inf
-    own, best = known[truth], min(known.values(), key=lambda entry: float(entry["left"]))
-    lost = float(own["chi2_per_dof"] - best["chi2_per_dof"])
-    # both are said beside the first, one of which they are as a rule
-    return lost if lost > math.hypot(own["error"], best["error"]) else 0.0
-
-
 @dataclass(frozen=True)
 class _CalibrationRule:
     """Rule that derives one threshold from a statistic of the cases."""
@@ -338,15 +324,13 @@ class _CalibrationRule:
 
 _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "gap": _CalibrationRule("min_excess_chi2_per_dof", _excess, "clean", "most", 0.1),
-    "candidate": _CalibrationRule("gap_significance_level_by_candidate", _of("candidate"), "clean", "least", 1e-4),
+    "candidate": _CalibrationRule("gap_significance_level", _of("candidate"), "clean", "least", 1e-4),
     "channel": _CalibrationRule("min_channel_excess_chi2_per_dof", _along, "clean", "most", 0.02),
     "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
     "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),
-    "relevance": _CalibrationRule("min_rmse_reduction", _of("fall"), "clean", "most", 0.01),
     "explained": _CalibrationRule("min_explained_fraction", _of("explained"), "named", "least", 0.75),
     "carried": _CalibrationRule("transfer_z_max", _of("carried"), "named", "most", 3.0),
-    "tie": _CalibrationRule("chi2_equivalence", _lost, "refitted", "most", 0.001),
 }
 """All rules, by what they look at."""
 _STATISTIC_TEXTS = {
@@ -356,10 +340,8 @@ _STATISTIC_TEXTS = {
     "evidence": "rise of the log evidence by the best place",
     "rival": "log odds of the likeliest effect against the truth",
     "closure": "lower end of the closure by the best effect",
-    "relevance": "part of a held-out error taken away by it",
     "explained": "part of the smoother's explanation",
     "carried": "standard deviations between recordings",
-    "tie": "held-out chi2/n by which the truth is behind the best effect, beyond a standard error",
 }
 
 
@@ -465,6 +447,7 @@ def evidence_to_json(finding: DiagnosisResult) -> dict[str, Any]:
         "tests": [plain(test) for test in (finding.nominal_test, finding.nominal_held_out_test)],
         "screening": _screening_to_json(finding.screening),
         "are_offsets_stated": finding.are_offsets_stated,
+        "has_left_baseline": finding.has_left_baseline,
         "located_gap": None if finding.located_gap is None else plain(finding.located_gap),
         "remaining": [plain(place) for place in finding.remaining_gap_locations],
         "refits": {name: fit and _refit_to_json(fit) for name, fit in sorted(record.refits.items())},
@@ -496,7 +479,8 @@ class _RecordedCase:
         restored, located = dataclass_from_plain_data, data["located_gap"]
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
-        self.evidence = NominalEvidence(nominal, before, held, screened, data["are_offsets_stated"])
+        flags = (data["are_offsets_stated"], data["has_left_baseline"])
+        self.evidence = NominalEvidence(nominal, before, held, screened, *flags)
         self.located_gap = None if located is None else restored(LocatedGap, located)
         self.record = SearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},

@@ -44,14 +44,7 @@ from yid_ocp.diagnosis.refit import (
     load_stored_refit,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.screening import (
-    CandidateScore,
-    GapLocation,
-    gap_locations_by_smoother_evidence,
-    gap_locations_from_effect_closures,
-    merge_time_intervals,
-    screen_candidates,
-)
+from yid_ocp.diagnosis.screening import CandidateScore, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
@@ -64,7 +57,14 @@ from yid_ocp.inference.null_test import (
     residuals_exceed_noise,
     whiten_with_extra_errors,
 )
-from yid_ocp.inference.smoother import SmoothedUnknownsResult, select_and_smooth_unknowns
+from yid_ocp.inference.smoother import (
+    GapLocation,
+    SmoothedUnknownsResult,
+    gap_locations_by_smoother_evidence,
+    gap_locations_from_effect_closures,
+    merge_time_intervals,
+    select_and_smooth_unknowns,
+)
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
 from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
 from yid_ocp.parallel import map_with_merged_calls
@@ -173,7 +173,8 @@ def _examined(
         finer = replace(finer, problem=replace(finer.problem, candidate_effects=search.problem.candidate_effects))
         problem = problem.with_time_step(finer.problem.problem.step.time_step)
         found = _examined_about_fit(problem, *_followed(finer, again, found.truncated), clock)
-    poor = found.is_search_worthwhile and found.evidence.nominal_test.chi2_per_dof < limits.restart_chi2
+    little = 1 + limits.min_excess_chi2_per_dof
+    poor = found.is_search_worthwhile and found.evidence.nominal_test.chi2_per_dof < little
     if poor and not search.note_skip_past_deadline("the nominal model from other starts"):
         other = _better_nominal_fit(found.search, found.nominal)
         if other is not None:
@@ -217,8 +218,7 @@ def _diagnosed(
         smoothed = _smooth_about_model(nominal, limits) if known is None else known
         by_chance = smoothed.dof_before - smoothed.dof_after
         places = gap_locations_by_smoother_evidence(smoothed, limits.location_z)
-        decrease = smoothed.chi2_before - smoothed.chi2_after - by_chance
-        return LocatedGap(places, smoothed.plant_or_sensor_origin, decrease)
+        return LocatedGap(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
 
     located = functools.cache(locate)
 

@@ -10,22 +10,16 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.refit import RefitStatistics
-from yid_ocp.diagnosis.screening import (
-    DetectableAmplitudes,
-    GapLocation,
-    main_gap_locations,
-)
+from yid_ocp.diagnosis.screening import DetectableAmplitudes
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     Judgement,
     NominalEvidence,
-    failed_transfer_checks,
-    independent_assumption_count,
-    required_fraction_of_smoother_chi2_decrease,
 )
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
 from yid_ocp.inference.null_test import residuals_exceed_noise
+from yid_ocp.inference.smoother import GapLocation, main_gap_locations
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _PRIOR_RANGE_TOLERANCE = 0.25  # part of its range by which an amplitude may leave it unnoticed
@@ -183,8 +177,8 @@ def _places(finding: DiagnosisResult) -> str:
 def _nameless(finding: DiagnosisResult) -> str:
     """Why no effect is named, with the numbers that say so."""
     added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
-    apart = [entry.both_estimates_text for entry in failed_transfer_checks(finding.transfer_checks)]
-    count, closed = independent_assumption_count(added), finding.gap_closure
+    apart = [entry.both_estimates_text for entry in finding.failed_transfer_checks]
+    count, closed = finding.assumption_count, finding.gap_closure
     is_closure_known = math.isfinite(closed.fraction) and math.isfinite(closed.ci_low)
     none = "held-out motions have no gap to close"
     sure = (
@@ -203,7 +197,7 @@ def _nameless(finding: DiagnosisResult) -> str:
         least=100 * finding.thresholds.min_gap_closed,
         explained=100 * finding.explained_fraction,
         asked=f"of the former is required for {count} assumptions" if count > 1 else "is required of both",
-        enough=100 * required_fraction_of_smoother_chi2_decrease(added, finding.thresholds),
+        enough=100 * finding.required_fraction(finding.thresholds),
         apart="; ".join(apart[:2]),
         no="No effect tried so far" if finding.untried else "No known effect",
     )

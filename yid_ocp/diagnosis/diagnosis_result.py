@@ -12,12 +12,10 @@ from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel, SearchRecord
-from yid_ocp.diagnosis.screening import GapLocation, bonferroni_min_p_value
+from yid_ocp.diagnosis.screening import bonferroni_min_p_value
 from yid_ocp.diagnosis.select import (
     GapClosure,
     held_out_gap_closure,
-    held_out_improvement,
-    largest_relative_rmse_reduction,
     penalized_chi2_difference,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -25,8 +23,6 @@ from yid_ocp.diagnosis.verdict import (
     Judgement,
     LocatedGap,
     NominalEvidence,
-    failed_transfer_checks,
-    independent_assumption_count,
 )
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin
 from yid_ocp.effects import EffectBase
@@ -36,7 +32,7 @@ from yid_ocp.inference.null_test import (
     NullTestResult,
     min_bonferroni_p_value,
 )
-from yid_ocp.inference.smoother import SmoothedUnknownsResult
+from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 
 _FORMAT = "yid-diagnosis/2"
 
@@ -221,7 +217,7 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the worst
     channel), `candidate` (p-value of the best, as the best of so many), `evidence` (rise of the log evidence by unknown
     forces, offsets and biases; not where noise drives the motion), `closure` and `closure_low` (held out, of all that
-    was added, accepted or not), `fall` (part of the held-out error that they take away), `explained` (over what the
+    was added, accepted or not), `explained` (over what the
     smoother explains), `assumptions` (how many), `carried` (standard deviations between the values found and those on
     the held-out recordings, at most), `behind` (of every effect refitted alone, the held-out chi2/n that it leaves and
     how far it is behind the first: in held-out chi2/n with its standard error, and in r'r of all recordings). None
@@ -231,10 +227,9 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     added, seen, before = finding.selected_effects, finding.smoother_result, finding.nominal_model
     differences = (entry.estimate_difference_and_std for entry in finding.transfer_checks)
     apart, alone = [distance / std for distance, std in differences if std > 0], finding.single_effect_models
-    of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "fall", "explained"))
+    of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "explained"))
     if added:
-        fall = largest_relative_rmse_reduction(before.held_out_loss, added[-1].refitted_model.held_out_loss)
-        own = (finding.gap_closure.fraction, finding.gap_closure.ci_low, fall, finding.explained_fraction)
+        own = (finding.gap_closure.fraction, finding.gap_closure.ci_low, finding.explained_fraction)
         of_effects = dict(zip(of_effects, own, strict=True))
     found = {
         "p_value": min_bonferroni_p_value(tests),
@@ -243,18 +238,17 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
         "candidate": min(1.0, bonferroni_min_p_value(finding.screening.candidate_scores)),
         "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
         **of_effects,
-        "assumptions": independent_assumption_count(added),
+        "assumptions": finding.assumption_count,
         "carried": max(apart, default=None),
-        "behind": {fit.effects[-1].label: _behind(fit, alone[0]) for fit in alone},
+        "behind": {
+            fit.effects[-1].label: {
+                "left": fit.held_out_loss.chi2_per_sample,
+                "squares": penalized_chi2_difference(fit, alone[0]),
+            }
+            for fit in alone
+        },
     }
     return {name: to_json_types(value) for name, value in found.items()}
-
-
-def _behind(fit: RefitStatistics, first: RefitStatistics) -> dict[str, float]:
-    """Difference of a refit's loss to that of the first."""
-    lost, error = held_out_improvement(fit.held_out_loss, first.held_out_loss)
-    left, squares = fit.held_out_loss.chi2_per_sample, penalized_chi2_difference(fit, first)
-    return {"left": left, "chi2_per_dof": lost, "error": error, "squares": squares}
 
 
 _EFFECT = "kind location"
@@ -285,7 +279,7 @@ def _state(fit: RefitStatistics, test: NullTestResult) -> dict[str, Any]:
 
 def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
     """Effects that imitate the gap and are not its cause, each with its closure and the reason of its rejection."""
-    failed, listed = failed_transfer_checks(finding.transfer_checks), []
+    failed, listed = finding.failed_transfer_checks, []
     for entry in finding.selected_effects if finding.unknown_reason == "stand_in" else ():
         own = [check for check in failed if check.effect_label == entry.effect.label] or failed
         reason = "; ".join(check.both_estimates_text for check in own)

@@ -26,12 +26,16 @@ from yid_ocp.diagnosis.pulse_detection import (
     InverseDynamicsModel,
     detect_force_pulses,
 )
-from yid_ocp.diagnosis.screening import generalised_force_unit, smoothed_unknown_significance_mask
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.files import object_attributes_to_json_dict
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
-from yid_ocp.inference.smoother import SmoothedUnknownsResult, force_log_likelihood_coefficients
+from yid_ocp.inference.smoother import (
+    SmoothedUnknownsResult,
+    force_log_likelihood_coefficients,
+    generalised_force_unit,
+    smoothed_unknown_significance_mask,
+)
 from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces, sensor_bias_location
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction

@@ -37,9 +37,10 @@ from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
-"""A refit starts near its end and must be good to a small part of its std and of `chi2_equivalence` only."""
+"""A refit starts near its end and must be good to a small part of its std only."""
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # times the prior range that a std may be: beyond it the parameter is not known at all
+_HALF_DONE_FRACTION = 0.2  # of the excess, explained by a refit that leaves more than noise and is tried again
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -320,9 +321,9 @@ def _half_done(
     own, count = problem.with_nominal_and_effects_free(effects), len(finish.residual)
     x = own.vector({**start, **neutral_effect_parameter_values(effects)})
     before = own.evaluate(x, False, finish.equilibrium_guesses)
-    if 2 * finish.cost < limits.restart_chi2 * count or not before.ok:
+    if 2 * finish.cost < (1 + limits.min_excess_chi2_per_dof) * count or not before.ok:
         return False
-    return before.cost - finish.cost > limits.restart_gain * (before.cost - count / 2)
+    return before.cost - finish.cost > _HALF_DONE_FRACTION * (before.cost - count / 2)
 
 
 def _leaves_noise(finish: Evaluation, limits: Thresholds) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_min_p_value
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
 
+_MODEL_ERROR_CHI2 = 1e3  # chi2/n from which noise is no part of what is left
+_LOSS_RTOL = 1.4e-3  # part of a loss by which refits of equivalent effects differ
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
@@ -65,13 +66,13 @@ def held_out_gap_closure(
 
 def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
     """Whether the held-out log likelihood ratio favours `after` decisively, if both models leave only noise."""
-    fall = before.total_chi2 - after.total_chi2 if _noise_is_left(limits, before, after) else 0.0
-    return fall > 2 * limits.min_log_bayes_factor
+    fall = before.total_chi2 - after.total_chi2
+    return _is_noise(before, limits) and _is_noise(after, limits) and fall > 2 * limits.min_log_bayes_factor
 
 
-def _noise_is_left(limits: Thresholds, *losses: HeldOutLoss) -> bool:
-    """Whether all of some models leave little but noise."""
-    return max(loss.chi2_per_sample for loss in losses) < 1 + limits.min_excess_chi2_per_dof
+def _is_noise(loss: HeldOutLoss, limits: Thresholds) -> bool:
+    """Whether a model leaves little but noise, so that squares are log likelihoods; otherwise they are its errors."""
+    return loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
 
 
 def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
@@ -85,99 +86,61 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
+def penalized_chi2_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
+    """Return r'r of `fit` minus r'r of `other`, over fitted and held-out recordings, plus a parameter penalty.
+
+    It is that of Schwarz (1978, doi:10.1214/aos/1176344136), so that half the difference is the log odds of `other`.
+    """
+    held = fit.held_out_loss.total_chi2 - other.held_out_loss.total_chi2
+    more = fit.effect_parameter_count - other.effect_parameter_count
+    return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
+
+
 def _chi2(fit: RefitStatistics) -> float:
     return fit.held_out_loss.chi2_per_sample
 
 
-def _near_best_models(
-    fits: Sequence[RefitStatistics], limits: Thresholds = DEFAULT_THRESHOLDS
-) -> list[RefitStatistics]:
-    """Models that predict the held-out recordings as well as the best one, the simplest first."""
+def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> list[RefitStatistics]:
+    """Models that the recordings cannot tell from the best one: plausible ones first, of these the best.
+
+    Where the best leaves noise, all recordings are one likelihood: what has odds against it is out. Where it errs, what
+    counts is how well other motions are predicted, in units of what is left; of what does as well the simplest is best.
+    """
     best = min(fits, key=_chi2)
-    likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
-    if likely and min(map(_chi2, likely)) <= (1 + limits.implausible_shape_margin) * _chi2(best):
-        fits, best = likely, min(likely, key=_chi2)
-    near = []
-    for fit in fits:
-        close = fit is best or _is_predicting_as_well(fit.held_out_loss, best.held_out_loss, limits)
-        if close or _noise_difference(fit, best, limits) <= CHI2_95_TWO_SIDED or _bic_prefers(fit, best, limits):
-            near.append(fit)
-    likeliest = min(near, key=lambda fit: penalized_chi2_difference(fit, best))
-    near = [fit for fit in near if not _noise_difference(fit, likeliest, limits) > 2 * limits.min_log_bayes_factor]
-
-    def order(fit: RefitStatistics) -> tuple[bool, int, float]:
-        odd = any(_is_amplitude_outside_prior(effect, fit, limits) for effect in fit.effects[-1:])
-        return odd, fit.effect_parameter_count, penalized_chi2_difference(fit, likeliest)
-
-    return sorted(near, key=order)
+    if _is_noise(best.held_out_loss, limits):
+        best = min(fits, key=lambda fit: penalized_chi2_difference(fit, best))
+        near = [fit for fit in fits if penalized_chi2_difference(fit, best) <= 2 * limits.min_log_bayes_factor]
+        near.sort(key=lambda fit: penalized_chi2_difference(fit, best))
+    else:
+        near = [fit for fit in fits if _is_predicting_as_well(fit, best)]
+        near.sort(key=lambda fit: (fit.effect_parameter_count, _chi2(fit)))
+    return sorted(near, key=lambda fit: not _is_plausible(fit.effects[-1], fit, limits))
 
 
-def _is_predicting_as_well(loss: HeldOutLoss, best: HeldOutLoss, limits: Thresholds) -> bool:
-    """Whether a loss is within one standard error over blocks of the best, or within `chi2_equivalence` of it.
+def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool:
+    """Whether a loss, and the mean logarithm of its blocks, is within a standard error over blocks of the best.
 
-    Where a model errs, few loud blocks make the error of a sum: then it has to hold of the mean logarithm of the
-    blocks' ratios as well.
+    The sum alone would not do, as few loud blocks make its error. Where errors of the model are all that is left, fewer
+    parameters outweigh a larger loss as in BIC, with the blocks as samples.
     """
-    lost, error = held_out_improvement(loss, best)
-    if lost <= limits.chi2_equivalence * best.chi2_per_sample:
-        return True
-    count = len(best.block_chi2)
-    if lost > error or count < 2 or _noise_is_left(limits, loss, best):
-        return lost <= error
+    loss, best = fit.held_out_loss, other.held_out_loss
+    (lost, error), count = held_out_improvement(loss, best), len(best.block_chi2)
     ratios = np.log(np.maximum(loss.block_chi2, 1.0) / np.maximum(best.block_chi2, 1.0))
-    return float(ratios.mean()) <= float(np.std(ratios, ddof=1)) / math.sqrt(count)
+    spread = np.std(ratios, ddof=1) / math.sqrt(count) if np.isfinite(lost) and count > 1 else math.inf
+    fewer = other.effect_parameter_count - fit.effect_parameter_count if best.chi2_per_sample > _MODEL_ERROR_CHI2 else 0
+    tie = max(_LOSS_RTOL, math.expm1(fewer * math.log(count) / count))
+    return bool(lost <= tie * best.chi2_per_sample or (lost <= error and ratios.mean() <= spread))
 
 
-def _noise_difference(fit: RefitStatistics, other: RefitStatistics, limits: Thresholds) -> float:
-    """`penalized_chi2_difference`; NaN where either leaves more than noise, so that squares are errors of a model."""
-    left = _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
-    return penalized_chi2_difference(fit, other) if left else math.nan
-
-
-def penalized_chi2_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
-    """Return r'r of `fit` minus r'r of `other`, over fitted and held-out recordings, plus a parameter penalty.
-
-    Every parameter counts as the one by which chance alone lowers r'r.
-    """
-    held = fit.held_out_loss.total_chi2 - other.held_out_loss.total_chi2
-    return held + 2 * (fit.cost - other.cost) + fit.effect_parameter_count - other.effect_parameter_count
-
-
-def _bic_prefers(fit: RefitStatistics, best: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates, alike within a block.
-
-    Schwarz 1978, doi:10.1214/aos/1176344136.
-    """
-    blocks, fewer = len(best.held_out_loss.block_chi2), best.effect_parameter_count - fit.effect_parameter_count
-    if _chi2(best) < limits.model_error_chi2 or not np.isfinite(_chi2(fit)) or fewer <= 0:
-        return False
-    return blocks * math.log(_chi2(fit) / _chi2(best)) <= fewer * math.log(blocks)
-
-
-def _likely(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    return _is_significant(effect, fit, limits) and not _is_shape_outside_prior(effect, fit, limits)
-
-
-def _is_shape_outside_prior(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether a shape exceeds its prior range by `max_shape_out_of_range_factor` or the margin in widths."""
-    for name in effect.shape_parameter_names:
-        low, high = effect.prior_ranges[name]
-        room, factor = limits.prior_range_margin_in_widths * (high - low), limits.max_shape_out_of_range_factor
-        near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
-        unsure = limits.min_z * fit.std.get(name, 0.0)
-        if not near - unsure <= fit.values[name] <= far + unsure:
-            return True
-    return False
-
-
-def _is_amplitude_outside_prior(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether an amplitude lies more than `prior_range_margin_in_widths` outside its prior range."""
-    for name in effect.amplitude_names:
-        low, high = effect.prior_ranges[name]
-        room = limits.prior_range_margin_in_widths * (high - low)
-        if not low - room <= fit.values[name] <= high + room:
-            return True
-    return False
+def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
+    """Whether an effect is significant, and no parameter surely outside its prior range by a width or a factor."""
+    room = limits.prior_range_margin_in_widths
+    for name, (low, high) in effect.prior_ranges.items():
+        unsure, width = limits.min_z * fit.std.get(name, 0.0), room * (high - low)
+        least = low / (1 + room) if low > 0 else low - width
+        if not least - unsure <= fit.values[name] <= high + width + unsure:
+            return False
+    return _is_significant(effect, fit, limits)
 
 
 def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
@@ -186,18 +149,20 @@ def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds
     return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
 
 
-def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
-    """Whether the held-out error, of all channels or of any one, is reduced by the fraction `min_rmse_reduction`."""
-    sure = _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample)
-    return sure or largest_relative_rmse_reduction(before, after) >= limits.min_rmse_reduction
+def _is_needed(without: RefitStatistics, fit: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
+    """Whether an effect is significant, and held-out recordings are surely predicted worse without it.
+
+    Where both models leave noise the likelihood decides, otherwise the part of the gap that it closes.
+    """
+    before, after = without.held_out_loss, fit.held_out_loss
+    (gained, error), part = held_out_improvement(before, after), limits.min_gap_closed * before.excess_chi2_per_sample
+    closes = not _is_explained(without, limits) and 0 < part <= gained > error
+    return (closes or _lr_decisive(before, after, limits)) and _is_significant(effect, fit, limits)
 
 
-def largest_relative_rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
-    """Return the relative reduction of the held-out RMSE, of all channels or the best channel, whichever is larger."""
-    channels = [name for name in before.channel_rmse if name in after.channel_rmse]
-    pairs = [(np.sqrt(before.chi2_per_sample), np.sqrt(after.chi2_per_sample))]
-    pairs += [(before.channel_rmse[name][0], after.channel_rmse[name][0]) for name in channels]
-    return float(max(1.0 - later / earlier if earlier > 0 else 0.0 for earlier, later in pairs))
+def _is_explained(fit: RefitStatistics, limits: Thresholds) -> bool:
+    """Whether the effects of a fit leave little but noise; a gap that is as little is one without any."""
+    return bool(fit.effects) and _is_noise(fit.held_out_loss, limits)
 
 
 # -- several effects --------------------------------------------------------------------------------------------------
@@ -259,23 +224,20 @@ def select_effects(
     first round, the chosen one first, then by held-out loss (where one stays alone, its last fit first), and what was
     selected.
     """
-    limits, alone, current = search.thresholds, screened, nominal
-    first: tuple[RefitStatistics, ...] = ()
-    added: tuple[SelectedEffect, ...] = ()
-    paired = False
-    while len(added) < limits.max_effects:
-        base = tuple(entry.effect for entry in added)
-        if added:
-            if search.note_skip_past_deadline(f"the residual gap next to {join_effect_labels(base)}"):
+    limits, alone, chosen, before = search.thresholds, screened, _Choice(nominal), nominal
+    first: list[RefitStatistics] = []
+    while len(chosen.fit.effects) < limits.max_effects:
+        base, current = chosen.fit.effects, chosen.fit
+        if base:
+            beside = join_effect_labels(base)
+            if search.note_skip_past_deadline(f"the residual gap next to {beside}"):
                 break
-            ahead = 3.5 if _little_is_left(current, limits) else 20.0
-            search.progress.begin_stage(
-                f"scoring the residual gap next to {', '.join(e.label for e in base)}", 1.0, ahead
-            )
-            screened = search.screen(base, current.values, f"beside {join_effect_labels(base)}")
+            ahead = 3.5 if _is_explained(current, limits) else 20.0
+            search.progress.begin_stage(f"scoring the residual gap next to {beside}", 1.0, ahead)
+            screened = search.screen(base, current.values, f"beside {beside}")
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)
-            if _little_is_left(current, limits) and p_value >= limits.gap_significance_level_by_candidate:
+            if _is_explained(current, limits) and p_value >= limits.gap_significance_level:
                 break
             if len(base) == 1 and _futile(search, [nominal, current, *first], alone, screened):
                 break
@@ -284,41 +246,101 @@ def select_effects(
         if moved and not base and not search.note_skip_past_deadline("candidates from the earlier run's parameters"):
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
-            pairs = _pairs_to_refit(search, alone, base[0])
-            for fit in refit_with_each_effect(search, (), pairs, nominal.values, "together"):
-                one = fit.effects[0]
-                if _likely(one, fit, limits) and not _is_amplitude_outside_prior(one, fit, limits):
-                    fits.append(fit)
+            pairs = refit_with_each_effect(
+                search, (), _pairs_to_refit(search, alone, base[0]), nominal.values, "together"
+            )
+            fits += [fit for fit in pairs if _is_plausible(fit.effects[0], fit, limits)]
         # of an unlikely size it would mend what those before it do wrong
-        fits = [fit for fit in fits if not base or not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
-        if not fits:
+        fits = [fit for fit in fits if not base or _is_plausible(fit.effects[-1], fit, limits)]
+        near = _near_best_models(fits, limits) if fits else []
+        first = first or [*near[:1], *sorted((fit for fit in fits if fit is not near[0]), key=_chi2)]
+        better = next((fit for fit in near if _is_needed(current, fit, fit.effects[-1], limits)), None)
+        if better is None:
             break
-        near = _near_best_models(fits, limits)
-        first = first or (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=_chi2))
-        chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
-        if chosen is None:
-            break
-        paired = chosen.effects[:-1] != base
-        total = held_out_gap_closure(nominal.held_out_loss, chosen.held_out_loss, limits)
-        both = f"put {join_effect_labels(chosen.effects)} in the place of {join_effect_labels(base)}"
-        said = "" if np.isnan(total.fraction) else f": {100 * total.fraction:.3g} % of the held-out gap closed"
-        search.progress.begin_stage((both if paired else f"added {chosen.effects[-1].label}") + said)
-        if paired:
-            pair = [SelectedEffect(effect, chosen, total, (effect,)) for effect in chosen.effects]
-            added = _rebuilt(search, nominal, pair, chosen)
-        else:
-            beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
-            # what looks alike and was not tried cannot be separated from it yet
-            alike = screened.confusability.confusable_with(chosen.effects[-1].label, limits.signature_overlap)
-            beside += [own[0] for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
-            added = (*added, SelectedEffect(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
-        current = chosen
-    kept = _reconsidered(search, nominal, added, paired)
-    if len(kept) == 1:
+        # what looks alike and was not tried cannot be told from it yet
+        alike = screened.confusability.confusable_with(better.effects[-1].label, limits.signature_overlap)
+        untried = [own[0] for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
+        before = current
+        chosen = chosen.replaced(better, [fit.effects[-1] for fit in near if fit.effects[:-1] == base], untried)
+        closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss, limits).fraction
+        said = "" if math.isnan(closed) else f": {100 * closed:.3g} % of the held-out gap closed"
+        search.progress.begin_stage(f"explained by {join_effect_labels(better.effects)}{said}")
+    chosen = _reconsidered(search, chosen, before)
+    if len(chosen.fit.effects) == 1:
         # it may have ended elsewhere than where it was tried first
-        [own] = kept
-        first = (own.refitted_model, *(fit for fit in first if fit.effects[0].label != own.effect.label))
-    return first, kept
+        first = [chosen.fit, *(fit for fit in first if fit.effects != chosen.fit.effects)]
+    return tuple(first), _with_closures(search, nominal, chosen, first)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The effects that are in the model, refitted together, and what the data cannot tell from each."""
+
+    fit: RefitStatistics
+    rivals: Mapping[str, tuple[EffectBase, ...]] = field(default_factory=dict)  # by label, the effect itself first
+
+    def replaced(self, fit: RefitStatistics, near: Sequence[EffectBase], untried: Sequence[EffectBase] = ()) -> _Choice:
+        """Other effects, of which the last has the rivals `near`, and those that stay have theirs."""
+        *before, last = fit.effects
+        kept = {effect.label: self.rivals.get(effect.label, (effect,)) for effect in before}
+        known = {effect.label: effect for effect in (last, *near, *untried)}
+        return _Choice(fit, kept | {last.label: tuple(known.values())})
+
+
+def _reconsidered(search: RefitContext, chosen: _Choice, before: RefitStatistics) -> _Choice:
+    """Every effect tried for its place again beside the others: without it, and others instead of it.
+
+    The last one was just tried so, if it was added to the effects of `before`.
+    """
+    is_added = chosen.fit.effects[:-1] == before.effects
+    tried = {frozenset(effect.label for effect in before.effects)} if is_added else set()
+    while len(chosen.fit.effects) > 1:
+        labels = frozenset(effect.label for effect in chosen.fit.effects)
+        own = next((effect for effect in chosen.fit.effects if labels - {effect.label} not in tried), None)
+        if own is None or search.note_skip_past_deadline("each effect without the others' company"):
+            break
+        tried.add(labels - {own.label})
+        chosen = _revised(search, chosen, own)
+    return chosen
+
+
+def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choice:
+    """The effects without one of them, or with it or another one last, and what would do as well there."""
+    limits, full, label = search.thresholds, chosen.fit, effect.label
+    rest = tuple(other for other in full.effects if other is not effect)
+    # it begins elsewhere than a refit of the same effects in an earlier round
+    without = search.refit(rest, full.values, f"{join_effect_labels(full.effects)} without {label}")
+    if without is None:
+        return chosen
+    if not _is_needed(without, full, effect, limits):
+        search.progress.begin_stage(f"left {label} out again: the others do as well")
+        return replace(chosen, fit=without)
+    search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
+    company = f"in the place of {label}"
+    screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
+    tried = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
+    tried = [pair for pair in tried if pair[0][0].label != label]
+    own = replace(full, effects=(*rest, effect))
+    others = refit_with_each_effect(search, rest, tried, without.values, company)
+    near = _near_best_models([own, *(fit for fit in others if _is_plausible(fit.effects[-1], fit, limits))], limits)
+    better = next((fit for fit in near if _is_needed(without, fit, fit.effects[-1], limits)), own)
+    if better is not own:
+        search.progress.begin_stage(f"put {better.effects[-1].label} in the place of {label}")
+    found = chosen.replaced(better, [fit.effects[-1] for fit in near])
+    return replace(found, fit=full) if better is own else found
+
+
+def _with_closures(
+    search: RefitContext, nominal: RefitStatistics, chosen: _Choice, first: Sequence[RefitStatistics]
+) -> tuple[SelectedEffect, ...]:
+    """The chosen effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
+    effects, found = chosen.fit.effects, []
+    for i, effect in enumerate(effects, 1):
+        known = next((fit for fit in (chosen.fit, *first) if fit.effects == effects[:i]), None)
+        fit = known or search.refit(effects[:i], chosen.fit.values, f"{join_effect_labels(effects[:i])} again")
+        closed = held_out_gap_closure(nominal.held_out_loss, (fit or chosen.fit).held_out_loss, search.thresholds)
+        found.append(SelectedEffect(effect, fit or chosen.fit, closed, chosen.rivals[effect.label]))
+    return tuple(found)
 
 
 def _futile(
@@ -353,115 +375,14 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
     return chosen
 
 
-def _little_is_left(fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the effects of a fit leave little but noise; a gap that is as little is one without any."""
-    return bool(fit.effects) and _noise_is_left(limits, fit.held_out_loss)
-
-
-def _worth_adding(current: RefitStatistics, chosen: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the last effect of a fit closes a significant and relevant part of the gap, and is significant itself."""
-    before, after = current.held_out_loss, chosen.held_out_loss
-    gained, error = held_out_improvement(before, after)
-    part = gained >= limits.min_gap_closed * before.excess_chi2_per_sample and before.excess_chi2_per_sample > 0
-    closes = not _little_is_left(current, limits) and gained > error and part
-    return (closes or _lr_decisive(before, after, limits)) and _is_there(current, chosen, chosen.effects[-1], limits)
-
-
-def _is_there(without: RefitStatistics, full: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
-    """Whether an effect is significant and removes a relevant part of the held-out error."""
-    reduced = _is_rmse_reduced(without.held_out_loss, full.held_out_loss, limits)
-    return reduced and _is_significant(effect, full, limits)
-
-
-def _reconsidered(
-    search: RefitContext, nominal: RefitStatistics, added: Sequence[SelectedEffect], paired: bool
-) -> tuple[SelectedEffect, ...]:
-    """Effects after testing each with the others: without it, and with others instead of it."""
-    kept = tuple(added)
-    seen = {_labels(kept)}
-    tried = set() if paired else {_labels(kept[:-1])}
-    while len(kept) > 1:
-        others = [_labels(kept) - {entry.effect.label} for entry in kept]
-        position = next((i for i, own in enumerate(others) if own not in tried), None)
-        if position is None or search.note_skip_past_deadline("each effect without the others' company"):
-            break
-        tried.add(others[position])
-        revised = _revised(search, nominal, kept, kept[position])
-        if _labels(revised) == _labels(kept) or _labels(revised) not in seen:
-            kept = revised
-            seen.add(_labels(kept))
-    return kept
-
-
-def _labels(added: Sequence[SelectedEffect]) -> frozenset[str]:
-    return frozenset(entry.effect.label for entry in added)
-
-
-def _revised(
-    search: RefitContext, nominal: RefitStatistics, kept: tuple[SelectedEffect, ...], entry: SelectedEffect
-) -> tuple[SelectedEffect, ...]:
-    """The effects without one of them, with another in its place, or as they are with what would do as well."""
-    limits, full, label = search.thresholds, kept[-1].refitted_model, entry.effect.label
-    rest = [other.effect for other in kept if other is not entry]
-    # it begins elsewhere than a refit of the same effects in an earlier round
-    without = _again(search, rest, full, f"{join_effect_labels(full.effects)} without {label}")
-    if without is None:
-        return kept
-    if not _needed(without, full, entry.effect, limits):
-        search.progress.begin_stage(f"left {label} out again: the others do as well")
-        return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
-    search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
-    company = f"in the place of {label}"
-    screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
-    tried = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
-    own = replace(full, effects=(*rest, entry.effect))
-    tried = [pair for pair in tried if pair[0][0].label != label]
-    others = refit_with_each_effect(search, rest, tried, without.values, company)
-    if not _is_amplitude_outside_prior(entry.effect, own, limits):
-        others = [fit for fit in others if not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
-    near = _near_best_models([own, *others], limits)
-    chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
-    rivals = (chosen.effects[-1], *(fit.effects[-1] for fit in near if fit is not chosen))
-    placed = [replace(e, effect=chosen.effects[-1], equivalent_effects=rivals) if e is entry else e for e in kept]
-    if chosen is own:
-        return tuple(placed)
-    search.progress.begin_stage(f"put {chosen.effects[-1].label} in the place of {label}")
-    return _rebuilt(search, nominal, placed, replace(chosen, effects=tuple(e.effect for e in placed)))
-
-
-def _needed(without: RefitStatistics, full: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
-    """Whether held-out recordings are predicted significantly worse without an effect that is significant."""
-    gained, error = held_out_improvement(without.held_out_loss, full.held_out_loss)
-    sure = gained > error or _lr_decisive(without.held_out_loss, full.held_out_loss, limits)
-    return sure and _is_there(without, full, effect, limits)
-
-
-def _rebuilt(
-    search: RefitContext, nominal: RefitStatistics, entries: Sequence[SelectedEffect], last: RefitStatistics
-) -> tuple[SelectedEffect, ...]:
-    """Effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
-    effects = [entry.effect for entry in entries]
-    parts = [effects[:i] for i in range(1, len(effects))]
-    fits = [_again(search, part, last, f"{join_effect_labels(part)} again") or last for part in parts]
-    found = []
-    for entry, fit in zip(entries, [*fits, last], strict=True):
-        closure = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss, search.thresholds)
-        found.append(replace(entry, refitted_model=fit, cumulative_closure=closure))
-    return tuple(found)
-
-
 def selection_without(
     search: RefitContext, nominal: RefitStatistics, kept: Sequence[SelectedEffect], entry: SelectedEffect
 ) -> tuple[SelectedEffect, ...]:
     """Return the selected effects without one of them, the others refitted; empty if they cannot be."""
     full, rest = kept[-1].refitted_model, [other for other in kept if other is not entry]
     name = f"{join_effect_labels(full.effects)} without {entry.effect.label}"
-    without = _again(search, [other.effect for other in rest], full, name)
-    return () if without is None else _rebuilt(search, nominal, rest, without)
-
-
-def _again(
-    search: RefitContext, effects: Sequence[EffectBase], near: RefitStatistics, name: str
-) -> RefitStatistics | None:
-    """A refit that begins where another one ended."""
-    return search.refit(effects, near.values, name)
+    without = search.refit(tuple(other.effect for other in rest), full.values, name)
+    if without is None:
+        return ()
+    rivals = {other.effect.label: other.equivalent_effects for other in rest}
+    return _with_closures(search, nominal, _Choice(without, rivals), ())

@@ -24,21 +24,18 @@ class Thresholds(SmootherThresholds):
     """
 
     # is there a gap
-    significance_level: Annotated[float, Gt(0), Lt(1), OptionInfo("significance below which a gap counts as one")] = (
-        DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level
-    )
+    significance_level: Annotated[
+        float, Gt(0), Lt(1), OptionInfo("significance from which a candidate is tried, and a window flagged")
+    ] = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level
     min_excess_chi2_per_dof: Annotated[float, Ge(0), OptionInfo("chi2/n - 1 below which a gap is not worth a name")] = (
         DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof
     )
     min_channel_excess_chi2_per_dof: Annotated[
         float, Ge(0), OptionInfo("the same for the worst channel, if a candidate explains it")
     ] = 0.02
-    gap_significance_level_by_candidate: Annotated[
-        float, Gt(0), Lt(1), OptionInfo("significance from which a candidate alone shows a gap")
+    gap_significance_level: Annotated[
+        float, Gt(0), Lt(1), OptionInfo("significance from which there is a gap, of all residuals or along a candidate")
     ] = 1e-4
-    unexplained_p_factor: Annotated[
-        float, Gt(0), Le(1), OptionInfo("part of the level that an excess without shape must reach")
-    ] = 0.01
     min_samples_per_unknown: Annotated[float, Gt(0), OptionInfo("effective samples needed for every unknown")] = 3.0
     residual_window: Annotated[float, Gt(0), OptionInfo("length of the windows of the residual", "s")] = (
         RESIDUAL_WINDOW_SECONDS
@@ -54,34 +51,13 @@ class Thresholds(SmootherThresholds):
     signature_overlap: Annotated[
         float, Gt(0), Le(1), OptionInfo("part of a signature from which two candidates are alike")
     ] = 0.9
-    restart_chi2: Annotated[
-        float,
-        Gt(0),
-        OptionInfo("chi2/n above which refits, below which a nominal fit with a gap, are repeated from other starts"),
-    ] = 1.1
-    restart_gain: Annotated[float, Gt(0), Lt(1), OptionInfo("part of the excess explained by a refit tried again")] = (
-        0.2
-    )
     budget: Annotated[float | None, Gt(0), OptionInfo("time from which on no refit begins", "s")] = None
     # which effects are added
     max_effects: Annotated[int, Ge(1), Le(10), OptionInfo("how many effects may be added")] = 3
     min_z: Annotated[float, Ge(0), OptionInfo("standard deviations from neutral below which no effect is kept")] = 2.0
-    min_rmse_reduction: Annotated[
-        float, Ge(0), Lt(1), OptionInfo("part of a held-out error that an effect must take away")
-    ] = 0.01
     min_gap_closed: Annotated[float, Ge(0), Lt(1), OptionInfo("part of the held-out gap that must be closed")] = 0.05
-    chi2_equivalence: Annotated[float, Ge(0), OptionInfo("part of chi2/n within which models are equal")] = 0.0014
-    model_error_chi2: Annotated[
-        float, Gt(0), OptionInfo("chi2/n above which model error dominates: statistics are taken over blocks of time")
-    ] = 1e3
-    implausible_shape_margin: Annotated[
-        float, Ge(0), OptionInfo("part of chi2/n by which an unlikely shape must be better")
-    ] = 0.05
-    max_shape_out_of_range_factor: Annotated[
-        float, Ge(1), OptionInfo("factor by which a shape parameter may leave its range")
-    ] = 2.0
     prior_range_margin_in_widths: Annotated[
-        float, Ge(0), OptionInfo("widths of its range by which a value may leave it")
+        float, Ge(0), OptionInfo("widths, or a factor of 1 + this, by which a value may leave its range")
     ] = 1.0
     transfer_rtol: Annotated[
         float, Ge(0), OptionInfo("part of an effect by which it may differ on held-out recordings")

@@ -7,19 +7,12 @@ robot comes out the same wherever it is fitted; so the held-out recordings are f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import (
-    CandidateScore,
-    DetectableAmplitudes,
-    GapLocation,
-    ScreeningResult,
-    bonferroni_min_p_value,
-    main_gap_locations,
-)
+from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.select import (
     UNDEFINED_GAP_CLOSURE,
     GapClosure,
@@ -30,6 +23,8 @@ from yid_ocp.diagnosis.select import (
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
+from yid_ocp.inference.smoother import GapLocation, main_gap_locations
+from yid_ocp.problem.options import ExcessResidualCriteria
 
 UnknownVerdictReason = Literal["", "none", "unsure", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""
@@ -69,7 +64,6 @@ class LocatedGap:
     """Location of the nominal model's gap by the smoother."""
 
     locations: tuple[GapLocation, ...]
-    origin: str  # see `SmoothedUnknownsResult.plant_or_sensor_origin`
     chi2_decrease: float  # by unknown forces, offsets and biases, beyond what chance takes
 
 
@@ -85,9 +79,19 @@ class NominalEvidence:
     has_left_baseline: bool = False  # whether parameters are no more what an earlier run found
 
     def has_gap(self, limits: Thresholds) -> bool:
-        """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount."""
+        """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
+
+        Along a candidate's signature some channel must be above noise too; the sum over all channels does not notice
+        what only a few samples show. An offset of a torque beyond the stated one needs no such channel where offsets
+        are stated: it is one number among thousands.
+        """
         tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
-        return has_significant_gap(*tests, limits, ranked, self.are_offsets_stated)
+        largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
+        is_seen = largest > 1 + limits.min_channel_excess_chi2_per_dof
+        level = limits.gap_significance_level
+        along = [s.p_value for s in ranked if is_seen or (self.are_offsets_stated and s.effect.is_torque_offset)]
+        whole = ExcessResidualCriteria(level, limits.min_excess_chi2_per_dof)
+        return residuals_exceed_noise(tests, whole) or min(along, default=1.0) * max(len(ranked), 1) < level
 
     def has_enough_samples(self, limits: Thresholds) -> bool:
         """Whether there are enough effective samples for the unknowns."""
@@ -113,6 +117,17 @@ class Judgement:
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     @property
+    def assumption_count(self) -> int:
+        """Number of independent assumptions in the effects: one for each kind, but one for each local effect."""
+        effects = (entry.effect for entry in self.selected_effects)
+        return len({effect.label if effect.is_local else effect.kind for effect in effects})
+
+    @property
+    def failed_transfer_checks(self) -> tuple[EffectAmplitudeTransferCheck, ...]:
+        """The checks whose two estimates disagree."""
+        return tuple(entry for entry in self.transfer_checks if not entry.is_consistent)
+
+    @property
     def closure_by_location(self) -> dict[str, float]:
         """Part of the gap that the accepted effects at each location close beyond those added before."""
         closed: dict[str, float] = {}
@@ -122,6 +137,45 @@ class Judgement:
             closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
             most = max(part, most)
         return closed
+
+    def required_fraction(self, limits: Thresholds) -> float:
+        """Fraction of what the smoother explains that the effects are required to explain.
+
+        Each further assumption has to explain that part of what could be left.
+        """
+        return 1.0 - (1.0 - limits.min_explained_fraction) ** self.assumption_count
+
+
+def _is_little_explained(said: Judgement, limits: Thresholds) -> bool:
+    """Whether effects explain too little where the model was fitted; one may close as much on other motions instead."""
+    elsewhere = said.assumption_count == 1 and said.gap_closure.ci_low >= limits.min_explained_fraction
+    return said.explained_fraction < said.required_fraction(limits) and not elsewhere
+
+
+_REASONS_FOR_UNKNOWN: Mapping[UnknownVerdictReason, Callable[[Judgement, Thresholds], bool]] = {
+    "none": lambda said, limits: not said.selected_effects,
+    "unsure": lambda said, limits: (
+        not (said.gap_closure.ci_low > limits.min_gap_closed or said.gap_closure.is_decisive)
+    ),
+    "little": _is_little_explained,
+    "stand_in": lambda said, limits: bool(said.failed_transfer_checks),
+}
+"""Rules that effects have to pass, in the order in which the first that fails is the reason why none is accepted."""
+
+
+def _with_verdict(said: Judgement, gap: bool, are_data_sufficient: bool, limits: Thresholds) -> Judgement:
+    """The judgement with the first verdict that holds."""
+    reasons: list[UnknownVerdictReason] = [name for name, fails in _REASONS_FOR_UNKNOWN.items() if fails(said, limits)]
+    reason = [*reasons, ""][0]
+    holds = {
+        "insufficient_data": not are_data_sufficient,
+        "no_gap": not gap,
+        "unknown": bool(reason),
+        "confusable": any(len(entry.equivalent_effects) > 1 for entry in said.selected_effects[:1]),
+        "effect": True,
+    }
+    verdict = next(name for name, is_so in holds.items() if is_so)
+    return replace(said, verdict=verdict, unknown_reason=reason if verdict == "unknown" else "")
 
 
 def judge(
@@ -135,31 +189,37 @@ def judge(
     A function of numbers alone: refits, screenings and the smoother (`locate`) are asked for by name, and are answered
     from a record as well. `finished` is called with the name of each stage.
     """
-    limits, scores = search.thresholds, seen.screening.candidate_scores
-    seen_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
-    moved = seen.has_left_baseline and not seen_gap
-    gap, located, trusted = seen_gap or moved, None, None
-    if gap and enough:
-        located = locate()
-        # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
-        trusted = None if seen.nominal_model.has_process_noise else located
-        gap = not is_barely_significant_and_unexplained(trusted, seen, limits)
+    limits, nominal = search.thresholds, seen.nominal_model
+    has_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
+    # what parameters explain by moving is no gap, unless an effect explains it
+    moved = seen.has_left_baseline and not has_gap
+    located = locate() if enough and (has_gap or moved) else None
     finished("localisation")
     fits: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
-    if gap and enough and scores and located is not None:
+    if located is not None:
         places = [place.location for place in main_gap_locations(located.locations)]
-        fits, added = select_effects(search, seen.nominal_model, seen.screening, places, seen.has_left_baseline)
+        fits, added = select_effects(search, nominal, seen.screening, places, seen.has_left_baseline)
     finished("refits")
-    added, carried = _effects_with_transfer_checks(search, seen.nominal_model, added)
+    added, carried = _effects_with_transfer_checks(search, nominal, added)
+    total, explained = UNDEFINED_GAP_CLOSURE, 1.0
+    if added:
+        total = added[-1].cumulative_closure
+        explained = _explained_fraction(nominal, added[-1].refitted_model, located)
     finished("carry_over")
-    total = added[-1].cumulative_closure if added else UNDEFINED_GAP_CLOSURE
-    explained = fraction_of_smoother_chi2_decrease(seen.nominal_model, added, trusted)
-    reason = find_unknown_verdict_reason(added, total, limits, explained, not failed_transfer_checks(carried))
-    # what parameters explain by moving is no gap
-    gap = gap and (bool(added) or not moved)
-    verdict = decide_verdict(gap, enough, seen.screening.detectability, reason, added)
-    return Judgement(verdict, reason if verdict == "unknown" else "", fits, added, total, explained, carried)
+    said = Judgement("", "", fits, added, total, explained, carried)
+    is_seen = any(entry.is_detectable for entry in seen.screening.detectability)
+    return _with_verdict(said, has_gap or bool(added), enough and is_seen, limits)
+
+
+def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, located: LocatedGap | None) -> float:
+    """The effects' decrease of r'r over the smoother's, each less degrees of freedom; 1 if that says nothing.
+
+    The smoother knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains.
+    """
+    if located is None or nominal.has_process_noise or located.chi2_decrease <= 0:
+        return 1.0
+    return (2 * (nominal.cost - last.cost) - last.effect_parameter_count) / located.chi2_decrease
 
 
 def _effects_with_transfer_checks(
@@ -175,10 +235,10 @@ def _effects_with_transfer_checks(
     checks = _check_effect_amplitude_transfer(search, added[-1].refitted_model)
     places = [entry.effect.location for entry in added]
     shared = [entry for entry in reversed(added) if places.count(entry.effect.location) > 1]
-    for entry in shared if failed_transfer_checks(checks) else ():
+    for entry in shared if any(not check.is_consistent for check in checks) else ():
         fewer = selection_without(search, nominal, added, entry)
         own = _check_effect_amplitude_transfer(search, fewer[-1].refitted_model) if fewer else ()
-        if own and not failed_transfer_checks(own):
+        if own and all(check.is_consistent for check in own):
             added, checks = fewer, own
             break
     if not checks:
@@ -232,104 +292,3 @@ def _inflate_fit_stds_by_disagreement(
         if apart > _DISAGREEMENT_Z * spread:
             std[name] = max(std[name], apart / math.sqrt(2.0))
     return replace(fit, std=std)
-
-
-def failed_transfer_checks(entries: Sequence[EffectAmplitudeTransferCheck]) -> tuple[EffectAmplitudeTransferCheck, ...]:
-    """Return the checks whose two estimates disagree."""
-    return tuple(entry for entry in entries if not entry.is_consistent)
-
-
-def has_significant_gap(
-    before: NullTestResult,
-    held_out: NullTestResult,
-    limits: Thresholds,
-    ranked: Sequence[CandidateScore] = (),
-    offsets: bool = False,
-) -> bool:
-    """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
-
-    Along a candidate's signature some channel must be above noise too; the sum over all channels does not notice what
-    only a few samples show. A candidate alone needs a smaller p-value than the sum. An offset of a torque beyond the
-    stated one needs no such channel where `offsets` are stated: it is one number among thousands.
-    """
-    if residuals_exceed_noise((before, held_out), limits.null_test_limits):
-        return True
-    stated = [score.p_value for score in ranked if score.effect.is_torque_offset] if offsets else []
-    if stated and min(stated) * len(ranked) < limits.gap_significance_level_by_candidate:
-        return True
-    best = bonferroni_min_p_value(ranked)
-    largest = max((*before.channel_chi2.values(), *held_out.channel_chi2.values()), default=1.0)
-    return best < limits.gap_significance_level_by_candidate and largest > 1 + limits.min_channel_excess_chi2_per_dof
-
-
-def is_barely_significant_and_unexplained(
-    located: LocatedGap | None, seen: NominalEvidence, limits: Thresholds
-) -> bool:
-    """Whether an excess counts as chance: barely significant, and explained by no unknown or candidate.
-
-    A significant excess without shape stays a gap: understated noise looks like that.
-    """
-    best = bonferroni_min_p_value(seen.screening.candidate_scores)
-    surest = min(seen.nominal_test.p_value, seen.nominal_held_out_test.p_value)
-    barely = surest > limits.unexplained_p_factor * limits.significance_level
-    has_no_place = located is None or located.origin == "none"
-    return barely and best >= limits.significance_level and has_no_place
-
-
-def decide_verdict(
-    gap: bool,
-    enough: bool,
-    visible: Sequence[DetectableAmplitudes],
-    reason: UnknownVerdictReason,
-    added: Sequence[SelectedEffect],
-) -> str:
-    """Return the verdict of a diagnosis; `enough` states whether there are enough samples for the unknowns."""
-    if not enough or not any(entry.is_detectable for entry in visible):
-        return "insufficient_data"
-    if not gap:
-        return "no_gap"
-    if reason:
-        return "unknown"
-    return "confusable" if len(added[0].equivalent_effects) > 1 else "effect"
-
-
-def independent_assumption_count(added: Sequence[SelectedEffect]) -> int:
-    """Number of independent assumptions in effects: one for each kind, but one for each local effect."""
-    return len({entry.effect.label if entry.effect.is_local else entry.effect.kind for entry in added})
-
-
-def required_fraction_of_smoother_chi2_decrease(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
-    """Return the fraction of the chi2 explained by the smoother that the effects are required to explain.
-
-    Each further assumption has to explain that part of what could be left.
-    """
-    return 1.0 - (1.0 - limits.min_explained_fraction) ** independent_assumption_count(added)
-
-
-def find_unknown_verdict_reason(
-    added: Sequence[SelectedEffect], total: GapClosure, limits: Thresholds, explained: float, carried: bool
-) -> UnknownVerdictReason:
-    """Return the code of the reason why no effect is accepted for a gap; empty if one is accepted.
-
-    Effects have to explain `required_fraction_of_smoother_chi2_decrease` of what the smoother explains where the
-    model was fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
-    `min_explained_fraction`.
-    """
-    if not added:
-        return "none"
-    if not (total.ci_low > limits.min_gap_closed or total.is_decisive):
-        return "unsure"
-    elsewhere = independent_assumption_count(added) == 1 and total.ci_low >= limits.min_explained_fraction
-    if explained < required_fraction_of_smoother_chi2_decrease(added, limits) and not elsewhere:
-        return "little"
-    return "" if carried else "stand_in"
-
-
-def fraction_of_smoother_chi2_decrease(
-    nominal: RefitStatistics, added: Sequence[SelectedEffect], located: LocatedGap | None
-) -> float:
-    """Return the effects' decrease of r'r divided by the smoother's, each less degrees of freedom; 1 if undefined."""
-    if located is None or not added or located.chi2_decrease <= 0:
-        return 1.0
-    last = added[-1].refitted_model
-    return (2 * (nominal.cost - last.cost) - last.effect_parameter_count) / located.chi2_decrease

@@ -20,7 +20,6 @@ from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel
-from yid_ocp.diagnosis.screening import smoothed_unknown_units
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import law_tables_csv
 from yid_ocp.errors import DataError, OutputError
@@ -33,6 +32,7 @@ from yid_ocp.files import (
     write_strict_json,
     write_text,
 )
+from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem

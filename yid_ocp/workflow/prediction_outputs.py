@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.diagnosis import DiagnosisResult
-from yid_ocp.diagnosis.screening import smoothed_unknown_units
 from yid_ocp.inference import whitening
+from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction

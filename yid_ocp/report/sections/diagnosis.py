@@ -11,11 +11,10 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages
-from yid_ocp.diagnosis.screening import smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import LAW_QUANTITY_UNITS, LawTable
 from yid_ocp.inference.null_test import residual_channel_indices
-from yid_ocp.inference.smoother import SmoothedUnknownsResult
+from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
