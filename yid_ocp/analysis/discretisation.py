@@ -10,7 +10,6 @@ import casadi as ca
 import numpy as np
 import scipy.optimize
 
-from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import YidError
@@ -352,18 +351,19 @@ def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float
     """
     if not system.grasps:
         return {}
-    q, numeric = ca.SX.sym("q", system.n_coordinates), system_with_numeric_parameters(system, theta)
-    kinematics = forward_kinematics(numeric.mechanism, q)
-    phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in numeric.grasps))
+    q, inner = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*system.effect_internal_coordinate_symbols.values())
+    kinematics = forward_kinematics(system.mechanism, q)
+    phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps))
     known = [system.mechanism.joint_index(name) for name in configuration]
     free = [i for i in range(system.n_coordinates) if i not in known]
     full = np.zeros(system.n_coordinates)
     full[known] = list(configuration.values())
-    function = ca.Function("phi", [q], [phi, ca.jacobian(phi, q)[:, free]])
+    symbols = [q, system.parameters.symbols, inner]
+    function = ca.Function("phi", symbols, [phi, ca.jacobian(phi, q)[:, free]])
 
     def phi_at(x: Array, part: int) -> Array:
         full[free] = x
-        return np.array(ca.densify(function(full)[part]))
+        return np.array(ca.densify(function(full, theta, 0)[part]))
 
     # a little stiffness keeps the search from winding the object up
     def gaps(x: Array) -> Array:
