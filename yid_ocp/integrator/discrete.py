@@ -168,7 +168,7 @@ def discrete_equations(
     push = h * force
     scale, spring = _row_scale(system, at)
     pulls = _constraint_pulls(system, at, kinematics, 0.0 if constraint_force == "node" else 0.5)
-    constraint, gain = _constraint(system, at)
+    constraint, gain = _constraint(system, at, kinematics)
     balance_rest = scale * (h / 2 * extra_q - extra_v + share * push) - spring
     p1_rest = scale * (h / 2 * extra_q + extra_v + (1 - share) * push) - spring
     by_q, by_v = rigid.lagrangian_by_q, rigid.lagrangian_by_v
@@ -280,11 +280,12 @@ def _row_scale(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX]:
     return ca.vertcat(*scale), ca.vertcat(*held)
 
 
-def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
+def _constraint(system: System, at: _Symbols, middle: Kinematics) -> tuple[ca.SX, ca.SX | None]:
     """`constraint_residual` and `constraint_relaxation_gain` of `DiscreteEquations`."""
+    residual = system.constraint_residual(middle)
 
     def phi(q: ca.SX, z: ca.SX) -> ca.SX:
-        return ca.substitute(system.constraint_residual(forward_kinematics(system.mechanism, q)), at.internal, z)
+        return ca.substitute([residual], [at.qm, at.internal], [q, z])[0]
 
     closure, gain = phi(at.q1, at.z1), None
     relaxation = system.constraint_relaxation_times()
@@ -296,11 +297,10 @@ def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
 
 def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> _ConstraintImpulses:
     parts: dict[str, ca.SX] = {}
+    found = _constraint_derivatives(system, middle, at.lam)
     for name, q, z in (("before", at.q0, at.z0), ("after", at.q1, at.z1)):
-        found = _constraint_derivatives(system, forward_kinematics(system.mechanism, q), q, at.lam)
-        jacobian, by_q = (ca.substitute(expression, at.internal, z) for expression in found)
+        jacobian, by_q = ca.substitute(found, [at.qm, at.internal], [q, z])
         parts |= {f"{name}_jacobian": jacobian, f"{name}_force_by_q": by_q}
-    found = _constraint_derivatives(system, middle, at.qm, at.lam)
     parts["middle_jacobian"], parts["middle_force_by_q"] = (at.placed(expression, dense=False) for expression in found)
     jacobians = ("before_jacobian", "middle_jacobian", "after_jacobian")
     before, middle_sparsity, after = (parts[name].sparsity() for name in jacobians)
@@ -308,7 +308,7 @@ def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m:
     return _ConstraintImpulses(1.0 - share_m, share_m, **parts)
 
 
-def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:
+def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) -> list[ca.SX]:
     """Dphi(q) and d(Dphi(q)' lam)/dq in closed form.
 
     A point moves with d2x/dq_i dq_j = w_i x dx/dq_j, a direction with d2v/dq_i dq_j = w_i x (w_j x v), for i above j.
@@ -354,7 +354,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
             for i, by_i in turns[0].items():
                 for j, by_j in turns[1].items():
                     add(i, j, (2 if i == j else 1) * ca.dot(by_i, by_j))
-    return ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(hessian)
+    return [ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(hessian)]
 
 
 def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
