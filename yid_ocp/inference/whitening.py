@@ -259,7 +259,7 @@ def _whitened_episode(
     if episode.input_errors is None:
         return episode, None
     result = predictor.predict_episode(episode, *at, False, guess)
-    if guess is not None and not isinstance(result, str):
+    if not isinstance(result, str):
         episode = replace(episode, equilibrium_guess=result.equilibrium_guess)
     if before is not None and not isinstance(result, str):
         episode = _about_smoothed(predictor, episode, at[0], result, before)
@@ -317,7 +317,7 @@ def problem_whitened_at(
 
     It is the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened already,
     the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number of
-    relinearizations; 2 at a fit. Further searches for equilibria begin at those found from the guesses, if any.
+    relinearizations; 2 at a fit. Further searches for equilibria begin at those found there.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
@@ -347,7 +347,7 @@ def problem_with_whitened_held_out(
     for held, (episode, theta, offset) in zip(problem.held_out, problem.held_out_prediction_inputs(x), strict=True):
         own, whitening = _whitened_episode(problem.predictor, episode, (theta, offset), None, None)
         own, whitening = _whitened_episode(problem.predictor, own, (theta, offset), None, whitening, keep_weights)
-        episodes.append(replace(held, input_errors=own.input_errors))
+        episodes.append(replace(held, input_errors=own.input_errors, equilibrium_guess=own.equilibrium_guess))
         made.append(whitening)
     return problem.with_episodes(problem.episodes, episodes, problem.whitening_filters, made)
 
