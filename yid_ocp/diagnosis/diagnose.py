@@ -32,6 +32,7 @@ from yid_ocp.diagnosis.hypotheses import (
     CandidateNamesOrAll,
     TruncatedHeldOutRecording,
     exclude_candidates,
+    join_effect_labels,
     make_candidate_effects,
 )
 from yid_ocp.diagnosis.law import GapLaw, find_gap_law
@@ -75,6 +76,7 @@ from yid_ocp.solvers.base import INITIAL_VALUE_RESTART_FACTORS
 
 log = logging.getLogger(__name__)
 
+_SAME_WEIGHTS_STDS = 0.05  # standard deviations by which a fit may leave the point at which its weights were frozen
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
@@ -325,13 +327,16 @@ def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> Es
 
 
 def _happened(
-    whole: EstimationProblem, fit: RefittedModel, limits: Thresholds
+    whole: EstimationProblem, fit: RefittedModel, limits: Thresholds, weighted: EstimationProblem | None = None
 ) -> tuple[EventSet, SmoothedUnknownsResult | None]:
-    """Events about a fit in all that was recorded, none where that cannot be predicted, and what the smoother says."""
+    """Events about a fit in all that was recorded, none where that cannot be predicted, and what the smoother says.
+
+    `weighted` is the problem of all that was recorded with weights frozen at the fit, if there is one.
+    """
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
     if own.system.unprescribed_coordinate_indices:
-        judged = problem_whitened_at(own, x, guesses)
+        judged = weighted or problem_whitened_at(own, x, guesses)
         residual = judged.evaluate(x, False, guesses)
         if not residual.ok:
             return NO_EVENTS, None
@@ -368,7 +373,8 @@ def _without_events(
     search: RefitContext, nominal: RefittedModel, whole: EstimationProblem
 ) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
     """All that follows without what events explain, the nominal model fitted to that, and what happened about it."""
-    first, (events, smoothed) = search.problem, _happened(whole, nominal, search.thresholds)
+    first, own = search.problem, None if search.problem.is_split_in_blocks else nominal.problem
+    events, smoothed = _happened(whole, nominal, search.thresholds, own)
     for round_ in range(_MAX_EVENT_ROUNDS):
         if not events:
             break
@@ -459,7 +465,14 @@ def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> Ref
     if composed.problem.has_process_noise:
         composed = composed.whitened_at(start)
         first = refit_with_effects(composed, (), start, limits=limits)
-        start = start if first is None else first.values
+        if first is not None:
+            slopes, moved = first.evaluation.jacobian, first.problem.vector(first.values) - first.problem.vector(start)
+            if slopes is not None and float(np.linalg.norm(slopes @ moved)) < _SAME_WEIGHTS_STDS:
+                if search.store is not None:
+                    known = StoredFit(first.values, first.std, first.amplitude_std, first.solver_message)
+                    search.store.put(name or join_effect_labels(()), known)
+                return first
+            start = first.values
         composed = composed.whitened_at(start)
     return refit_with_effects(composed, (), start, search.store, name, limits)
 
@@ -515,17 +528,19 @@ def fit_nominal_model(
     if known is not None:
         return known
     start: Mapping[str, float] = {}
+    begun = composed
     # a single recording that is both fitted and held out has no solution yet
     if solution is not None or not composed.is_split_in_blocks:
         found = solve(problem, GaussNewton(max_iterations=30)) if solution is None else solution
         if found.evaluation is None:
             raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
         start = dict(zip(found.unknown_names, map(float, found.x), strict=True))
-    search = RefitContext(composed, limits, NULL_PROGRESS, store)
-    fit = _settled(search, start, "")
+        if found.problem is not None and composed.problem.has_process_noise:
+            begun = composed.about_input_errors(found.problem)
+    fit = _settled(RefitContext(begun, limits, NULL_PROGRESS, store), start, "")
     if fit is None and start:
         # a gap may drive parameters so far that the equilibrium which the solver followed is not found again from there
-        fit = _settled(search, {}, "the nominal model from its start")
+        fit = _settled(RefitContext(composed, limits, NULL_PROGRESS, store), {}, "the nominal model from its start")
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
     return fit

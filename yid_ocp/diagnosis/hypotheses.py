@@ -146,9 +146,19 @@ class AllCandidatesProblem:
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
         """The problem with residuals whitened by sensor and torque noise; the filters are linearised at `values`."""
-        # twice in a row, so that what is frozen is about the offsets that the torques have there
-        x = self.problem.vector(values)
-        return replace(self, problem=problem_with_whitened_held_out(problem_whitened_at(self.problem, x, rounds=2), x))
+        # what is frozen is about the torques that are estimated there, for which they must be known beforehand
+        x, errors = self.problem.vector(values), (episode.input_errors for episode in self.problem.episodes)
+        known = all(own is None or np.any(own.torque_noise) for own in errors)
+        made = problem_whitened_at(self.problem, x, rounds=1 if known else 2)
+        return replace(self, problem=problem_with_whitened_held_out(made, x))
+
+    def about_input_errors(self, solved: EstimationProblem) -> AllCandidatesProblem:
+        """The problem about the input errors that were estimated with a solved problem of the same recordings."""
+        pairs = list(zip(self.problem.episodes, solved.episodes, strict=True))
+        if any(own.grid.steps != other.grid.steps for own, other in pairs):
+            return self
+        episodes = [replace(own, input_errors=other.input_errors) for own, other in pairs]
+        return replace(self, problem=self.problem.with_episodes(episodes, self.problem.held_out))
 
     def with_time_step(self, time_step: float) -> AllCandidatesProblem:
         """The problem of the whole recordings with another time step [s], whitened by sensor noise alone."""

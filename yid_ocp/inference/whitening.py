@@ -336,17 +336,18 @@ def problem_whitened_at(
     return found if rounds < 2 else problem_whitened_at(found, x, equilibrium_guesses, rounds - 1)
 
 
-def problem_with_whitened_held_out(
-    problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
-) -> EstimationProblem:
+def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> EstimationProblem:
     """Whiten held-out residuals by all noise at `x`, or by sensor noise if a rollout fails.
 
-    Filters are relinearized about the smoothed motion; `keep_weights` weighs once, which is enough for torque offsets.
+    A recording is weighed once. Its filter is about the motion that its filter so far smooths; a first one is weighed
+    about its rollout, and linearized about the motion that it smooths itself.
     """
     x, episodes, made = np.asarray(x, float), [], []
-    for held, (episode, theta, offset) in zip(problem.held_out, problem.held_out_prediction_inputs(x), strict=True):
-        own, whitening = _whitened_episode(problem.predictor, episode, (theta, offset), None, None)
-        own, whitening = _whitened_episode(problem.predictor, own, (theta, offset), None, whitening, keep_weights)
+    known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
+    for held, (before, (episode, *at)) in zip(problem.held_out, known, strict=True):
+        own, whitening = _whitened_episode(problem.predictor, episode, (at[0], at[1]), None, _own_filter(before))
+        if before is None and whitening is not None:
+            own, whitening = _whitened_episode(problem.predictor, own, (at[0], at[1]), None, whitening, True)
         episodes.append(replace(held, input_errors=own.input_errors, equilibrium_guess=own.equilibrium_guess))
         made.append(whitening)
     return problem.with_episodes(problem.episodes, episodes, problem.whitening_filters, made)
