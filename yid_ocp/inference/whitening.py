@@ -336,18 +336,21 @@ def problem_whitened_at(
     return found if rounds < 2 else problem_whitened_at(found, x, equilibrium_guesses, rounds - 1)
 
 
-def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> EstimationProblem:
+def problem_with_whitened_held_out(
+    problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
+) -> EstimationProblem:
     """Whiten held-out residuals by all noise at `x`, or by sensor noise if a rollout fails.
 
-    A recording is weighed once. Its filter is about the motion that its filter so far smooths; a first one is weighed
-    about its rollout, and linearized about the motion that it smooths itself.
+    Filters are relinearized about the motion that those so far smooth, first ones about what they smooth themselves;
+    there `keep_weights` weighs once, which is enough for torque offsets.
     """
     x, episodes, made = np.asarray(x, float), [], []
     known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
-    for held, (before, (episode, *at)) in zip(problem.held_out, known, strict=True):
-        own, whitening = _whitened_episode(problem.predictor, episode, (at[0], at[1]), None, _own_filter(before))
-        if before is None and whitening is not None:
-            own, whitening = _whitened_episode(problem.predictor, own, (at[0], at[1]), None, whitening, True)
+    for held, (before, (own, theta, offset)) in zip(problem.held_out, known, strict=True):
+        whitening, at = _own_filter(before), (theta, offset)
+        if first := whitening is None:
+            own, whitening = _whitened_episode(problem.predictor, own, at, None, None)
+        own, whitening = _whitened_episode(problem.predictor, own, at, None, whitening, first and keep_weights)
         episodes.append(replace(held, input_errors=own.input_errors, equilibrium_guess=own.equilibrium_guess))
         made.append(whitening)
     return problem.with_episodes(problem.episodes, episodes, problem.whitening_filters, made)

@@ -38,7 +38,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     if apart:
         is_whitened = any(problem.held_out_whitening_filters)
         weigh = whitening.problem_with_whitened_held_out
-        held = problem if is_whitened else weigh(problem, x)
+        held = problem if is_whitened else weigh(problem, x, keep_weights=True)
         for (episode, result), own in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
             is_apart = episode.initial_state_shared_with is None
             if is_apart and isinstance(own, whitening.WhiteningFilter) and not isinstance(result, str):
