@@ -223,15 +223,9 @@ def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     figure.update_yaxes(**_POWERS)
-    return _add_curves(
-        figure, ((name, (t, relative_excess_over_lowest_cost(cost))) for name, (t, cost) in costs.items())
-    )
-
-
-def relative_excess_over_lowest_cost(costs: Sequence[float]) -> list[float]:
-    """Relative excess of costs over the lowest of them, cost / min(costs) - 1; at least 1e-9."""
-    least = max(min(costs, default=0.0), 1e-300)
-    return [max(cost / least - 1.0, 1e-9) for cost in costs]
+    least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}
+    excess = {name: (t, [max(c / least[name] - 1, 1e-9) for c in cost]) for name, (t, cost) in costs.items()}
+    return _add_curves(figure, excess.items())
 
 
 def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:

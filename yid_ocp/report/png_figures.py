@@ -1,4 +1,4 @@
-"""Figures written as PNG: sparsity patterns, convergence of methods, blind validation."""
+"""Figures written as PNG: sparsity patterns, blind validation."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from yid_ocp.analysis.compare import MethodComparison
 from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.errors import OutputError
-from yid_ocp.report.figures import LINE_COLORS, asymmetric_error_bars, relative_excess_over_lowest_cost
+from yid_ocp.report.figures import LINE_COLORS, asymmetric_error_bars
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,29 +24,6 @@ def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[st
     labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
     rates = {label: result["calibration"][key] for key, label in labels.items()}
     return {label: {entry["level"]: entry for entry in own if entry["of"]} for label, own in rates.items()}
-
-
-def draw_method_convergence(path: Path, comparison: MethodComparison) -> None:
-    """Write a PNG of each method's relative excess cost over iterations and over wall time; raises `OutputError`."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    by_iteration, by_time = figure.subplots(1, 2, sharey=True)
-    for run in comparison.method_results:
-        history = [entry for entry in run.solution.history if np.isfinite(entry.cost) and not entry.note]
-        if history:
-            relative = relative_excess_over_lowest_cost([entry.cost for entry in history])
-            for axes, places in ((by_iteration, range(len(history))), (by_time, [entry.seconds for entry in history])):
-                axes.plot(places, relative, marker=".", label=run.method)
-    for axes, label in ((by_iteration, "iteration"), (by_time, "wall time [s]")):
-        if axes.get_xlim()[1] > 2.0:  # below that it is linear all over, and has no ticks of its own
-            axes.set_xscale("symlog", linthresh=1.0)
-        axes.set(yscale="log", xlabel=label)
-        axes.set_xlim(left=0.0)
-        axes.grid(alpha=0.3)
-    by_iteration.set_ylabel("cost over its lowest value, less one")
-    by_iteration.legend()
-    _save(figure, path)
 
 
 def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:

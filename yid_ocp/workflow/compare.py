@@ -10,7 +10,6 @@ from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import Progress
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.report.png_figures import draw_method_convergence
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.solvers.base import EstimateChecks
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
@@ -45,7 +44,6 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
 
         limits, budget = run.diagnosis.null_test_residual_limits, run.compare.time_budget
         comparison = compare_methods(problem, solvers, truth, iterate, limits, math.inf if budget is None else budget)
-        draw_method_convergence(folder.path / "convergence.png", comparison)
         judged = comparison.verdict_solution
         own, checks = judged.problem or problem, judged.checks or EstimateChecks()
         held_out = checks.held_out_predictions
