@@ -21,6 +21,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.base import EffectBase
+from yid_ocp.errors import ConfigError
 from yid_ocp.export.equations import _MAX_JACOBIAN_OPERATIONS
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.discrete import discrete_equations
@@ -57,14 +58,40 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
-@pytest.mark.parametrize("name", ["tutorial", "inspection"])
-def test_commands_exist(page, repository, name):
-    [block] = blocks(page(name), "sh")
-    for line in block.strip().splitlines():
-        program, *arguments = shlex.split(line)
-        assert program == "yid-ocp"
-        said = build_argument_parser().parse_args(arguments)
-        assert name == "tutorial" or (repository / said.config).is_file()
+def printed_commands(text: str) -> list[list[str]]:
+    """Words of every command that a page prints, continued lines joined."""
+    found, lines = [], iter(text.splitlines())
+    for line in lines:
+        begin = re.match(r"\s*(?:\$ |python -m pip install [^&]*&& )?(yid-ocp .*)", line)
+        if begin is None:
+            continue
+        command = begin[1]
+        while True:
+            if command.endswith("\\"):
+                command = command[:-1] + next(lines).strip()
+                continue
+            try:
+                words = shlex.split(command, comments=True)
+                break
+            except ValueError:  # a quote that a later line closes
+                command += next(lines).strip()
+        for part in " ".join(map(shlex.quote, words)).replace("'&&'", "|").replace("'|'", "|").split(" | "):
+            found += [shlex.split(part)] if part.startswith("yid-ocp ") else []
+    return found
+
+
+def test_every_command_that_is_printed_is_understood(repository):
+    parser, count = build_argument_parser(), 0
+    for file in [repository / "README.md", *repository.glob("docs/**/*.md")]:
+        for _, *arguments in printed_commands(file.read_text(encoding="utf-8")):
+            try:
+                parser.parse_args(arguments)
+            except (SystemExit, ConfigError) as error:
+                pytest.fail(f"{file.name}: {' '.join(arguments)}: {error}")
+            named = [word for word in arguments if re.fullmatch(r"configs/\w+\.yaml", word)]
+            assert all((repository / word).is_file() for word in named), file.name
+            count += 1
+    assert count > 50
 
 
 def test_names_in_the_pages_exist(repository):
