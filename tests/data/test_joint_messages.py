@@ -130,7 +130,7 @@ def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without
     path = write(tmp_path, "lab_msgs/msg/Arm")
     assert main(["import", str(path), "--preview"]) == 0
     told = capsys.readouterr().out
-    assert "something has to be said first" in told
+    assert "needs more information" in told
     assert "--field position=" in told
     assert "\n  yid-ocp import" not in told
     words = [

@@ -115,10 +115,10 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
     first += "`yid-ocp diagnose`"
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    numbers = "beyond this model these mean something, with the ± that the misfit implies: a = 2 ± 0.1 N m/rad"
+    numbers = "beyond this model these values are meaningful, with a ± that includes the misfit: a = 2 ± 0.1 N m/rad"
     assert lines[:2] == [first, numbers]
     unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
-    assert "beyond this model no number means anything" in told("yid-solve/1", unsure)[1]
+    assert "beyond this model no value is meaningful" in told("yid-solve/1", unsure)[1]
     assert "beyond this model" not in told("yid-solve/1", unsure | {"fit": BAD | {"believed": False}})[1]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
     lines = told("yid-solve/1", said)

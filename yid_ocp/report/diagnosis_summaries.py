@@ -65,7 +65,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     left = len(result["which"]) - _MAX_CANDIDATES
     yield f"{left} more candidates are in result.json" if left > 0 else ""
-    yield f"these recordings could not show: {', '.join(result['unseen'])}" if result.get("unseen") else ""
+    yield f"not detectable in these recordings: {', '.join(result['unseen'])}" if result.get("unseen") else ""
     for signals, kinds in result.get("not_candidates", {}).items():
         yield f"no candidates, as nothing was recorded of {signals}: {', '.join(kinds)}"
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
@@ -80,11 +80,11 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             sizes = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
             rows.append((channel, made, *sizes, entry["unit"]))
     yield SummaryTable(rows, "Without the effects, and with them")
-    yield SummaryTable(torque_offset_table_rows(result), "How far the torques are off")
+    yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     if result.get("doubts"):
         yield "issues of the recordings may have caused this verdict"
     if result["next_plan"] is not None:
-        yield "to separate what looks alike, plan a motion:"
+        yield "to separate these effects, plan a motion:"
         yield CodeBlock(_planning_command(result["next_plan"]))
     yield f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
 
@@ -144,19 +144,19 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     marks: TableRows = [
         ("what", "value, and its binomial 95 % interval"),
         ("false alarms on clean data", sure["false_alarms"]),
-        ("true kind and place first, of the gaps found", sure["kind_first"]),
+        ("true kind and place first, of the detected gaps", sure["kind_first"]),
         ("among the first two", sure["kind_in_two"]),
         ("place first", sure["location_first"]),
-        ("what was named, alone or as not separable, holds the truth", sure["sets_cover"]),
-        ("how many were named, on average", _number(result["set_size"], ".2f")),
-        ("unknown said of effects that the library never had", sure["unknown_outside"]),
-        ("unknown said of effects taken out of it", sure["unknown_left_out"]),
+        ("the named effects, alone or as not separable, include the true one", sure["sets_cover"]),
+        ("number of named effects, on average", _number(result["set_size"], ".2f")),
+        ("unknown for effects outside the library", sure["unknown_outside"]),
+        ("unknown for effects removed from it", sure["unknown_left_out"]),
         ("place first of both", sure["unknown_location"]),
         ("both of a pair, each alone or in a set of three", sure["pairs_right"]),
         ("both of a pair, each alone", sure["pairs_named"]),
         ("closure over that of the true effect refitted", _share(result["closure_of_best"])),
         ("median error of the effects' parameters", _share(result["parameter_error"], 1)),
-        ("their 95 % intervals that hold the truth", sure["interval_coverage"]),
+        ("their 95 % intervals that contain the true value", sure["interval_coverage"]),
         ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
     ]
     sizes: TableRows = [
@@ -319,7 +319,7 @@ def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
         yield "the recordings have issues, so agreement of methods does not confirm the values"
     elif not found:
         yield "no parameter can be found from these recordings, so there is nothing to agree on"
-        yield "`yid-ocp identifiability CONFIG --what-if` says what would have to be measured"
+        yield "`yid-ocp identifiability CONFIG --what-if` lists measurements that would help"
     elif not result["agree"]:
         yield "the methods do not agree on the parameters that are found"
 
@@ -380,7 +380,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
     if not drifted and result["p_value"] >= result["level"]:
         p = _relation(result["p_value"])
-        yield f"Nothing drifted: all {len(runs)} runs agree within what they state (p {p})."
+        yield f"No parameter changed: all {len(runs)} runs agree within what they state (p {p})."
     elif not drifted:
         yield (
             f"Together the runs differ (p {_relation(result['p_value'])}), though no parameter alone does: look at "

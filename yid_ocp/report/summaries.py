@@ -75,7 +75,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *format_error_value_and_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
     yield SummaryTable(rows, "Errors where it was fitted")
     yield from _held_out_blocks(result)
-    yield SummaryTable(torque_offset_table_rows(result), "How far the torques are off")
+    yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     yield from discretisation_shift_sentences(result)
     yield from result.get("discretisation_notes", ())
     if failed:
@@ -221,7 +221,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     """Summary of what recordings tell of each parameter."""
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
-        said = f"{result['status']}: {result['message']}; there is no point at which to judge"
+        said = f"{result['status']}: {result['message']}; there is no point to analyse"
         yield SummaryStatement(said, "verdict")
         return
     unsure = ("±", "± if start and grasps were unknown", "± if all else were known")
@@ -241,7 +241,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"and {len(hidden) - _MAX_DIRECTIONS} more directions, in result.json"
     if not result["profiles"]:
-        yield "intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all"
+        yield "intervals of parameters are computed on request: --intervals NAME,NAME or --intervals all"
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]", "")]
@@ -279,7 +279,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     fitted = result["laws"][best]["parameters"].items()
     own = [(name, value_and_uncertainty_text(e["value"], e["std"], None), e["unit"]) for name, e in fitted]
     yield SummaryTable([("parameter", "value", "unit"), *own], f"Fit with the law '{best}'")
-    text = f"the law '{best}' is warranted: it is the simplest whose error is within one standard error of the least "
+    text = f"the law '{best}' is chosen: it is the simplest whose error is within one standard error of the least "
     text += f"({', '.join(result['kinds'])} left out in turn)"
     yield SummaryStatement(text, "conclusion")
     yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
@@ -293,7 +293,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         travel = own["travel"] if own["travel"] > 1e-9 else 0.0
         shares = ("" if own[key] is None else f"{100 * own[key]:.0f} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
-    yield SummaryTable(rows, "What it asks of the joints", is_key_table=True)
+    yield SummaryTable(rows, "Load of the joints", is_key_table=True)
     parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
     yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
     yield SummaryStatement(f"{result['status']}: {result['message']}", "conclusion")
@@ -301,23 +301,23 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if result["error"] is None or result["swing"] is None:
-        yield "the motion at which the search ended cannot be simulated to its end; nothing is known of where it leads"
+        yield "the final motion of the search cannot be simulated to its end, so its result is unknown"
         return
     place = ", ".join(f"{x:.4g}" for x in result["place"])
     yield (
         f"in {result['duration']:g} s '{result['point']}' goes to ({place}) m; in the {result['settle']:g} s after "
         f"that it is at most {1e3 * result['error']:.3g} mm from there, and no point of the object is faster than "
-        f"{1e3 * result['swing']:.3g} mm/s, as the model has it"
+        f"{1e3 * result['swing']:.3g} mm/s, by the model"
     )
     if result["off_path"] is not None:
-        yield f"on the way it is at most {1e3 * result['off_path']:.3g} mm from where its path is at that time"
+        yield f"on the way it is at most {1e3 * result['off_path']:.3g} mm from its path"
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
-        yield f"what is not known of the parameters makes that uncertain by ({std}) mm, one standard deviation"
+        yield f"the uncertainty of the parameters adds ({std}) mm, one standard deviation"
         if lost := result["from"]["uncertainty_unknown"]:
             yield f"not counted, as their uncertainty is not known: {', '.join(lost)}"
     elif result["from"]["run"] is None:
-        yield "the parameters are those of the configuration, so nothing is said of how uncertain that is"
+        yield "the parameters are those of the configuration, so its uncertainty is unknown"
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -416,11 +416,11 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         "rows of a step that contain the parameter, and those of them that sensors see to first order; what one unit "
         f"more moves: a reading at most (from rest, within {seconds:.2g} s), all readings together (recordings)"
     )
-    yield SummaryTable([*_dependence_rows(result)], "Where parameters enter, and who sees it", is_key_table=True)
+    yield SummaryTable([*_dependence_rows(result)], "Rows and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"and {left} more free parameters, in result.json" if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "what sensors see to first order is looked for about a rest, which this is not"
+        yield "observable rows are computed about a rest only"
     said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
     yield SummaryStatement(said, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]

@@ -156,8 +156,8 @@ def misfit_summary_blocks(
                     known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "beyond this model no number means anything: the misfit leaves each unsure by more than 10 %"
-            said = f"beyond this model these mean something, with the ± that the misfit implies: {shown}"
+            none = "beyond this model no value is meaningful: with the misfit each is uncertain by more than 10 %"
+            said = f"beyond this model these values are meaningful, with a ± that includes the misfit: {shown}"
             yield SummaryStatement(said if known else none, "conclusion")
 
 

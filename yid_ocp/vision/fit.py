@@ -64,9 +64,7 @@ class ShapeFitOptions:
     ] = (0.15, 0.05)
     surface_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
-        OptionInfo(
-            "the same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper", "m"
-        ),
+        OptionInfo("the same on the points of the cloud; empty for a fit to the nodes alone, as Caldwell et al.", "m"),
     ] = (0.03, 0.015)
     surface_noise_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")

@@ -245,7 +245,7 @@ def weighted_median(values: Array, weight: Array) -> float:
 class SkeletonOptions:
     """Settings of the skeleton extraction."""
 
-    segment_neighbours: Annotated[int, Ge(2), OptionInfo("points of a segment, k1 in the source paper")] = 50
+    segment_neighbours: Annotated[int, Ge(2), OptionInfo("points of a segment, k1 in Caldwell et al.")] = 50
     neighbour_radius: Annotated[
         PositiveFloat,
         OptionInfo("points further away are no neighbours; somewhat more than the thickest tube's diameter", "m"),

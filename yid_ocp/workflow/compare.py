@@ -1,4 +1,4 @@
-"""The command `compare`: several methods on one problem, compared with the result of the source paper."""
+"""The command `compare`: several methods on one problem, compared with the result of Caldwell et al. (2014)."""
 
 from __future__ import annotations
 

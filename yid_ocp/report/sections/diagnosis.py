@@ -64,9 +64,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         reference = factor * floor[channel] if channel in floor else None
         rows.append((channel, shown, ValueBeforeAfter(factor * error, later, reference=reference)))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
-    sentences = [
-        "Errors on recordings that no fit has touched, channel by channel; the tick is what noise alone gives."
-    ]
+    sentences = ["Errors on held-out recordings by channel; the tick is the error from noise alone."]
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
@@ -228,19 +226,19 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     if not entries:
         return None
     unit = (
-        "as a part of the excess over noise"
+        "as a fraction of the excess over noise"
         if percent
         else "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
     )
-    promise = f"hat each promises to first order where the model was fitted, {unit}."
-    sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
+    promise = f"redicted decrease of the fitted misfit by each, to first order, {unit}."
+    sentences = [f"P{promise}", "No predicted decrease is large enough for a refit."]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
         best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
         sentences = [
-            "Left: refitted together with the stiffnesses, each alone, and judged on held-out motions, with the 95 % "
+            "Left: refitted together with the stiffnesses, each alone, and tested on held-out motions, with the 95 % "
             f"interval; 100 % closes the gap, less than zero predicts worse. Closed by {said}.",
-            f"Right: w{promise}",
+            f"Right: p{promise}",
         ]
     # beside each other on a phone there is room for a word
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
@@ -347,10 +345,10 @@ def _curves(
     for recording, pair in list(best.values())[:_MAX_CHANNELS]:
         by_recording.setdefault(recording, []).extend(pair)
     shown = _recording_figures(by_recording, ", held out", figures.MEASURED_COLOR, _MODEL_COLORS)
-    what, count = "change most with the effects" if changed else "the nominal model misses most", len(best)
+    what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
     sentences = [
         f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
-        "each the error, with two standard deviations of the noise shaded: what is right stays within."
+        "each the error, with two standard deviations of the noise shaded; a correct model stays inside."
     ]
     return "Measured and predicted", sentences, shown
 
