@@ -251,4 +251,4 @@ def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
     lines = blind_tables_markdown(to_json_types(detection_and_false_alarm_rates(MARKS)))
     assert "| false alarms on clean data | 0 % (0 of 5, 0 % to 52 %) |" in lines
     assert f"| 3 | 8 | {' | '.join([*2 * ['75 % (6 of 8, 35 % to 97 %)'], '50 % (4 of 8, 16 % to 84 %)'])} |" in lines
-    assert "| two | 5 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines
+    assert "| two | 5 | 0 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines
