@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -213,14 +213,14 @@ def right(case: Case, finding: DiagnosisResult) -> bool:
 
 def rescored(folder: Path, names: Sequence[str], overrides: Sequence[str]) -> int:
     """Recorded cases judged again, beside what was said; how many differ."""
-    limits, differ = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis, 0
-    limits = replace(limits, max_effects=2)
+    wanted, differ = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis, 0
+    changes = {name: getattr(wanted, name) for name in (text.split("=")[0].split(".")[-1] for text in overrides)}
     print("| case | then | now | differs |\n|---|---|---|---|")
     for name in names:
         if not (file := folder / f"{name}.json").exists():
             continue
         data = read_input_json(file)
-        now = said(judge_recorded_case(data["evidence"], limits))
+        now = said(judge_recorded_case(data["evidence"], changes))
         differ += data["said"] != now
         print(f"| {name} | {data['said']} | {now} | {'yes' if data['said'] != now else '-'} |")
     return differ

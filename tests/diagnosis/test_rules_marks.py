@@ -8,8 +8,6 @@ from types import SimpleNamespace
 import pytest
 from factories import added, amplitude, cases, effect, finding, fit, loss, place, score, screening
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
-from yid_ocp.config.settings import config_yaml_with_defaults
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, labels_json_and_sha256, open_sealed_labels
 from yid_ocp.diagnosis.blind_scores import (
@@ -20,7 +18,7 @@ from yid_ocp.diagnosis.blind_scores import (
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import SearchRecord
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import LocatedGap
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
@@ -308,7 +306,7 @@ def diagnosed(decrease=80.0, there=0.5):
 def again(finding, **limits):
     """Verdict and effects of what was kept of a diagnosis, by other thresholds."""
     data = json.loads(json.dumps(evidence_to_json(finding), allow_nan=False))
-    found = judge_recorded_case(data, replace(DEFAULT_THRESHOLDS, **limits))
+    found = judge_recorded_case(data, limits)
     return found["verdict"], [f"{e['kind']}@{e['location']}" for e in found["effects"]]
 
 
@@ -334,6 +332,14 @@ def test_what_was_kept_of_a_case_is_judged_by_other_thresholds(made, limits, ver
     assert again(diagnosed(**made), **limits) == (verdict, [FRICTION.label] if verdict == "effect" else [])
 
 
+def test_a_case_keeps_its_own_thresholds_as_far_as_there_still_are_such():
+    asked = Thresholds(min_explained_fraction=0.6)
+    made = evidence_to_json(replace(diagnosed(decrease=120.0), thresholds=asked))
+    assert judge_recorded_case(made, {})["verdict"] == "effect"
+    made["thresholds"] = {"min_explained_fraction": 0.8, "one_that_is_gone": 3.0}
+    assert judge_recorded_case(made, {})["verdict"] == "unknown"
+
+
 def test_a_case_without_a_place_of_its_gap_is_not_judged_where_thresholds_see_one():
     assert again(replace(diagnosed(), located_gap=None))[0] == "not_judged"
 
@@ -348,11 +354,9 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
     ]
     text, digest = labels_json_and_sha256(sealed)
     monkeypatch.setattr("yid_ocp.workflow.blind.draw_blind_results", lambda *_: None)
-    run = load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
-    for part in ("sealed", "configs", "answers", "best"):
+    for part in ("sealed", "answers", "best"):
         (tmp_path / part).mkdir()
     (tmp_path / "sealed/labels.json").write_text(text)
-    (tmp_path / "configs/of.yaml").write_text(config_yaml_with_defaults(run))
     told = {"sha256": digest, "cases": 2, "seed": 3, "purpose": "report", "configs": {"of": ""}}
     (tmp_path / "commitment.json").write_text(json.dumps(told))
     first, second = diagnosed(), diagnosed()

@@ -448,6 +448,7 @@ def evidence_to_json(finding: DiagnosisResult) -> dict[str, Any]:
         "screening": _screening_to_json(finding.screening),
         "are_offsets_stated": finding.are_offsets_stated,
         "has_left_baseline": finding.has_left_baseline,
+        "thresholds": plain(finding.thresholds),
         "located_gap": None if finding.located_gap is None else plain(finding.located_gap),
         "remaining": [plain(place) for place in finding.remaining_gap_locations],
         "refits": {name: fit and _refit_to_json(fit) for name, fit in sorted(record.refits.items())},
@@ -521,12 +522,16 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
     return EFFECTS[kind](kind, location, Parameters(entries), definitions=definitions)
 
 
-def judge_recorded_case(data: Mapping[str, Any], limits: Thresholds) -> dict[str, Any]:
-    """Judge what `evidence_to_json` returned by other thresholds; return the part of `yid-diagnosis/2` that is scored.
+def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Judge what `evidence_to_json` returned again; return the part of `yid-diagnosis/2` that is scored.
 
-    The verdict is `not_judged` where these thresholds ask for a refit that was not made. What steers the search
-    before the first screening (events, the time step, other starts) is as it was.
+    Thresholds are those of the diagnosis, as far as there still are such, with `changes`. The verdict is `not_judged`
+    where they ask for a refit that was not made. What steers the search before the first screening (events, the time
+    step, other starts) is as it was.
     """
+    known = {entry.name for entry in fields(Thresholds)}
+    kept = {name: value for name, value in data["thresholds"].items() if name in known}
+    limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))
     case = _RecordedCase(data)
     try:
         judged = judge(

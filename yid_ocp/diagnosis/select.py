@@ -155,8 +155,9 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, effect: EffectBas
     Where both models leave noise the likelihood decides, otherwise the part of the gap that it closes.
     """
     before, after = without.held_out_loss, fit.held_out_loss
-    (gained, error), part = held_out_improvement(before, after), limits.min_gap_closed * before.excess_chi2_per_sample
-    closes = not _is_explained(without, limits) and 0 < part <= gained > error
+    (gained, error), gap = held_out_improvement(before, after), before.excess_chi2_per_sample
+    is_open = gap > 0 and not _is_explained(without, limits)
+    closes = is_open and gained > error and gained >= limits.min_gap_closed * gap
     return (closes or _lr_decisive(before, after, limits)) and _is_significant(effect, fit, limits)
 
 

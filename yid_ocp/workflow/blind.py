@@ -169,17 +169,16 @@ def rescore_blind(
     labels = {}
     for label in blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"]):
         labels[label.case] = label
-    limits = {
-        name: load_config(made / "configs" / f"{name}.yaml", overrides).diagnosis for name in commitment["configs"]
-    }
+    wanted = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
+    names = [text.partition("=")[0].removeprefix("diagnosis.") for text in overrides]
+    changes = {name: getattr(wanted, name) for name in names if hasattr(wanted, name)}
     marks, changed = [], []
     answers, best = _stored_values(made / "answers"), _stored_values(made / "best")
     progress.begin_stage(f"judging {len(answers)} of {commitment['cases']} cases")
     for case, found in sorted(answers.items()):
         label, then, now = labels[case], found["result"], found["result"]
         if found.get("evidence") is not None:
-            config = label.experiment.rpartition(".")[0]
-            now = blind_scores.judge_recorded_case(found["evidence"], limits[config])
+            now = blind_scores.judge_recorded_case(found["evidence"], changes)
         shares = (math.nan if best.get(case) is None else float(best[case]), float(found["seconds"]))
         before, mark = (blind_scores.score_blind_case(label, told, *shares) for told in (then, now))
         marks.append(mark)
