@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import fields
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from yid_ocp.diagnosis.events import ForceOrFaultEvent
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.parallel import WorkerConfig
 
 # -- run.py: ratios within one run ------------------------------------------------------------------------------------
@@ -41,6 +44,25 @@ def test_a_regression_is_a_ratio_that_grew_beyond_the_tolerance(run):
     assert "1.55 times" in found[0]
     assert "not measured" in found[1]
     assert "limit 20 s" in found[2]
+
+
+# -- ablation.py: what each rule is worth -----------------------------------------------------------------------------
+
+
+def test_a_rule_is_worth_the_cases_that_change_without_it(benchmark_module, monkeypatch, tmp_path):
+    ablation, asked = benchmark_module("ablation"), []
+    ways = [("effect a@b", [True, False]), ("effect a@b", [False, True]), ("unknown -", [False, False])]
+    changed = [{"now": now, "right": right} for now, right in [*ways, ("not_judged -", [True, False])]]
+
+    def rescored(folder, out, settings):
+        asked.append(settings)
+        return SimpleNamespace(result={"cases": 9, "not_judged": 1, "rescored": {"changed": changed}})
+
+    monkeypatch.setattr(ablation, "rescore_blind", rescored)
+    found = ablation.changes(tmp_path, ["diagnosis.min_z=0"])
+    assert dict(found) == {"cases": 9, "not_judged": 1, "lost": 1, "gained": 1, "otherwise": 1}
+    assert asked == [["diagnosis.min_z=0"]]
+    assert set(ablation.NEUTRAL) <= {entry.name for entry in fields(Thresholds)}
 
 
 # -- coverage.py: whether standard deviations are true ----------------------------------------------------------------
