@@ -10,13 +10,13 @@ from made_series import series
 
 from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.screening import (
+    _candidate_detectable_amplitudes,
+    _confusability_matrix,
     _covariance_of_scores,
+    _make_joint_score_model,
     _newey_west_covariance,
+    _score_candidates,
     _shape_grid,
-    candidate_detectable_amplitudes,
-    confusability_matrix,
-    make_joint_score_model,
-    score_candidates,
 )
 
 CHI2 = scipy.stats.chi2
@@ -29,7 +29,7 @@ SHAPED = effect("branch@T1", amplitude(), shape())
 def only(of, columns, residual, noise=None, **shapes):
     """The score of one candidate that is visible."""
     at = point(residual, signature(of, columns, noise, **shapes))
-    [found] = score_candidates(at, [series(range(len(residual)))], [visible(of)])
+    [found] = _score_candidates(at, [series(range(len(residual)))], [visible(of)])
     return found
 
 
@@ -100,21 +100,21 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
 )
 def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
     of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
-    [found] = candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)), z=2.0)
+    [found] = _candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)), z=2.0)
     assert found.detectable_amplitudes == {"friction@elbow.a": pytest.approx(size)}
     assert found.is_detectable is seen
 
 
 def test_the_range_counts_from_the_neutral_value():
     of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
-    found = [candidate_detectable_amplitudes(point([0.0], signature(of, [c])), 2.0)[0] for c in (6.0, 8.0)]
+    found = [_candidate_detectable_amplitudes(point([0.0], signature(of, [c])), 2.0)[0] for c in (6.0, 8.0)]
     assert [entry.is_detectable for entry in found] == [False, True]
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
 def test_the_best_shape_tells_what_is_detectable(order):
     at = point([0.0], *(signature(SHAPED, [size], s=size) for size in order))
-    [found] = candidate_detectable_amplitudes(at, z=2.0)
+    [found] = _candidate_detectable_amplitudes(at, z=2.0)
     assert found.detectable_amplitudes["branch@T1.a"] == pytest.approx(0.5)
     assert found.is_detectable
 
@@ -129,7 +129,7 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
         ((seen, weaker), "y", 0.5, True),
         ((hidden, larger), "x", 0.1, False),
     ):
-        [found] = candidate_detectable_amplitudes(point([0.0], *pair), z=2.0)
+        [found] = _candidate_detectable_amplitudes(point([0.0], *pair), z=2.0)
         assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
 
 
@@ -201,20 +201,20 @@ def test_the_best_of_many_shapes_counts_as_the_best_of_that_many_tries():
     r = np.array([-1.5, -1.5, 0.0, 0.0])
     columns = [np.array(c) for c in ([1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0])]
     at = point(r, *(signature(SHAPED, c, s=0.1 * (i + 1)) for i, c in enumerate(columns)))
-    [found] = score_candidates(at, [series(range(4))], [visible(SHAPED)])
+    [found] = _score_candidates(at, [series(range(4))], [visible(SHAPED)])
     alone = only(SHAPED, columns[1], r, s=0.2)
     assert found.predicted_values == {"branch@T1.a": pytest.approx(1.5), "branch@T1.s": 0.2}
     assert found.predicted_chi2_decrease == pytest.approx(4.5)
     assert found.p_value == pytest.approx(3 * alone.p_value)
     none = point(0 * r, *(signature(SHAPED, c, s=1.0) for c in columns))
-    assert score_candidates(none, [series(range(4))], [visible(SHAPED)])[0].p_value == 1.0
+    assert _score_candidates(none, [series(range(4))], [visible(SHAPED)])[0].p_value == 1.0
 
 
 def test_scores_are_of_visible_candidates_and_the_most_promising_first():
     others = [effect(f"offset@{name}", amplitude(lower=-math.inf)) for name in ("a", "b", "c")]
     at = point([3.0, 2.0, 1.0], *(signature(of, np.eye(3)[i]) for i, of in zip((1, 0, 2), others, strict=True)))
     seen = [visible(others[0]), visible(others[1]), visible(others[2], seen=False)]
-    found = score_candidates(at, [series(range(3))], seen)
+    found = _score_candidates(at, [series(range(3))], seen)
     assert [s.effect.label for s in found] == ["offset@b", "offset@a"]
     assert [s.predicted_chi2_decrease for s in found] == pytest.approx([9.0, 4.0])
 
@@ -227,25 +227,25 @@ def test_a_signature_explained_by_another():
     b = effect("b@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
     angle = math.radians(30)
     at = point([0.0] * 2, signature(a, [2.0, 0.0]), signature(b, [math.cos(angle), math.sin(angle)]))
-    found = confusability_matrix(make_joint_score_model(at))
+    found = _confusability_matrix(_make_joint_score_model(at))
     assert found.labels == ("a@x", "b@x")
     np.testing.assert_allclose(found.overlap_fractions, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
     # nothing is like what moves nothing
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
-    found = confusability_matrix(make_joint_score_model(at))
+    found = _confusability_matrix(_make_joint_score_model(at))
     np.testing.assert_array_equal(found.overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])
-    assert confusability_matrix(make_joint_score_model(point([0.0]))).labels == ()
+    assert _confusability_matrix(_make_joint_score_model(point([0.0]))).labels == ()
 
 
 def test_shapes_are_those_of_the_scores_or_the_middle_of_the_grid():
     one = effect("one@x", amplitude())
     axes = [signature(SHAPED, np.eye(4)[i], s=0.1 * (i + 1)) for i in range(4)]
     at = point([0.0] * 4, *axes, signature(one, [0.0, 1.0, 0.0, 0.0]))
-    assert confusability_matrix(make_joint_score_model(at)).overlap_fractions[1, 0] == 0.0
+    assert _confusability_matrix(_make_joint_score_model(at)).overlap_fractions[1, 0] == 0.0
     chosen = score(SHAPED, step={"branch@T1.a": 1.0, "branch@T1.s": 0.2})
-    assert confusability_matrix(make_joint_score_model(at, [chosen])).overlap_fractions[1, 0] == pytest.approx(1.0)
+    assert _confusability_matrix(_make_joint_score_model(at, [chosen])).overlap_fractions[1, 0] == pytest.approx(1.0)
     middle = point([0.0] * 4, *axes, signature(one, [0.0, 0.0, 1.0, 0.0]))
-    assert confusability_matrix(make_joint_score_model(middle)).overlap_fractions[1, 0] == pytest.approx(1.0)
+    assert _confusability_matrix(_make_joint_score_model(middle)).overlap_fractions[1, 0] == pytest.approx(1.0)
 
 
 def test_candidates_alike_explain_the_signature_from_the_limit_on():
@@ -264,10 +264,10 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = list(make_joint_score_model(at).ranked_pairs([a.label, b.label, c.label]))
+    pairs = list(_make_joint_score_model(at).ranked_pairs([a.label, b.label, c.label]))
     assert ["".join(of.kind for of in pair) for pair, *_ in pairs] == ["ab", "ac", "bc"]
     assert pairs[0][1:] == (pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0}), pytest.approx(-1.0))
-    [(fewer, *_)] = make_joint_score_model(at).ranked_pairs(["c@x", "b@x"])
+    [(fewer, *_)] = _make_joint_score_model(at).ranked_pairs(["c@x", "b@x"])
     assert fewer == (b, c)
 
 
@@ -277,7 +277,7 @@ def test_pairs_promise_what_the_linear_model_of_both_does():
     columns = [rng.standard_normal((9, len(of.amplitude_names))) for of in effects]
     residual = rng.standard_normal(9)
     made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
-    for pair, values, decrease in make_joint_score_model(point(residual, *made)).ranked_pairs(
+    for pair, values, decrease in _make_joint_score_model(point(residual, *made)).ranked_pairs(
         [of.label for of in effects]
     ):
         x = np.hstack([columns[effects.index(of)] for of in pair])

@@ -13,7 +13,7 @@ from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext
-from yid_ocp.diagnosis.screening import ScreeningResult, make_joint_score_model
+from yid_ocp.diagnosis.screening import ScreeningResult, _make_joint_score_model
 from yid_ocp.diagnosis.select import (
     _is_plausible,
     _is_significant,
@@ -217,7 +217,7 @@ def test_a_value_that_may_as_well_lie_within_is_not_out_of_its_range():
 # -- the shortlist ----------------------------------------------------------------------------------------------------
 
 
-FEW = make_joint_score_model(point([0.0]))
+FEW = _make_joint_score_model(point([0.0]))
 
 
 def ranked(**decreases):

@@ -13,12 +13,12 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_ef
 from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
 from yid_ocp.diagnosis.screening import (
     AllCandidatesLinearization,
+    _candidate_detectable_amplitudes,
+    _confusability_matrix,
     _EffectSignature,
-    candidate_detectable_amplitudes,
-    confusability_matrix,
+    _make_joint_score_model,
+    _score_candidates,
     linearize_candidates,
-    make_joint_score_model,
-    score_candidates,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import make_effect
@@ -60,7 +60,9 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
 
 def test_screening_finds_the_withheld_effect_first_and_promises_what_a_refit_does_to_a_linear_model(screened):
     composed, nominal, point = screened
-    ranked = score_candidates(point, residual_channel_indices(nominal.problem), candidate_detectable_amplitudes(point))
+    ranked = _score_candidates(
+        point, residual_channel_indices(nominal.problem), _candidate_detectable_amplitudes(point)
+    )
     assert ranked[0].effect.label == "joint_coulomb@elbow"
     assert ranked[0].predicted_values["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
     assert ranked[0].p_value < 1e-6
@@ -83,7 +85,7 @@ def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_t
         leak = np.abs(jacobian.T @ signature.projected_sensitivity / size[:, None]).max()
         assert leak < 1e-8 * max(np.abs(signature.projected_sensitivity).max(), 1e-300) * len(jacobian)
     # a candidate explains itself, and nothing explains more
-    table = confusability_matrix(make_joint_score_model(point))
+    table = _confusability_matrix(_make_joint_score_model(point))
     assert np.diag(table.overlap_fractions) == pytest.approx(1.0)
     assert np.all((table.overlap_fractions >= 0) & (table.overlap_fractions <= 1))
     assert "joint_stribeck@elbow" in table.labels
@@ -92,7 +94,7 @@ def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_t
 def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_noise(screened):
     _, _, point = screened
     still = AllCandidatesLinearization(0 * point.projected_residual, point.signatures)
-    sizes, silent = ([v.detectable_amplitudes for v in candidate_detectable_amplitudes(at)] for at in (point, still))
+    sizes, silent = ([v.detectable_amplitudes for v in _candidate_detectable_amplitudes(at)] for at in (point, still))
     assert sizes == silent
     coulomb = next(size["joint_coulomb@elbow.tau_c"] for size in sizes if "joint_coulomb@elbow.tau_c" in size)
     assert 0 < coulomb < 0.1
@@ -109,7 +111,7 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
     signatures = tuple(_EffectSignature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
     point = AllCandidatesLinearization(residual[:, 0], signatures)
-    best = score_candidates(point, [series(range(200))], candidate_detectable_amplitudes(point))[0]
+    best = _score_candidates(point, [series(range(200))], _candidate_detectable_amplitudes(point))[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
 
 

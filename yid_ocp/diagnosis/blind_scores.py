@@ -40,9 +40,9 @@ _CATEGORIES = tuple(BLIND_CASE_CATEGORY_SHARES)
 _OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
 """Categories whose true effect is not among the candidates."""
 _MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
-NOT_JUDGED = "not_judged"
+_NOT_JUDGED = "not_judged"
 """Verdict of a recorded case where other thresholds ask for a refit that was not made."""
-_VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", NOT_JUDGED)
+_VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", _NOT_JUDGED)
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
 
-    every, marks = marks, [m for m in marks if m.verdict != NOT_JUDGED]
+    every, marks = marks, [m for m in marks if m.verdict != _NOT_JUDGED]
     by = {sort: [m for m in marks if m.category == sort] for sort in _CATEGORIES}
     singles, pairs = by["single"], by["pair"]
     strange = [m for m in marks if m.category in _OUT_OF_LIBRARY_CATEGORIES]
@@ -229,7 +229,7 @@ def _rates(intervals: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """Cases, those not judged, false alarms and right answers of one experiment."""
-    every, own = own, [m for m in own if m.verdict != NOT_JUDGED]
+    every, own = own, [m for m in own if m.verdict != _NOT_JUDGED]
     return {
         "cases": len(every),
         "not_judged": len(every) - len(own),
@@ -540,7 +540,7 @@ def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> 
             case.locate,
         )
     except UnrecordedRefitError:
-        judged = Judgement(NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, ())
+        judged = Judgement(_NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, ())
     where = () if case.located_gap is None else case.located_gap.locations
     if judged.accepted:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])

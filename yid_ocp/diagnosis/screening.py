@@ -128,7 +128,7 @@ def _basis(matrix: Array) -> Array:
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
 
 
-def candidate_detectable_amplitudes(
+def _candidate_detectable_amplitudes(
     point: AllCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
 ) -> tuple[DetectableAmplitudes, ...]:
     """Return the smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
@@ -185,7 +185,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
     return total
 
 
-def score_candidates(
+def _score_candidates(
     point: AllCandidatesLinearization,
     series: Sequence[ResidualChannel],
     visible: Sequence[DetectableAmplitudes],
@@ -303,7 +303,7 @@ class AllCandidatesScoreModel:
             yield (one, other), values, float(penalized)
 
 
-def make_joint_score_model(
+def _make_joint_score_model(
     point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
 ) -> AllCandidatesScoreModel:
     """Return the joint linear model of all candidates, at the shape values of `chosen` or the middle of the grid."""
@@ -319,7 +319,7 @@ def make_joint_score_model(
     return AllCandidatesScoreModel(effects, shapes, every.T @ every, -(every.T @ point.projected_residual))
 
 
-def confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:
+def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:
     """Return the signature fractions that candidates explain of each other, with amplitudes scaled by prior range."""
     ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
@@ -353,7 +353,7 @@ def screen_candidates(
 ) -> ScreeningResult:
     """Screen all candidates not in `base`; return their detectability, scores and confusability at `values`."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
-    visible = candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
-    ranked = score_candidates(point, residual_channel_indices(problem.problem), visible)
-    everything = make_joint_score_model(point, ranked)
-    return ScreeningResult(visible, ranked, confusability_matrix(everything), everything)
+    visible = _candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
+    ranked = _score_candidates(point, residual_channel_indices(problem.problem), visible)
+    everything = _make_joint_score_model(point, ranked)
+    return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)
