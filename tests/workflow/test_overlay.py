@@ -7,6 +7,10 @@ import h5py
 import numpy as np
 import pytest
 
+from yid_ocp.report import diagnosis_summaries  # noqa: F401, it registers
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.workflow.run_history import _overlaid_parameters
+
 
 @pytest.fixture(scope="module")
 def two_runs(pendulum_data, tmp_path_factory):
@@ -64,3 +68,16 @@ def test_runs_that_share_only_some_recordings_are_refused_by_name(two_runs, cli,
     assert f"held_out.h5 only in {first}" in refused.err
     assert "the other's `recordings`" in refused.err
     assert not (tmp_path / "both").exists()
+
+
+def test_a_value_that_cannot_be_found_has_no_digits_and_no_difference():
+    entry = {"value": 3.001, "std": None, "unit": "N m/rad", "free": True, "verdict": "not_identifiable"}
+    found = [{"k": entry}, {"k": entry | {"value": 2.5, "std": 0.1, "verdict": "identifiable"}}]
+    parameters = _overlaid_parameters(["a", "b"], found)
+    assert (parameters["k"]["difference"], parameters["k"]["difference_in_std"]) == (None, None)
+    channel = {"recording": "r", "channel": "points.p", "unit": "m", "held_out": True, "rmse": {"a": 1.0, "b": 2.0}}
+    result = {"format": "yid-overlay/1", "runs": {"a": "a", "b": "b"}, "parameters": parameters}
+    lines = summary_terminal_lines(
+        SUMMARY_BY_RESULT_FORMAT["yid-overlay/1"](result | {"channels": [channel | {"difference": 0.5}]})
+    )
+    assert "k          –  2.5 ± 0.1  N m/rad" in lines

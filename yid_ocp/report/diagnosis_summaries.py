@@ -445,7 +445,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
-    if entry is None:
-        return ""
+    if entry is None or entry["verdict"] == "not_identifiable":
+        return "" if entry is None else "–"
     text = value_and_uncertainty_text(entry["value"], entry["std"], None)
     return text if entry["free"] else f"{entry['value']:.4g} (fixed)"

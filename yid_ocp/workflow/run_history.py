@@ -349,31 +349,30 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
             "animations": _overlaid_motions(folders, labels, found),
             "section_data": {"overlay": pairs},
         }
+        more["robot"] = None if (first := _settings(folders[0])) is None else first.model.robot
         told |= {"channels": channels}
         written = folder.write_result_and_report(settings, progress, told, "overlay.json", **more)
     return CommandOutcome(folder.path, written, None)
 
 
 def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Values of every parameter that is free in one of two runs, and their difference over the larger std."""
+    """Values of every parameter that is free in one of two runs, and their difference over the larger std.
+
+    There is no difference from a value that a run could not find.
+    """
     parameters: dict[str, Any] = {}
     for name in dict.fromkeys(name for own in found for name, entry in own.items() if entry.get("free", True)):
-        values = {
-            label: {
-                key: own[name].get(key, default) for key, default in (("value", None), ("std", None), ("free", True))
-            }
-            for label, own in zip(labels, found, strict=True)
-            if name in own
-        }
-        both = [entry["value"] for entry in values.values()]
-        apart = both[1] - both[0] if len(both) == 2 else None
-        largest = max((entry["std"] or 0.0 for entry in values.values()), default=0.0)
-        parameters[name] = {
-            "unit": next(own[name]["unit"] for own in found if name in own),
-            "values": values,
-            "difference": apart,
-            "difference_in_std": None if apart is None or largest == 0 else apart / largest,
-        }
+        known = {label: own[name] for label, own in zip(labels, found, strict=True) if name in own}
+        kept = {"value": None, "std": None, "free": True, "verdict": None}
+        values = {label: {key: own.get(key, kept[key]) for key in kept} for label, own in known.items()}
+        both = [own["value"] for own in values.values() if own["verdict"] != "not_identifiable"]
+        apart, largest = (
+            both[1] - both[0] if len(both) == 2 else None,
+            max(own["std"] or 0.0 for own in values.values()),
+        )
+        over = None if apart is None or largest == 0 else apart / largest
+        unit = next(iter(known.values()))["unit"]
+        parameters[name] = {"unit": unit, "values": values, "difference": apart, "difference_in_std": over}
     return parameters
 
 

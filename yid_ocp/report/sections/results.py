@@ -117,7 +117,8 @@ def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
     rows = []
     if result.get("format") in formats:
         for name, entry in result["parameters"].items():
-            values = {run: (own["value"], own["std"]) for run, own in entry["values"].items()}
+            known = {r: own for r, own in entry["values"].items() if own.get("verdict") != "not_identifiable"}
+            values = {run: (own["value"], own["std"]) for run, own in known.items()}
             rows.append((name, entry["unit"], values))
     return figures_by_unit(rows, figures.parameter_values_by_source_figure)
 

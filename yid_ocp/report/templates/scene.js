@@ -137,7 +137,7 @@ class Viewer {
   // where a place is on the canvas: x and y in pixels, how near, and pixels a metre there
   eye(width, height) {
     const { yaw, tilt, zoom } = this.turn, [cy, sy, ct, st] = [Math.cos(yaw), Math.sin(yaw), Math.cos(tilt), Math.sin(tilt)];
-    const away = 4 * this.reach, size = (0.54 * Math.min(width, height) * zoom * away) / this.reach;
+    const away = 4 * this.reach, size = (0.46 * Math.min(width, height) * zoom * away) / this.reach;
     return (place) => {
       const [x, y, z] = place.map((value, c) => value - this.middle[c]);
       const right = cy * x + sy * y, into = -sy * x + cy * y, up = ct * z + st * into, far = away + ct * into - st * z;
