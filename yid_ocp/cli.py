@@ -1,4 +1,4 @@
-"""The command line: commands, their arguments and shell completion.
+"""Command-line interface with commands, their arguments and shell completion.
 
 `workflow` implements the commands. A command's module is imported when it runs, so that help needs none of the
 libraries for numbers.

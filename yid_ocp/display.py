@@ -14,7 +14,7 @@ _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows
 
 @dataclass(frozen=True)
 class ReprLineAndTableRows:
-    """Texts that represent an object: one line without its class name, and rows of a notebook table, header first."""
+    """Texts that represent an object: a line without class name, and rows of a notebook table, header first."""
 
     one_line: str
     table_rows: Sequence[Sequence[str]] = ()
@@ -68,7 +68,7 @@ class Progress:
         """Report that `done` of `total` parts of the stage are finished. `text` names the last or next one."""
 
     def report_table(self, rows: Sequence[Sequence[str]]) -> None:
-        """Report a table of all results so far, header first, then best first. It replaces the previous table."""
+        """Report a table of all results so far, header and best result first. It replaces the previous table."""
 
 
 NULL_PROGRESS = Progress()

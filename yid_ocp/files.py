@@ -58,7 +58,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 @contextlib.contextmanager
 def limited_memory() -> Iterator[None]:
-    """Limit this process to 1.75 GiB of memory beyond its present use (context manager, Linux only).
+    """Limit this process to 1.75 GiB beyond its present memory use. This context manager works on Linux only.
 
     It is for libraries that unpack what a file from outside holds; what is more becomes a MemoryError.
     """

@@ -1,4 +1,4 @@
-"""Handle signals that end a command: re-raise those that libraries suppress, and finally kill the process."""
+"""Handle signals that end a command. Those that libraries suppress are re-raised; finally the process is killed."""
 
 from __future__ import annotations
 

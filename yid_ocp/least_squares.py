@@ -19,7 +19,7 @@ _MAX_STEP = 0.5  # by which a component moves at most in one step
 
 @dataclass(frozen=True)
 class LocalQuadraticModel:
-    """Quadratic model of a cost about one point: value, gradient (n,), positive definite Hessian (n, n)."""
+    """Quadratic model of a cost about one point, with value, gradient (n,) and positive definite Hessian (n, n)."""
 
     cost: float
     gradient: Array

@@ -53,7 +53,7 @@ class RegistryChoice:
 
 @dataclass(frozen=True)
 class Option:
-    """Annotated type, default (`MISSING` where there is none) and dataclass field name of an option."""
+    """Annotated type, default and dataclass field name of an option. The default is `MISSING` where there is none."""
 
     type_hint: Any
     default_value: Any

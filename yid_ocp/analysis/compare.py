@@ -1,4 +1,4 @@
-"""Compare estimation methods on one problem, and with the results of Caldwell et al. (2014)."""
+"""Compare estimation methods on one problem, and with published results."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[f
 def explain_paper_estimates(
     experiment: str, estimates: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """Explain in a sentence why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours.
+    """Explain why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours, a sentence each.
 
     `estimates` are those of the parameters from recordings of such an experiment, `truth` their values where known.
     Empty where the model does not explain the recordings. The reason, judged by synthetic recordings, is the first of

@@ -1,4 +1,4 @@
-"""Errors from links and time steps: shifted estimates, natural frequencies, open grasps and numerical stability."""
+"""Errors from finite links and time steps, natural frequencies, open grasps and numerical stability."""
 
 from __future__ import annotations
 
@@ -414,7 +414,7 @@ class AlternatingErrorGrowth:
 
     @property
     def description(self) -> str:
-        """State in a sentence whether the time step is stable, with a remedy if it is not."""
+        """Explain in a sentence whether the time step is stable, with a remedy for an unstable one."""
         step = f"{self.recording_name}: the step of {self.time_step:g} s is"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along the motion"
@@ -468,7 +468,7 @@ def _alternating_mode_magnitude(
 
 
 def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
-    """Largest alternating error growth of all recordings at x (nx,), up to a failed step. None if none can start."""
+    """Largest alternating error growth of all recordings at x, up to a failed step. None if none can start."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)

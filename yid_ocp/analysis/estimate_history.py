@@ -1,4 +1,4 @@
-"""Compare estimates of one model from several runs: pooled mean, drifting parameters and outlier runs.
+"""Pool estimates of one model from several runs, and find drifting parameters and outlier runs.
 
 For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. Where
 nothing changed, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the

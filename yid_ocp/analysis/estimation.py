@@ -1,4 +1,4 @@
-"""Parameter estimation as `solve` reports it, with complete uncertainty and checks."""
+"""Parameter estimation with complete uncertainty and checks, as in the command `solve`."""
 
 from __future__ import annotations
 

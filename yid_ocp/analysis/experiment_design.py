@@ -1,4 +1,4 @@
-"""Fisher information of hypothetical variants of a recorded experiment: grasps, arms, motions and sensors."""
+"""Fisher information of hypothetical variants of a recorded experiment in grasps, arms, motions and sensors."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ class RecordedExperiment:
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The camera's point group (None: defaults are used), frame times since the start [s], typical std [m]."""
+        """Point group of the camera (None: defaults), with frame times since the start [s] and typical std [m]."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The arms' point group (None: defaults are used), its sample times [s] and typical std [m]."""
+        """Point group of the arms (None: defaults), with sample times [s] and typical std [m]."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
 
@@ -166,7 +166,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 
 
 def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_ObservableFrame]]:
-    """Add all measurable frames to a step's mechanism, and return them too. The equations stay the same."""
+    """Add all measurable frames to a step's mechanism and list the frames. The equations stay the same."""
     mechanism, seen = step.system.mechanism, observable_frames(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
@@ -192,7 +192,7 @@ class CandidateExperimentSensitivities:
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def fisher_information_with_prior(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
-        """Fisher information of observations (one list per recording) plus the prior's, (nx, nx)."""
+        """Fisher information of observations plus that of the prior, (nx, nx). There is one list per recording."""
         total = self.prior_information.copy()
         nx = len(total)
         for i, episode in enumerate(self.problem.episodes):

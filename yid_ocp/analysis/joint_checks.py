@@ -83,7 +83,7 @@ class RecordedJointsModel:
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
-        """Positions of frames, (N, nf, 3) [m], and their Jacobian (N, nf, 3, k) at recorded angles `q` (N, k).
+        """Positions of frames and their Jacobian at recorded angles `q` (N, k). Shapes: (N, nf, 3) [m], (N, nf, 3, k).
 
         The frames are such that `is_frame_determined_by_angles`.
         """

@@ -1,4 +1,4 @@
-"""Check measured points against a model: mirrored, exchanged, scaled, delayed or out of reach."""
+"""Check whether measured points are mirrored, exchanged, scaled, delayed or out of reach of a model."""
 
 from __future__ import annotations
 
@@ -237,7 +237,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 def check_point_distances(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, choice: _SensorChoices
 ) -> Iterator[Issue]:
-    """Yield issues about points farther apart or from the root than the object's length between them allows."""
+    """Yield issues about points that are farther apart, or from the root, than the object's length allows."""
     mechanism = system.mechanism
     for group in recording.points:
         frames = _point_frames(system, group, choice(group.name))

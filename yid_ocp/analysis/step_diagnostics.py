@@ -25,7 +25,7 @@ _DIFFERENCE_STEP = 1e-5
 
 @dataclass(frozen=True)
 class CheckedStepLinearisation:
-    """Linearisation A, B of a step at a state (q, p, z), with its deviations from finite differences."""
+    """Linearisation of a step at one state, with its deviations from finite differences."""
 
     state: Array
     a: Array  # A_k, shape (nx, nx)
@@ -36,7 +36,7 @@ class CheckedStepLinearisation:
 
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
-    """Sizes of a step: vector lengths, unknowns, Jacobian nonzeros, and operations of its functions.
+    """Sizes of a step, such as vector lengths, unknowns, Jacobian nonzeros and operations.
 
     `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
     """
@@ -52,7 +52,7 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
 def checked_step_linearisation(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> CheckedStepLinearisation:
-    """Linearise a step at a state (nx,) and compare A_k and B_k with central finite differences.
+    """Linearise a step at a state (nx,), and compare A_k and B_k with central finite differences.
 
     The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
     """
@@ -78,7 +78,7 @@ def checked_step_linearisation(
 def linearise_step_equations(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepEquationLinearizations:
-    """Linearise the step equations at a state (nx,), torque (nu,) [N m] and path (nc,), also by parameters."""
+    """Linearise the step equations, also by parameters. State (nx,), torque (nu,) [N m] and path (nc,) are given."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])

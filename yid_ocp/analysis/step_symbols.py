@@ -208,7 +208,7 @@ class EquationOrDerivativeFormula:
         return bool(self.expression.is_zero())
 
     def numeric_value(self, variables: ca.SX, at: Array) -> float:
-        """Numeric value of the expression at values `at` (k,) of the variables (k, 1)."""
+        """Numeric value of the expression. The variables (k, 1) have the values `at` (k,)."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
     @property
@@ -223,7 +223,7 @@ class EquationOrDerivativeFormula:
 
 @dataclass(frozen=True, repr=False)
 class NamedStepEquations(ReprMixin):
-    """Symbolic equations of one time step with named rows (equations) and columns (variables).
+    """Symbolic equations of one time step with named rows and columns. Rows are equations, columns variables.
 
     Rows are in the blocks `del` (DEL equations; at a prescribed coordinate the residual is -h times its effort),
     `internal`, `constraint`, and `p1`, the momentum after the step; columns in `q0`, `p0`, `z0`, `u`, `theta`,
@@ -268,12 +268,12 @@ class NamedStepEquations(ReprMixin):
 
     @property
     def row_names(self) -> tuple[str, ...]:
-        """Full names of all rows (equations), in order."""
+        """Full names of all equations in order."""
         return tuple(name for block in self.row_blocks for name in block.full_names)
 
     @property
     def column_names(self) -> tuple[str, ...]:
-        """Full names of all columns (variables), in order."""
+        """Full names of all variables in order."""
         return tuple(name for block in self.column_blocks for name in block.full_names)
 
     @cached_property
@@ -282,12 +282,12 @@ class NamedStepEquations(ReprMixin):
 
     @cached_property
     def column_symbols(self) -> ca.SX:
-        """Symbols of all columns (variables) as one column vector."""
+        """Symbols of all variables as one column vector."""
         return ca.vertcat(*(block.expressions for block in self.column_blocks))
 
     @cached_property
     def full_jacobian_sparsity_pattern(self) -> ca.Sparsity:
-        """Sparsity of the Jacobian of all rows (equations) by all columns (variables)."""
+        """Sparsity of the Jacobian of all equations by all variables."""
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
         return found
 
@@ -338,7 +338,7 @@ class NamedStepEquations(ReprMixin):
         return tuple(words)
 
     def text_lines(self) -> list[str]:
-        """Text lines of all equations (short ones in full), then the names of all variables."""
+        """Text lines of all equations, then the names of all variables. Only short equations are shown in full."""
         said = []
         place = {self.column_symbols[i].element_hash(): i for i in range(self.column_symbols.numel())}
         for at, name in enumerate(self.row_names):

@@ -38,7 +38,7 @@ _MAX_CHANGE_SET_SIZE = 3
 
 @dataclass(frozen=True)
 class ExperimentChange:
-    """One change of an experiment: a mechanical change, another measured frame or a camera rate.
+    """One change of an experiment, such as a mechanical change, another measured frame or a camera rate.
 
     Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
     """

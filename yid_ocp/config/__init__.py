@@ -1,1 +1,1 @@
-"""Configuration files: settings of a run, a reader that checks them, and a schema for editors."""
+"""Configuration files, with the settings of a run, a checking reader, and a schema for editors."""

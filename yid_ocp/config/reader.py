@@ -1,4 +1,4 @@
-"""Read YAML configuration files with line numbers and check them against the settings classes."""
+"""Read YAML configuration files and check them against the settings classes, with line numbers."""
 
 from __future__ import annotations
 

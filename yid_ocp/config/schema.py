@@ -178,6 +178,6 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
 
 
 def option_info_from_annotation(hint: Any) -> options.OptionInfo:
-    """Find the `OptionInfo` (meaning and unit) in a type annotation. Without one it is empty."""
+    """Find the meaning and unit of an option (`OptionInfo`) in a type annotation. Without one it is empty."""
     markers = reversed(options.split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())

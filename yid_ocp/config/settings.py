@@ -211,7 +211,7 @@ class RecordingsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
-    """Conversion of another tool's file by `import`; a command-line flag overrides its key here."""
+    """Settings for the conversion of another tool's file by `import`. A command-line flag overrides its key here."""
 
     joint_topics: Annotated[
         _Names | None, OptionInfo("of a bag: topics of joint states, merged on one clock; all when absent")

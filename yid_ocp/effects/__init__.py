@@ -47,7 +47,7 @@ def signal_kinds_required_by_any_effect() -> frozenset[str]:
 
 
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
-    """List all pairs (effect kind, location) that the system allows and the recorded signals can reveal.
+    """List all effect kinds and locations that the system allows and the recorded signals can reveal.
 
     The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`, or a
     sensor on a frame such as `wrist:FRAME`, or `points:GROUP`, points with a clock of their own. What works only on

@@ -87,7 +87,7 @@ class _DistortedReading(EffectBase):
 
 @EFFECTS.register("encoder_offset")
 class EncoderOffset(_DistortedReading):
-    """Constant encoder offset: measured = true angle + offset. Path, start and tracked angles are corrected for it."""
+    """Constant offset of the measured from the true angle. Path, start and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
     required_excitation = "its orientation to gravity"
@@ -102,7 +102,7 @@ class EncoderOffset(_DistortedReading):
 
 @EFFECTS.register("series_elasticity")
 class SeriesElasticity(_DistortedReading):
-    """Elastic gear with the encoder on the motor side: measured angle = q + effort/stiffness."""
+    """Elastic gear with the encoder on the motor side. The measured angle is q + effort/stiffness."""
 
     equation = "measured angle = q + effort/stiffness"
     required_excitation = "how hard it pulls at its ends"
@@ -117,7 +117,7 @@ class SeriesElasticity(_DistortedReading):
 
 @EFFECTS.register("backlash")
 class Backlash(_DistortedReading):
-    """Gear backlash with the encoder on the motor side: measured angle = q + width/2 tanh(effort/`_PLAY_TORQUE`).
+    """Gear backlash with the encoder on the motor side. The measured angle is q + width/2 tanh(effort/`_PLAY_TORQUE`).
 
     A servo acts on what its encoder reads: there the play z that is taken up solves z = width/2 tanh(torque(q + z)/
     `_PLAY_TORQUE`) in every step, an internal coordinate without a memory.
@@ -250,7 +250,7 @@ class EffortDelay(_LateTorque):
 
 @EFFECTS.register("effort_lag")
 class EffortLag(_LateTorque):
-    """First-order lag of a joint's torque z behind its command: time_constant dz/dt = command - z.
+    """First-order lag of a joint's torque z behind its command. The equation is time_constant dz/dt = command - z.
 
     The recorded torque is the command, of a prescribed joint too: the effort that its motion needs follows the recorded
     one. A negative time constant there means that the recorded effort follows the one that is needed, as one behind a
@@ -366,7 +366,7 @@ class ServoDelay(_ServoChange):
 
 @EFFECTS.register("servo_saturation")
 class ServoSaturation(_ServoChange):
-    """Additional smooth torque limit of a servo: torque = demand / (1 + |demand/limit|^16)^(1/16).
+    """Additional smooth torque limit of a servo. The torque is demand / (1 + |demand/limit|^16)^(1/16).
 
     Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there.
     """

@@ -147,7 +147,7 @@ class EffectBase(Effect):
 
     @property
     def prior_ranges(self) -> dict[str, tuple[float, float]]:
-        """Expected range (low, high) of every parameter in its unit."""
+        """Expected low and high value of every parameter in its unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
     def parameters_as_reported(
@@ -364,7 +364,7 @@ def compliance_parameter_definition(
 
 
 def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
-    """Generalized force (n, 1) with one nonzero entry, `value` at the joint."""
+    """Generalized force with one nonzero entry, `value` at the joint, shape (n, 1)."""
     force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force

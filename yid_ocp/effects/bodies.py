@@ -125,7 +125,7 @@ class PointMass(EffectBase):
 
 @EFFECTS.register("payload")
 class Payload(EffectBase):
-    """Payload fixed to a frame at (mx, my, mz)/mass. A negative mass removes excess mass of the model.
+    """Payload fixed to a frame, with its centre at (mx, my, mz)/mass. A negative mass removes excess mass of the model.
 
     The place is within `_MAX_PAYLOAD_DISTANCE` of the frame: moments beyond L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 +
     (`_MAX_COM_SHIFT` M)^2) do not grow any more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is
@@ -151,7 +151,7 @@ class Payload(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of mass [kg] and first moments [kg m]; mass >= -`_MAX_REMOVED_MASS_FRACTION` x link mass."""
+        """Definitions of mass and first moments. The mass [kg] is at least -`_MAX_REMOVED_MASS_FRACTION` x link's."""
         upper, expected = _bearable(system, location)
         lower = -_MAX_REMOVED_MASS_FRACTION * _carried_body(system, system.mechanism.frame(location).joint_index).mass
         far, near = (_MAX_PAYLOAD_DISTANCE * mass for mass in (upper, expected))
@@ -275,7 +275,7 @@ class RotorInertia(EffectBase):
 
 @EFFECTS.register("aerodynamic_drag")
 class AerodynamicDrag(EffectBase):
-    """Quadratic air drag on a segment's links: F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
+    """Quadratic air drag on a segment's links. The force is F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
     v_n is the velocity of a link's centre normal to the link, r its radius, l its length; |v_n| is rounded off below
     `_ABS_SMOOTHING_SPEED`.

@@ -1,4 +1,4 @@
-"""Laws without a name: a torque at a joint or segment as a smooth function of known quantities."""
+"""Laws for effects without a name: a torque at a joint or segment as a smooth function of known quantities."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class LawTable:
 
 @dataclass(frozen=True)
 class Law(EffectBase):
-    """A torque F = f(x) on an arm joint, or on every joint that bends a segment.
+    """Torque as a smooth function F = f(x) on an arm joint, or on every joint that bends a segment.
 
     x is that joint's own angle, speed, load or command: the torque that its servo asks of the motor within its
     limit, of a direct-current motor the duty's, before the counter-voltage takes its part.

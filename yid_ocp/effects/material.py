@@ -1,4 +1,4 @@
-"""Effects of the object's material: losses, stress relaxation, hysteresis, and errors of the nominal springs."""
+"""Material effects of the object: losses, stress relaxation, hysteresis, and errors of the nominal springs."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class _SpringChange(_SegmentEffect):
 
 @EFFECTS.register("kelvin_voigt")
 class KelvinVoigt(_SegmentEffect):
-    """Kelvin-Voigt damping on all joints of a segment: F = -tau kappa v with stiffness kappa."""
+    """Kelvin-Voigt damping on all joints of a segment. F = -tau kappa v with stiffness kappa."""
 
     equation = "F = -tau kappa v"
     required_excitation = "how fast it moves"
@@ -141,7 +141,7 @@ class Hysteresis(_SegmentMemory):
 
 @EFFECTS.register("cubic_stiffness")
 class CubicStiffness(_SegmentEffect):
-    """Springs of a segment that stiffen (k3 > 0) or soften (k3 < 0) with angle. Each joint adds V += 1/4 k3 q^4.
+    """Springs of a segment that stiffen or soften with angle, by the sign of k3. Each joint adds V += 1/4 k3 q^4.
 
     k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
     `with_prior_ranges_scaled_to_angles` is given the one in the data.
@@ -171,7 +171,7 @@ class CubicStiffness(_SegmentEffect):
 
 @EFFECTS.register("rest_curvature")
 class RestCurvature(_SpringChange):
-    """Rest curvature of a segment, with equal rest angles at all joints: V = 1/2 kappa (q - q_rest)^2."""
+    """Rest curvature of a segment, with equal rest angles at all joints. V = 1/2 kappa (q - q_rest)^2."""
 
     equation = "V = 1/2 kappa (q - q_rest)^2"
 

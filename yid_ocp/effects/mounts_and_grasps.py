@@ -1,4 +1,4 @@
-"""Effects of how the object is held: compliant mounts and junctions, and displaced, compliant or slipping grasps."""
+"""Compliant mounts and junctions of the object, and displaced, compliant or slipping grasps."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class _GraspChange(EffectBase):
 
 @EFFECTS.register("grasp_offset")
 class GraspOffset(_GraspChange):
-    """Displacement (dx, dy, dz) of the grasped point from its nominal position in the gripper's frame."""
+    """Displacement of the grasped point from its nominal position. It is (dx, dy, dz) in the gripper's frame."""
 
     equation = "phi = (holder + R (dx, dy, dz)) - held"
     declared_parameters = tuple(
@@ -132,7 +132,7 @@ class GraspOffset(_GraspChange):
 
 @EFFECTS.register("grasp_compliance")
 class GraspCompliance(_GraspChange):
-    """Spring-damper in place of a rigid grasp: f = phi/C + damping dphi/dt with phi = gripper - object.
+    """Spring-damper in place of a rigid grasp. f = phi/C + damping dphi/dt with phi = gripper - object.
 
     In a step: phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, regular at C = 0, where it is the rigid
     grasp. The stretch is taken at the end of the step, which by itself damps what is fast against it. Every row of the

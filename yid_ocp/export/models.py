@@ -1,4 +1,4 @@
-"""Export a system's tree as URDF or SDF, and list what a format has for each parameter and effect."""
+"""Export a system's tree as URDF or SDF, and list what a format can express of it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
 
 
 def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
-    """Convert a system to URDF text: joints with damping and friction, links with inertias; no springs, no grasps.
+    """Convert a system to URDF text, with damping, friction and inertias. Springs and grasps are left out.
 
     A `mujoco` element gives MuJoCo the least masses that it asks for; others read over it.
     """
@@ -195,7 +195,7 @@ _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 
 def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
-    """Support of an export format (`mjcf`, `urdf`, `sdf`) for each effect of a system, by effect label."""
+    """Support of an export format for each effect of a system. Formats: `mjcf`, `urdf`, `sdf`."""
     value, found = ParameterEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:

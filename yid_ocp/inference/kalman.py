@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 @dataclass(frozen=True)
 class FilterStateTransition:
-    """State transition of a filter: x' = (M (s, p1 + ... + pg), f p), x = (s, p), with g parameter groups p1 to pg."""
+    """Linear state transition of a filter from (s, p) to (M (s, p1 + ... + pg), f p), for parameter groups p1 to pg."""
 
     state_rows: Array  # M, shape (ns, ns + m)
     decay: Array  # f, shape (nx - ns,), nx - ns = g m
@@ -39,7 +39,7 @@ class FilterStateTransition:
         return len(self.decay) // m if m else 0, m
 
     def propagate_state(self, columns: Array) -> Array:
-        """Propagate states (nx, c) over the step. Each column is a state."""
+        """Propagate states over the step. They are the columns of an (nx, c) array."""
         ns, rows, own = len(self.state_rows), self.state_rows, columns[len(self.state_rows) :]
         together = own.reshape(*self._shape, own.shape[1]).sum(axis=0)
         return np.vstack([rows[:, :ns] @ columns[:ns] + rows[:, ns:] @ together, self.decay[:, None] * own])
@@ -67,12 +67,12 @@ class KalmanStepMatrices:
     transition: FilterStateTransition
 
     def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
-        """Normalized innovations (r, c) of measurements (r, c), and the state means (nx, c) after the step."""
+        """Normalized innovations of measurements (r, c), and the state means after the step (nx, c)."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
-        """Smoothed measurement noise (r, c), and the costate (nx, c) before the step from the one after it.
+        """Smoothed measurement noise (r, c), and the costate before the step from that after it (nx, c).
 
         The smoothed state is the filter's prediction + P costate.
         """
@@ -81,7 +81,7 @@ class KalmanStepMatrices:
         return noise, pulled + self.observation.T @ noise
 
     def costate_covariance_before_step(self, information: Array) -> Array:
-        """Covariance of the costate before the step from `information`, the one after it, (nx, nx)."""
+        """Covariance of the costate before the step. `information` is that after the step; both are (nx, nx)."""
         shaped, projected = self.whitening @ self.observation, self.projected_covariance
         pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
         pulled -= (pulled @ projected.T) @ shaped

@@ -1,4 +1,4 @@
-"""Linear model of a residual along a trajectory, with bounded steps and the cost reductions that it predicts."""
+"""Linear model of a residual along a trajectory, with bounded steps and predicted cost reductions."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class ResidualDerivativesAtNodes:
         return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Residual derivatives (r, d) in d directions from those of node states (K, nx, d) and efforts (K, nc, d).
+        """Residual derivatives in d directions. Node states' are (K, nx, d), efforts' (K, nc, d), the result's (r, d).
 
         The K nodes begin with `first`; a residual beyond them uses the last one.
         """
@@ -144,7 +144,7 @@ class ResidualDerivativesAtNodes:
         return found
 
     def residual_indices_by_first_node(self, last: int) -> list[IntArray]:
-        """For each node from 0 to `last`, indices of the residuals whose first node it is."""
+        """Indices of the residuals by their first node, one array for each node from 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
@@ -154,7 +154,7 @@ _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
 def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
-    """Noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
+    """Noise-scaled residual and Jacobian of data and stated priors, without weak priors. Shapes: (r,), (r, nx)."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
     units = np.ones(len(evaluation.residual))
@@ -164,7 +164,7 @@ def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Ev
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
-    """Solve for the bounded step d that minimises |J d + r|^2 + mu c |d|^2; c: largest squared column norm of J."""
+    """Minimise |J d + r|^2 + mu c |d|^2 over bounded steps d. c is the largest squared column norm of J."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
     small = np.zeros((count + 1, count + 1))
@@ -208,7 +208,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def solve_step_within_unknown_sizes(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Least-squares step (nx,) within bounds. An unknown moves by at most its value or typical size."""
+    """Solve for the bounded least-squares step (nx,). An unknown moves by at most its value or typical size."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)

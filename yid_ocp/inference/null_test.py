@@ -68,7 +68,7 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """Result of a null test: chi2 per degree of freedom and the p-value."""
+    """Result of a null test with chi2 per degree of freedom and p-value."""
 
     chi2_per_dof: float
     degrees_of_freedom: float  # effective ones, of autocorrelated noise
@@ -111,7 +111,7 @@ def residual_chi2_null_test(
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
-    """Test whether a whitened residual (nr,) is noise alone after a fit of `parameters` parameters.
+    """Test whether a whitened residual is noise alone after a fit. It is (nr,); `parameters` counts the fitted ones.
 
     Rows that belong to no series (priors) do not count. `level` is the false-discovery rate of the windows, `window`
     their length [s].
@@ -130,7 +130,7 @@ def residual_chi2_null_test(
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Whiten a residual r (nr,) in noise units against k more independent errors too: (I + F F')^(-1/2) r.
+    """Whiten a residual r in noise units against further independent errors, by (I + F F')^(-1/2) r.
 
     The `spread` F (nr, k) is the change of the residual per standard deviation of each error; non-finite columns are
     ignored.

@@ -80,14 +80,14 @@ class SmoothedUnknownsResult:
 
     @property
     def explainable_gap_fraction(self) -> float:
-        """Fraction of the gap G = max(0, chi2/n - 1) that the smoothed unknowns can explain."""
+        """Fraction of the gap that the smoothed unknowns can explain. The gap is G = max(0, chi2/n - 1)."""
         gap = self.chi2_before / self.dof_before - 1
         rest = max(self.chi2_after / self.dof_after - 1, 0.0)
         return float(np.clip(1 - rest / gap, 0.0, 1.0)) if gap > 0 else 0.0
 
     @property
     def plant_or_sensor_origin(self) -> str:
-        """Origin of the gap: "none", "plant", "sensor", "both", or "either" if they are confounded."""
+        """Origin of the gap in plant or sensor. Values: "none", "plant", "sensor", "both", "either" (confounded)."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
         heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
@@ -331,7 +331,7 @@ def select_and_smooth_unknowns(
     evaluation: Evaluation,
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
 ) -> SmoothedUnknownsResult:
-    """Choose the groups of unknowns with the largest evidence at a whitened fit `x`, and estimate them."""
+    """Choose and estimate the groups of unknowns with the largest evidence at a whitened fit `x`."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
         models = recording_models_with_unknown_forces(problem, x, evaluation, limits)
@@ -362,7 +362,7 @@ def select_and_smooth_unknowns(
 def force_log_likelihood_coefficients(
     model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
-    """Coefficients g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2 of one unknown's values f (J,).
+    """Coefficients g (J,) and L (J, J) of an unknown's log likelihood g'f - f'L f / 2, where f are its values.
 
     f is in units of the unknown's reference; free parameters, states and all other unknowns, whose groups have these
     variances [squared reference], are integrated out.

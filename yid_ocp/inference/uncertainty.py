@@ -1,4 +1,4 @@
-"""Uncertainty of a fit: covariance, intervals and verdicts of parameters, and goodness of fit."""
+"""Uncertainty of a fit, with covariance, intervals and verdicts of parameters, and goodness of fit."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MAX_CHECKED_PARAMETERS = 12
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """Null test of a fit on its own recordings, with chi2, p-value and whether the model explains them."""
+    """Result of the null test of a fit on its own recordings. It states whether the model explains them."""
 
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
@@ -72,7 +72,7 @@ class ParameterEstimate:
 
     @property
     def confidence_interval_ends(self) -> tuple[float, float]:
-        """Ends of the 95 % interval: infinite where open, and value ± 1.96 std where no interval is stated."""
+        """Ends of the 95 % interval. They are infinite where open, value ± 1.96 std where no interval is stated."""
         if self.interval is None:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
@@ -109,7 +109,7 @@ def assess_goodness_of_fit(
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
-    """Covariance of the unknowns from data and stated priors, (nx, nx), and chi2 per degree of freedom.
+    """Covariance of the unknowns (nx, nx) from data and stated priors, and chi2 per degree of freedom.
 
     Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one. A prior
     counts with at least the standard deviation that was stated, however few of the stated ones are noise.
@@ -260,7 +260,7 @@ def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
 
 
 def std_from_covariance(covariance: Array, x: Array) -> Array:
-    """Standard deviations (nx,) from a covariance. They are infinite where the covariance is NaN."""
+    """Standard deviations from a covariance, shape (nx,). They are infinite where the covariance is NaN."""
     if not len(covariance):
         return np.zeros(len(x))
     diagonal = np.diag(covariance)
@@ -268,7 +268,7 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Convert correlations (n, n) and standard deviations to names and covariance for result.json.
+    """Convert a covariance to names and data for result.json. `matrix` (n, n) holds the correlations.
 
     Parameters without a finite and positive standard deviation are left out: nothing is known of them.
     """
@@ -311,7 +311,7 @@ def parameter_verdict(
 
 
 def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str:
-    """Judge a parameter by its relative standard deviation alone: identifiable, weak or not_identifiable."""
+    """Judge a parameter by its relative standard deviation alone. Verdicts: identifiable, weak, not_identifiable."""
     if not math.isfinite(std):
         return "not_identifiable"
     relative, reach = std / max(abs(value), 1e-12), abs(value) + 2 * std
@@ -349,7 +349,7 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
 
 
 def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
-    """Whether a parameter is identifiable with a relative standard deviation up to 10 %, so it needs no profile."""
+    """Whether a parameter needs no profile, as its relative standard deviation is at most 10 %."""
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
 
@@ -446,7 +446,7 @@ VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VE
 
 
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
-    """State in a sentence whether a model explains its recordings, with advice if it does not."""
+    """Explain in a sentence whether a model explains its recordings, with advice for a poor fit."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "whether the model explains the recordings is not known"
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}"

@@ -95,7 +95,7 @@ class WhiteningFilter:
     torque_bias_std: Array  # of b after all measurements, shape (nu,) [N m]
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten residual columns to innovations (r, c), and estimate torque biases (nu, c) [N m] from all rows.
+        """Whiten residual columns, and estimate torque biases (nu, c) [N m] from all rows.
 
         Rows (r, c) are a residual in units of the sensors' noise, then columns of its derivative; `push` (N, nu, c) is
         the tracking filter's correction of the torque, and its derivative [N m].

@@ -43,7 +43,7 @@ class StepFunctions:
 
     @property
     def jacobian_parts(self) -> ca.Function:
-        """Jacobian parts: pair vectors, nonzeros of the rest, that of p1, the constraint Jacobian and the curvature.
+        """Function of the Jacobian's parts: pair vectors, then nonzeros of the rest, p1, constraints and curvature.
 
         The curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}.
         """
@@ -56,7 +56,7 @@ class StepFunctions:
 
     @property
     def internal_residual_at_rest(self) -> ca.Function:
-        """Internal equations at rest, with derivatives by (q, z, lam, u). Both nodes are the same."""
+        """Internal equations at rest and their derivatives by (q, z, lam, u). Both nodes are the same."""
         return self._function("resting")
 
     @property
@@ -156,7 +156,7 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 
 
 def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
-    """Build the sparse derivatives of (residual, p1, prescribed effort) by the named parameters, a CasADi function."""
+    """Build a CasADi function of a step's sparse parameter derivatives. Outputs: residual, p1, prescribed effort."""
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     prescribed = list(e.system.prescribed_coordinate_indices)
@@ -235,14 +235,14 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
 
 
 def kernel_source_text(functions: StepFunctions, tables: StepSparsityTables) -> str:
-    """Collect the text that identifies a kernel without generating C: equations, tables and the generators' files."""
+    """Collect the text that identifies a kernel without generating C, from equations, tables and generators."""
     folder = resources.files("yid_ocp.integrator")
     files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]
     return "\0".join([*files, *_kernel_tables(functions, tables), functions._expression_text()])
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
-    """Generate the C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables, then `kernel.c`.
+    """Generate the C source of the stepping kernel. Order: `simd.c`, CasADi's functions, sizes, tables, `kernel.c`.
 
     With `batched` for several rollouts at once, as many as `yid_simd_width` returns; then None where a function has no
     SIMD form.

@@ -130,14 +130,14 @@ class DiscreteEquations:
 
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
-        """Constraint violation phi(q) - C lam / h at the end of the step, without relaxation, shape (m, 1)."""
+        """Constraint violation at the end of the step without relaxation, phi(q) - C lam / h, shape (m, 1)."""
         if self.constraint_relaxation_gain is None:
             return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
     def newton_unknowns(self) -> ca.SX:
-        """Unknowns of Newton's method: free coordinates of q1, internal coordinates z1 and multipliers lam."""
+        """Unknowns of Newton's method. They are free coordinates of q1, internal coordinates z1 and multipliers lam."""
         return ca.vertcat(self.q1[list(self.system.unprescribed_coordinate_indices), 0], self.z1, self.lam)
 
 

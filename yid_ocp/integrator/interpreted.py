@@ -266,7 +266,7 @@ class InterpretedKernel:
     def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
-        """Evaluate step residuals of len(torque) steps one by one, and Jacobians if `derivatives` is set."""
+        """Evaluate step residuals along a trajectory one by one, and Jacobians if `derivatives` is set."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])

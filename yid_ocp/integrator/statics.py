@@ -402,7 +402,7 @@ def _solved(matrix: Array, right: Array) -> Array:
 
 
 def steady_effect_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
-    """Relaxed internal coordinates (nz,) of a system held at configuration `q` for a long time."""
+    """Relaxed internal coordinates of a system held at configuration `q` for a long time, shape (nz,)."""
     e = step.equations
     nz = e.z0.numel()
     if nz == 0:

@@ -68,7 +68,7 @@ class Step(ReprMixin):
 
     @property
     def force_split(self) -> ForceSplit:
-        """How a step's forces are split between its two nodes: `symmetric` (half each) or `left`."""
+        """Split of a step's forces between its two nodes. `symmetric` gives half each, `left` all to the first."""
         return self.model.equations.force_split
 
     @property
@@ -83,7 +83,7 @@ class Step(ReprMixin):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Dimensions by symbol: n (coordinates), nz (internal), m (constraints), nu (inputs), ntheta and more."""
+        """Dimensions by symbol. Some are n (coordinates), nz (internal), m (constraints), nu (inputs) and ntheta."""
         return self.model.sizes
 
     def __call__(
@@ -121,7 +121,7 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of the next state (q, p, z) by state, input and parameters, from implicit functions.
+        """Derivatives of the next state by state, input and parameters, from implicit functions.
 
         Returns A (nx, nx) by (q, p, z)_k, B_u (nx, nu) and B_theta (nx, len(names)), by all of theta without `names`.
         """

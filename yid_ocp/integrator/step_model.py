@@ -1,4 +1,4 @@
-"""Data types that all stepping kernels share: step models, rollouts, adjoints and linearizations."""
+"""Data types that all stepping kernels share, for step models, rollouts, adjoints and linearizations."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ _INSTABILITY_HINT = (
 
 @dataclass(frozen=True)
 class RolloutStatus:
-    """Convergence of a rollout: status code, Newton's last correction [rad or m] and totals over all steps.
+    """Convergence of a rollout with status code, Newton's last correction [rad or m] and totals over all steps.
 
     `prescribed_effort` (nc,) is that at the first node of the last step [N m], `internal_coordinates` (nz,) are those
     after it.
@@ -150,7 +150,7 @@ class SensitivityDirections:
 
 @dataclass(frozen=True)
 class TrackingFeedback:
-    """Time-varying feedback of the tracking filter: u_k = ubar_k - K_k (x_k[index] - xbar_k).
+    """Time-varying feedback of the tracking filter. The torque is u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     Of the rows of the state (q, p, z) in `state_indices` (nb,), with K_k in `gain` (N, nu, nb) [N m/rad for a
     coordinate, 1/s for a momentum] and the rows' measured values in `reference` (N, nb).
@@ -179,7 +179,7 @@ class RolloutInputs:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A simulated trajectory, with derivatives (..., d) along d directions on request. NaN follows a failed step.
+    """A simulated trajectory with derivatives on request, (..., d) along d directions. NaN follows a failed step.
 
     (q, p, z) at every node (N + 1, nx) with q in rad or m and p in N m s or N s, multipliers (N, m) [N s], effort
     of prescribed coordinates at nodes 0..N-1 (N, nc) [N m] and applied torque (N, nu) [N m]. At node 0 the effort

@@ -26,7 +26,7 @@ _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the sam
 
 
 def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
-    """Make a proportional tracking feedback on the driven joints: u_k = ubar_k - K (q_k - qbar_k), K diagonal.
+    """Make a proportional tracking feedback on the driven joints. u_k = ubar_k - K (q_k - qbar_k), K diagonal.
 
     `measured` are their angles qbar at every node, shape (N + 1, nu) [rad], `gains` one or one arm's worth or nu
     [N m/rad]; `ModelError` of another number of gains, or a negative one.
@@ -229,7 +229,7 @@ class EffectMomentumShift:
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Momentum shift (with effects minus recorded) at nodes 0..N-1, (N, nu), and derivatives (N, nu, d).
+        """Momentum shift, with effects minus recorded, at nodes 0..N-1. Shapes: (N, nu), derivatives (N, nu, d).
 
         `recorded` is the recorded motion, `true` that corrected for effects, whose derivatives alone are used; `names`
         are the parameters of the first of the d derivatives.

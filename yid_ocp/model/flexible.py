@@ -1,4 +1,4 @@
-"""Flexible branched objects as chains of rigid links with elastic joints: tubes, beams, cables."""
+"""Flexible branched objects such as tubes, beams and cables, as chains of rigid links with elastic joints."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class ElasticJoint:
-    """Spring and damper on one joint of a segment: 1/2 stiffness (q - rest)^2 and -damping v."""
+    """Spring and damper on one joint of a segment. Energy: 1/2 stiffness (q - rest)^2; force: -damping v."""
 
     joint_name: str
     segment_name: str

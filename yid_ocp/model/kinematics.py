@@ -40,7 +40,7 @@ class Kinematics:
         return self._columns(frame, lambda screw: screw[3:] + ca.cross(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Jacobian of a frame's angular velocity (world axes) by the joint rates, shape (3, n)."""
+        """Jacobian of a frame's angular velocity in world axes by the joint rates, shape (3, n)."""
         return self._columns(frame, lambda screw: screw[:3])
 
     def _frame(self, frame: str | Frame) -> Frame:
@@ -189,14 +189,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 
 def mass_matrix(rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
-    """Mass matrix of the mechanism in closed form (`MultibodyLagrangianDerivatives`), shape (n, n)."""
+    """Mass matrix of the mechanism, (n, n). Its closed form is in `MultibodyLagrangianDerivatives`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(
     rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Second derivatives L_qq, L_qv, L_vv of the bodies' Lagrangian, each (n, n). Rows of L_qv belong to q."""
+    """Second derivatives of the bodies' Lagrangian: L_qq, L_qv, L_vv, each (n, n). Rows of L_qv belong to q."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
     by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
     by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))

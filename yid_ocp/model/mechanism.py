@@ -20,7 +20,7 @@ from yid_ocp.model.parameters import Parameters
 
 @dataclass(frozen=True)
 class Placement:
-    """Symbolic rigid transform from a child frame to its parent: rotation (3, 3) and translation (3, 1) [m]."""
+    """Symbolic rigid transform from a child frame to its parent. Rotation (3, 3), translation (3, 1) [m]."""
 
     rotation: ca.SX
     translation: ca.SX
@@ -46,7 +46,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class Inertia:
-    """Inertia of a rigid body in its joint's frame: mass [kg], centre of mass [m] and tensor about it [kg m^2].
+    """Mass [kg], centre of mass [m] and inertia tensor about it [kg m^2] of a rigid body, in its joint's frame.
 
     `gravity_fraction` multiplies the pull of gravity on the body, not its inertia; None means 1.
     """
@@ -58,7 +58,7 @@ class Inertia:
 
     @staticmethod
     def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
-        """Make an inertia from numbers: mass [kg], centre (3,) [m], tensor about the centre (3, 3) [kg m^2]."""
+        """Make an inertia from mass [kg], centre (3,) [m] and tensor about the centre (3, 3) [kg m^2]."""
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
     def scaled_by(self, factor: ca.SX) -> Inertia:
@@ -95,7 +95,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Frame:
-    """A named frame fixed to a joint's moving side (`joint_index` = -1: to the world).
+    """A named frame fixed to a joint's moving side. `joint_index` is -1 for the world.
 
     Of what else is fixed there, a cut at the frame leaves `proximal_bodies` (in the joint's frame) and the frames and
     further joints named in `proximal_names` on the side of the joint; all the rest is beyond it.
@@ -127,7 +127,7 @@ class ArcLengthChain:
 
 @dataclass(frozen=True, repr=False)
 class Mechanism(ReprMixin):
-    """A kinematic tree of joints (parents before children) with bodies, named frames and parameters.
+    """A kinematic tree of joints with bodies, named frames and parameters. Parents precede children.
 
     Placements and inertias depend on its `parameters`; along its `link_chains` `NAME:40%` names a point by arc length.
     """
@@ -219,7 +219,7 @@ class Mechanism(ReprMixin):
         return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
 
     def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
-        """Add a frame `name`, fixed at a pose (4, 4) in `frame` (None: world)."""
+        """Add a frame `name` at a fixed pose in `frame`. The pose is (4, 4); None is the world."""
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
@@ -311,14 +311,14 @@ def snap_near_integer_entries(matrix: Array) -> Array:
 
 
 def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Build a homogeneous (4, 4) matrix from a rotation (3, 3) and a translation (3,) [m]."""
+    """Build a homogeneous matrix (4, 4) from a rotation (3, 3) and a translation (3,) [m]."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = np.asarray(rotation, float), np.asarray(translation, float)
     return matrix
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) from angles [rad], as in URDF, shape (3, 3)."""
+    """Rotation matrix from roll, pitch, yaw [rad] as in URDF, Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3)."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
     y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
@@ -356,7 +356,7 @@ def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca
 
 
 def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
-    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) from symbolic angles [rad], shape (3, 3). Yaw defaults to zero."""
+    """Rotation matrix from symbolic roll, pitch and yaw, Rz(yaw) Ry(pitch) Rx(roll), (3, 3). Default yaw: zero."""
     about_x = symbolic_rotation_from_axis_angle((1.0, 0.0, 0.0), roll)
     turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ about_x
     return ca.densify(turned if yaw is None else symbolic_rotation_from_axis_angle((0.0, 0.0, 1.0), yaw) @ turned)
@@ -367,5 +367,5 @@ def _skew(u: Array) -> Array:
 
 
 def transform_from_xyz_rpy(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Build a homogeneous (4, 4) matrix from a translation [m] and roll, pitch, yaw [rad]."""
+    """Build a homogeneous matrix (4, 4) from a translation [m] and roll, pitch, yaw [rad]."""
     return homogeneous_transform(rotation_from_rpy(*np.asarray(rpy, float)), xyz)

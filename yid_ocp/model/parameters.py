@@ -88,7 +88,7 @@ class Parameters(ReprMixin):
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """Parameter vector theta (ntheta,), nominal or from `values`. `ConfigError` if a name or value is invalid."""
+        """Parameter values theta (ntheta,), nominal or from `values`. `ConfigError` if a name or value is invalid."""
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):

@@ -133,7 +133,7 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class PositionServoOptions:
-    """Settings of all position servos: interpolation, gravity compensation, motor, firmware. Gains are parameters."""
+    """Settings of all position servos, for interpolation, gravity compensation, motor and firmware."""
 
     command_interpolation: Annotated[
         _CommandInterpolation,

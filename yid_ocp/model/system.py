@@ -70,7 +70,7 @@ class Grasp:
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual phi(q) as a column, holder minus held. Position [m] precedes orientation [rad]."""
+        """Constraint residual phi(q), holder minus held, as a column. Position [m] precedes orientation [rad]."""
         holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
         held = kinematics.frame_pose(self.held_frame)
         rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
@@ -133,7 +133,7 @@ class NodeState:
 
 @dataclass(frozen=True)
 class ForceWithDerivativeFactors:
-    """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives, (n, 1) [N m or N].
+    """A dissipative generalized force of wrenches on bodies with its derivatives, F(q, v), (n, 1) [N m or N].
 
     With S_j and D_j as in `MultibodyLagrangianDerivatives` and the columns of A and T, shape (6, n), for i an ancestor
     of joint j or j itself:
@@ -148,7 +148,7 @@ class ForceWithDerivativeFactors:
 
 @dataclass(frozen=True)
 class StepTerms:
-    """Energy, generalized forces (n, 1) [N m or N] and internal equations that an effect adds to one step."""
+    """Energy, generalized forces and internal equations that an effect adds to one step. Forces: (n, 1) [N m or N]."""
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
     generalized_force: ca.SX | None = None  # F(q, v, u, z)
@@ -177,7 +177,7 @@ class Effect:
     internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def apply_to_system(self, system: System) -> System:
-        """Apply this effect's changes to the system: masses, lengths, springs, grasps, gravity or joints."""
+        """Apply this effect to the system. It may change masses, lengths, springs, grasps, gravity or joints."""
         return system
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -185,7 +185,7 @@ class Effect:
         return StepTerms()
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """Predict a reading from the error-free `output`; `channel`: `group.point` or `joints.quantity.JOINT`."""
+        """Predict a reading from the error-free `output`. `channel` is `group.point` or `joints.quantity.JOINT`."""
         return output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
@@ -200,7 +200,7 @@ class Effect:
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
-        """Lag time constant [s]: `torque.JOINT` behind its record, `joints.effort.JOINT` behind the true one."""
+        """Lag time constant of `torque.JOINT` behind its record, or of `joints.effort.JOINT` behind the truth [s]."""
         return ca.SX(0)
 
 
@@ -282,7 +282,7 @@ class System(ReprMixin):
     def build(
         mechanism: Mechanism | None = None, *, effects: Sequence[Effect] = (), **options: Unpack[SystemBuildArguments]
     ) -> System:
-        """Build a system from a robot (None: object alone), effects, and the arguments in `SystemBuildArguments`.
+        """Build a system from a robot, effects and `SystemBuildArguments`. Without a robot it is the object alone.
 
         `ModelError` of a name that does not exist or is used twice, no joint, a joint both driven and prescribed.
         """
@@ -408,7 +408,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def weight_and_grasp_force_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
-        """Generalized force on one coordinate from weight and grasps of all it moves, at midpoint [N m or N]."""
+        """Generalized force of weight and grasps on one coordinate, from all it moves, at midpoint [N m or N]."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)
         for j, joint in enumerate(tree.joints):
@@ -422,11 +422,11 @@ class System(ReprMixin):
         return force
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual phi(q) of all grasps, shape (m, 1)."""
+        """Constraint residual of all grasps, phi(q), shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))
 
     def constraint_relaxation_times(self) -> ca.SX | None:
-        """Relaxation times T of the constraints, (m, 1) [s]: phi + T dphi/dt = C lam / h. None if no grasp has one."""
+        """Relaxation times T of the constraints phi + T dphi/dt = C lam / h, (m, 1) [s]. None if no grasp has one."""
         if all(grasp.relaxation_time is None for grasp in self.grasps):
             return None
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)

@@ -1,4 +1,4 @@
-"""Run tasks and store their results, by processes on this machine or a scheduler's workers.
+"""Run tasks by local processes or a scheduler's workers, and store their results.
 
 A task is a function at the top of a module with plain data and paths. Its result is one JSON file, written whole by
 whoever worked it out, under a name that is the hash of the function's name, the sources it depends on and the
@@ -64,7 +64,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Workers of a run: local processes, or a Dask scheduler's (address or file). `ConfigError` if both are given."""
+    """Workers of a run, local processes or those of a Dask scheduler (address or file). `ConfigError` for both."""
 
     n_processes: int | None = None
     scheduler_address: str = ""

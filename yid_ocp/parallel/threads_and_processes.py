@@ -1,4 +1,4 @@
-"""Threads and processes on this machine: parallel maps, merged calls, shared caches and process pools.
+"""Threads and processes on this machine, with parallel maps, merged calls, shared caches and process pools.
 
 Batched evaluation: items run in parallel until all wait for a function, which is then called once for all.
 """

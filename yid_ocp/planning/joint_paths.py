@@ -135,7 +135,7 @@ class FramePositionEvaluator:
             self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
 
     def positions_and_jacobian(self, q: Array, theta: Array) -> tuple[Array, Array]:
-        """Positions (N, 3 np) [m] of np frames, and their Jacobian (N, 3 np, n), at configurations (N, n)."""
+        """Positions of np frames and their Jacobian at configurations (N, n). Shapes: (N, 3 np) [m], (N, 3 np, n)."""
         at, slope = (np.array(x).T for x in self._function(np.asarray(q).T, np.asarray(theta)))
         return at, slope.reshape(len(at), at.shape[1], np.shape(q)[1])
 
@@ -146,7 +146,7 @@ _N_REST_CONTROL_POINTS = 3  # control points alike at either end: no velocity an
 
 @dataclass(frozen=True)
 class SplinePath:
-    """Spline path of joints from rest to rest: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
+    """Spline path of joints from rest to rest. q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
     A spline of degree 5 with clamped ends lies within the hull of its control points, and so do its derivatives:
     limits on these hold at all times, not at nodes alone.
@@ -171,12 +171,12 @@ class SplinePath:
         return np.asarray(splines.c[: len(splines.t) - splines.k - 1])
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
-        """Values of the K basis functions or their `order`-th derivative at times `t` (N,) [s], shape (N, K)."""
+        """Values of the K basis functions, or of their `order`-th derivative, at times `t` (N,) [s]: (N, K)."""
         values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight_line_coefficients(self, change: Array) -> Array:
-        """Coefficients (K, nj) of a straight line in joint space with displacement `change` (nj,)."""
+        """Coefficients of a straight line in joint space, shape (K, nj). The displacement `change` is (nj,)."""
         t = np.linspace(0.0, self.duration, 200)
         s = t / self.duration
         smooth = s**3 * (10 - 15 * s + 6 * s**2)
@@ -227,7 +227,7 @@ class PathSimulator:
         return self.path.basis_values(self.node_times)
 
     def joint_positions(self, w: Array) -> Array:
-        """Positions of the moved joints at the nodes, (N + 1, nc), for spline coefficients (K, nc)."""
+        """Positions of the moved joints at the nodes, (N + 1, nc). The spline coefficients are (K, nc)."""
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
@@ -249,7 +249,7 @@ class PathSimulator:
         return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
 
     def frame_positions_along_states(self, frames: FramePositionEvaluator, state: Array) -> Array:
-        """Positions of frames along states (N, nx), shape (N, frames, 3) [m]."""
+        """Positions of frames along a trajectory (N, nx), shape (N, frames, 3) [m]."""
         q = state[:, : self.step.system.n_coordinates]
         return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
 
@@ -324,7 +324,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 
 
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
-    """Start positions (nc,) of the moved joints from a mapping. `ConfigError` if one is missing or out of range."""
+    """Start positions of the moved joints from a mapping, (nc,). `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:

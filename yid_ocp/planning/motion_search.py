@@ -109,7 +109,7 @@ class PlanResidualAndLimitFunctions:
         return parts
 
     def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
-        """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
+        """Values of the limited quantities along a motion, in the order and units of `limit_rows`, (rows,).
 
         The second result is their Jacobian (rows, K nc) by the coefficients; None if the rollout has no sensitivities.
         """
@@ -192,7 +192,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 @dataclass(frozen=True)
 class TargetMotionSearchResult:
-    """Result of a search for a planned motion, with coefficients w (K, nc) and convergence within the limits."""
+    """Coefficients w (K, nc) of a planned motion, and whether the search converged within the limits."""
 
     w: Array
     is_converged: bool
@@ -304,7 +304,7 @@ class DOptimalityCriterion:
 
 @dataclass(frozen=True)
 class EffectDiscriminationCriterion:
-    """Criterion for how well the readings separate effects from what other effects can imitate.
+    """Criterion of how well the readings separate effects from imitations by other effects.
 
     d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
     -1/2 log sum_ij 1 / (1 + d_ij^2).
@@ -316,7 +316,7 @@ class EffectDiscriminationCriterion:
     parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
 
     def pairwise_effect_distances(self, rows: Array) -> Array:
-        """Distances of effect i's (row) changes from all that effect j can imitate [data stds]. Infinite diagonal."""
+        """Distances of effect i (row) from all that effect j can imitate [data stds]. The diagonal is infinite."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
@@ -390,7 +390,7 @@ class InformativeMotionSearch:
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
     def shrink_to_limits(self, w: Array) -> Array:
-        """Scale down spline coefficients `w` (K, nc) until the motion keeps its limits."""
+        """Scale down spline coefficients until the motion keeps its limits, shape (K, nc)."""
         for _ in range(60):
             if self._limited_values(w)[1]:
                 return w

@@ -227,7 +227,7 @@ class ParameterizedExperiment:
 
     @cached_property
     def sensitivity_column_names(self) -> tuple[str, ...]:
-        """Column names of `search_problem_sensitivities`: parameters, other unknowns, constant torque errors."""
+        """Column names of `search_problem_sensitivities`, from parameters, other unknowns and torque errors."""
         return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
 
     @cached_property

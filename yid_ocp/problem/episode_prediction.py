@@ -86,7 +86,7 @@ class EpisodePredictor:
         )
 
     def episode_with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
-        """Fit an episode's initial state to the first measured points if `initial_state` asks for it."""
+        """Fit an episode's initial state to the first measured points if `initial_state` requires this."""
         if episode.fixed_initial_state is not None or self.options.initial_state != "fitted_to_points":
             return episode
         samples = episode.measurements
@@ -100,7 +100,7 @@ class EpisodePredictor:
         return replace(episode, fixed_initial_state=start)
 
     def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
-        """Insert an episode's own values into theta: known ones and those fitted with its initial state."""
+        """Insert an episode's own values into theta, both known ones and those fitted with its initial state."""
         start = episode.fixed_initial_state
         return self._with(theta, {**episode.known_parameters, **({} if start is None else start.fitted_parameters)})
 
@@ -309,7 +309,7 @@ class EpisodePredictor:
     def readings_along_trajectory(
         self, samples: SensorMeasurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
-        """Predicted readings (M, k) along a trajectory (N + 1, nx), and their derivatives (M, k, d).
+        """Predict readings along a trajectory (N + 1, nx), with derivatives. Shapes: (M, k) and (M, k, d).
 
         `by_state` (N + 1, nx, d) are those of the trajectory, the first ones by the free parameters.
         """
@@ -412,7 +412,7 @@ class EpisodePredictor:
     def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
-        """Gradient of a cost of an episode's predictions by its (shared, local, start) unknowns.
+        """Gradient of a cost of an episode's predictions by its unknowns. These are shared, local and start ones.
 
         `result` is predicted at the same unknowns, `pulls` (M, k) are the cost's derivatives by every prediction.
         """

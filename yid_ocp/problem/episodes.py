@@ -109,7 +109,7 @@ class InputErrorModel:
 
     @property
     def estimated_torque_error(self) -> Array:
-        """Estimated torque error in every step, recorded minus true, offset plus noise, (N, nu) [N m]."""
+        """Estimated torque error, recorded minus true, in every step, (N, nu) [N m]. It has offset and noise."""
         return self.torque_bias + self.torque_noise
 
     @property
@@ -220,7 +220,7 @@ class Episode:
 def prepare_episode(
     functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array, free: Sequence[str]
 ) -> Episode:
-    """Prepare an episode: place a recording's inputs and measurements on the nodes of a rollout's time grid.
+    """Place a recording's inputs and measurements on the nodes of a rollout's time grid.
 
     At the nominal parameters `theta` encoder noise is converted to effort and the filter's gains are computed.
     `DataError` where the recording does not fit the model, is too short, or states no noise level.
@@ -275,7 +275,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
 
 
 def truncate_episode(episode: Episode, steps: int) -> Episode:
-    """Truncate an episode to its first `steps` steps and the measurements in them."""
+    """Truncate an episode to its first `steps` steps, with the measurements in these."""
     steps = min(steps, episode.grid.steps)
     samples = []
     for entry in episode.measurements:

@@ -1,4 +1,4 @@
-"""The estimation problem of a model and recordings: unknowns, and the residual with its derivatives."""
+"""Estimation problem of a model and recordings, with unknowns, residual and derivatives."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def unknown_scales(self) -> Array:
-        """Typical size of each unknown: its initial value, or if that is 0 its prior's std or a tenth of its range."""
+        """Typical size of each unknown. It is the initial value, or if that is 0 the prior's std or 0.1 x range."""
         lower, upper = self.bounds
         size = np.abs(self.initial_unknowns)
         width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
@@ -199,7 +199,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def positive_unknowns_mask(self) -> BoolArray:
-        """Mask (nx,) of unknowns with a nonnegative lower bound and a positive initial value."""
+        """Mask of unknowns with a nonnegative lower bound and a positive initial value, shape (nx,)."""
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     @property
@@ -228,7 +228,7 @@ class EstimationProblem(ReprMixin):
         return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Replace entries of the initial unknown vector (nx,) by `values`, clipped to the bounds."""
+        """Replace entries of the initial unknown vector by `values`, clipped to the bounds, shape (nx,)."""
         start = self.named_values(self.initial_unknowns)
         return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
 

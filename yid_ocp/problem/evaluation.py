@@ -39,7 +39,7 @@ class ProcessNoiseWhitener(Protocol):
         ...
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten residual and derivatives (r, c), and estimate constant torque errors (nu, c) [N m].
+        """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
 
         Of `rows` (r, c), a residual in units of the sensors' noise and columns of its derivative, and `push`
         (N, nu, c), the tracking filter's correction of the torque and its derivative [N m].
@@ -77,7 +77,7 @@ class ResidualVectorLayout:
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(ReprMixin):
-    """Evaluation of an estimation problem at one unknown vector: cost, residual, Jacobian and predictions."""
+    """Cost, residual, Jacobian and predictions of an estimation problem at one unknown vector."""
 
     cost: float  # 1/2 |r|^2, or the robust loss; infinite where the rollout failed
     residual: Array  # (nr,)
@@ -176,7 +176,7 @@ class UnknownVectorLayout:
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
 
     def scatter_to_unknown_columns(self, block: Array, recording: int) -> Array:
-        """Scatter one recording's derivative columns (r, d) to the unknowns' (r, nx). Others are zero."""
+        """Scatter one recording's derivative columns to those of all unknowns, (r, d) to (r, nx). Others are zero."""
         wide = np.zeros((len(block), len(self.unknown_names)))
         wide[:, self.unknown_indices_affecting_recording(recording)] = block
         return wide
@@ -225,7 +225,7 @@ def stated_prior_stds(
 
 
 def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Jacobian (k, nx) of the stated priors' whitened residual Jacobian x (x - initial x)."""
+    """Jacobian of the stated priors' whitened residual, (k, nx). The residual is Jacobian x (x - initial x)."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -298,7 +298,7 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
 
 
 def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
-    """Compute log(ratio) and its slope. Below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
+    """Logarithm of a ratio and its slope. Below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
     below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
     small = below < 0
     kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)

@@ -24,7 +24,7 @@ _MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as secon
 
 @dataclass(frozen=True)
 class TimeGrid:
-    """Uniform time grid of a rollout: t_k = start_time + k time_step [s], k = 0..steps."""
+    """Uniform time grid of a rollout, t_k = start_time + k time_step [s] for k = 0..steps."""
 
     start_time: float
     time_step: float
@@ -131,7 +131,7 @@ class SensorMeasurements:
 
     @cached_property
     def residual_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
-        """Matrix R^(-1/2) that decorrelates normalized residuals, (nr, nr). None if outputs are independent.
+        """Matrix that decorrelates normalized residuals, R^(-1/2), shape (nr, nr). None if outputs are independent.
 
         R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
         doi:10.1080/00031305.2016.1277159).
@@ -147,18 +147,18 @@ class SensorMeasurements:
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.n_residuals, self.n_residuals))
 
     def decorrelate(self, rows: Any) -> Any:
-        """Decorrelate rows (nr,) or (nr, d) that are already divided by their standard deviations, dense or sparse."""
+        """Decorrelate rows already divided by their standard deviations, (nr,) or (nr, d), dense or sparse."""
         return rows if self.residual_decorrelation_matrix is None else self.residual_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
-        """Whitened residual (M, k), prediction minus measurement. It is zero where nothing was measured."""
+        """Whitened residual, prediction minus measurement, shape (M, k). It is zero where nothing was measured."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
         if self.residual_decorrelation_matrix is not None:
             plain[self.positive_weight_mask] = self.residual_decorrelation_matrix @ plain[self.positive_weight_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
-        """Map a cost's gradient (M, k) by residual to the gradient by prediction, as adjoint of `whitened_residual`."""
+        """Map a cost's gradient by residual to that by prediction (M, k), as adjoint of `whitened_residual`."""
         if self.residual_decorrelation_matrix is not None:
             pull = pull.copy()
             pull[self.positive_weight_mask] = self.residual_decorrelation_matrix.T @ pull[self.positive_weight_mask]
@@ -167,7 +167,7 @@ class SensorMeasurements:
     def residual_and_jacobian(
         self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf
     ) -> ResidualAndJacobian:
-        """Residual block with Huber weights and, if the prediction's slopes (M, k, d) are given, its Jacobian."""
+        """Residual block with Huber weights. It has a Jacobian if the prediction's slopes (M, k, d) are given."""
         raw = self.whitened_residual(predicted)
         cost, factor = huber_loss_and_residual_factors(raw, threshold)
         seen, jacobian = self.positive_weight_mask, None
@@ -177,7 +177,7 @@ class SensorMeasurements:
         return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
     def shifted_earlier_by_steps(self, steps: Array) -> SensorMeasurements:
-        """Shift samples earlier by each output's delay (k,) [steps], clipped to predictable nodes."""
+        """Shift samples earlier by each output's delay [steps], clipped to predictable nodes. Delays: (k,)."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-9, near, position)
@@ -205,7 +205,7 @@ class SensorMeasurements:
         return np.where((position < first - 1e-9) | (position > last + 1e-9), 0.0, rate)
 
     def interpolate_to_samples(self, at_nodes: Array) -> Array:
-        """Interpolate values at `evaluation_nodes`, (len(nodes), ...), linearly to the samples, (M, ...)."""
+        """Interpolate values at `evaluation_nodes` linearly to the samples, (len(nodes), ...) to (M, ...)."""
         nodes = self.evaluation_nodes
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
         before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
@@ -261,7 +261,7 @@ def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid)
 
 
 def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
-    """Huber loss sum rho(r) of whitened residuals, and least-squares factors sqrt(rho'(r)/r).
+    """Huber loss of whitened residuals, sum rho(r), and least-squares factors sqrt(rho'(r)/r).
 
     Beyond `scale` the loss grows linearly [standard deviations]; infinite for plain squares.
     """

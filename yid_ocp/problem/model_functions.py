@@ -27,7 +27,7 @@ from yid_ocp.sensors import Sensor, sensor_reading_function
 
 @dataclass(frozen=True)
 class CorrectedInputs:
-    """Inputs of a rollout corrected for effects, with derivatives (..., d) along d parameters (None: zero)."""
+    """Inputs of a rollout corrected for effects, with derivatives along d parameters (..., d) (None: zero)."""
 
     torque: Array  # (N, nu) [N m]
     first_torque: Array  # torque of the initial equilibrium, (nu,) [N m]
@@ -177,7 +177,7 @@ class InputCorrectionFunctions:
     def true_angles_and_efforts(
         self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """True angles and efforts (K, nj) of `joint_names` from recorded ones, with derivatives.
+        """Compute true angles and efforts (K, nj) of `joint_names` from recorded ones, with derivatives.
 
         Followed by their derivatives by the d parameters `wanted`, (K, nj, d), and that of the effort by its reading.
         """
@@ -198,7 +198,7 @@ class InputCorrectionFunctions:
     def sensor_delays_with_derivatives(
         self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Recorded minus true time of each sensor output, (k,) [s], and its derivatives. None without delays."""
+        """Recorded minus true time of each sensor output with derivatives, (k,) [s]. None without delays."""
         return self._evaluate(self._sensor_delays(sensor), theta, wanted)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
@@ -256,7 +256,7 @@ class TimeGridStateValues:
 
 
 def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Velocity (len(nodes), ...) at some nodes of a trajectory (K, ...), the mean over the adjacent steps."""
+    """Velocity at some nodes of a trajectory as mean over the adjacent steps, (K, ...) to (len(nodes), ...)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
@@ -272,7 +272,7 @@ def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int
 
 
 def second_difference_acceleration(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Acceleration (len(nodes), ...) at some nodes of a trajectory (K, ...), by second differences."""
+    """Acceleration at some nodes of a trajectory by second differences, (K, ...) to (len(nodes), ...)."""
     middle = _inner_nodes(nodes, len(q))
     return np.asarray((q[middle + 1] - 2 * q[middle] + q[middle - 1]) / time_step**2) if len(q) > 2 else 0 * q[nodes]
 
@@ -308,7 +308,7 @@ class _SensorReadings(NamedTuple):
 
 
 class ModelFunctions:
-    """Compiled functions of a step's system: sensor readings, equilibrium, initial state fit, input corrections.
+    """Compiled functions of a system: sensor readings, equilibrium, initial state fit and input corrections.
 
     Derivatives may be asked for by the parameters `names`; `start_parameters` are fitted along with starts from points.
     """

@@ -1,4 +1,4 @@
-"""Settings of an estimation problem: initial state, noise, priors, tracking filter, sensors."""
+"""Settings of an estimation problem, such as initial state, noise, priors and tracking filter."""
 
 from __future__ import annotations
 

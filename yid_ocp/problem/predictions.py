@@ -1,4 +1,4 @@
-"""Results of predictions: model-free baselines, measured channels and synthetic recordings."""
+"""Results of predictions, with model-free baselines, measured channels and synthetic recordings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
 
 
 def constant_position_baseline(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
-    """Predict that every point stays where it was in the last given frame (baseline).
+    """Predict that every point stays at its position in the last given frame (baseline).
 
     The `given` first frames are as measured; shape (M, len(points), 3) [m]. Raises `DataError` for a point that is not
     recorded or not seen in the last given frame, or too few frames.
@@ -185,7 +185,7 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
 def rmse_unit_and_count_by_channel(
     results: Sequence[EpisodePrediction], episodes: Sequence[Episode]
 ) -> dict[str, dict[str, Any]]:
-    """Root mean square error, unit and number of samples by channel: {channel: {rmse, unit, n}}.
+    """Root mean square error, unit and number of samples by channel. The keys are `rmse`, `unit`, `n`.
 
     For points the error of a sample is the Euclidean distance.
     """

@@ -1,4 +1,4 @@
-"""Inputs of a rollout from a recording: step torques or commands, prescribed paths and joint angles."""
+"""Inputs of a rollout from a recording, such as torques, commands, prescribed paths and joint angles."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def smoothed_joint_efforts(
 
 
 def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Remove effort noise from gear loads: the model's loads plus the slow part of measured minus model loads.
+    """Remove effort noise from gear loads. The result is the model's loads plus the slow part of measured minus model.
 
     Both are smoothed (N + 1, k) and compared at `nodes` (M,), beyond the first and last of which neither is right; the
     filter of paths and efforts has the `cutoff` [Hz].

@@ -43,7 +43,7 @@ class LowPassFilter:
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def decorrelation_stride(self, step: float) -> int:
-        """Number of samples (`step` [s] apart) after which filtered white noise is nearly uncorrelated."""
+        """Number of samples after which filtered white noise is nearly uncorrelated. `step` [s] is their period."""
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 
     @property

@@ -231,7 +231,7 @@ class Sensor(ABC):
 
     @property
     def outputs_per_channel(self) -> int:
-        """Number of outputs of each channel: 3 for a point, 1 for a joint."""
+        """Number of outputs of each channel, 3 for a point and 1 for a joint."""
         return max(len(self.channel.components), 1)
 
     @property

@@ -1,4 +1,4 @@
-"""Sensors of the robot's joints: encoders of driven joints, efforts of prescribed joints, and their noise."""
+"""Sensors of the robot's joints, with encoders of driven joints and efforts of prescribed joints."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class JointSensor(Sensor):
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
     def select_sensor_joint_rows(self, values: ca.SX, state: NodeState) -> ca.SX:
-        """Select the rows (nj, 1) of the sensor's joints from a column for all joints (n, 1)."""
+        """Select the rows of the sensor's joints from a column for all joints, (n, 1) to (nj, 1)."""
         return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
@@ -160,7 +160,7 @@ def smoothed_effort_data(
 def nodes_and_decorrelated_values(
     around: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
 ) -> tuple[IntArray, Array]:
-    """Low-pass filter values and select nodes (K,) so far apart that noise is nearly independent; values (K, k).
+    """Low-pass filter values (K, k) at nodes (K,) so far apart that noise is nearly independent.
 
     `values` (M, k) belong to the times `t` + `late` [s] and are called `noun` in a `DataError` of a recording too short
     for the filter: that of efforts, whose prediction is smoothed again, or the one of the path.

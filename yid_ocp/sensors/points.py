@@ -1,4 +1,4 @@
-"""Sensors of point positions: cameras, motion capture, and the arm that holds the point."""
+"""Sensors of point positions, such as cameras, motion capture, and the arm that holds the point."""
 
 from __future__ import annotations
 

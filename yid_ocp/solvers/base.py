@@ -77,7 +77,7 @@ EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
 
 @dataclass(frozen=True)
 class EstimateChecks:
-    """Checks of an estimate beyond its fit: finer discretisations, held-out recordings, stability of the step.
+    """Checks of an estimate beyond its fit, by finer discretisations, held-out recordings and step stability.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Solvers that follow rollout gradients: Gauss-Newton, L-BFGS-B, and steepest descent of Caldwell et al. (2014)."""
+"""Solvers that follow rollout gradients: Gauss-Newton, L-BFGS-B, and the published steepest descent."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ class SingleShooting(SolverWithCheckedSettings):
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
 class SteepestDescent(SolverWithCheckedSettings):
-    """Projected steepest descent with Armijo backtracking: x <- P(x - s g), where P projects on the bounds.
+    """Projected steepest descent with Armijo backtracking. The iterates are x <- P(x - s g), P projects on the bounds.
 
     The gradient comes from the adjoint. Unscaled on purpose, as in the paper. The first length tried in an
     iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's from the change of the gradient

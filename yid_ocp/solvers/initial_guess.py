@@ -1,4 +1,4 @@
-"""Initial guesses: free effects off their neutral values, and node states for solvers with states as unknowns."""
+"""Initial guesses with active free effects, and node states for solvers with states as unknowns."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def guess_unknowns_and_node_states(
 
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
-    """Mean square whitened residual of a trajectory (N + 1, nx) of recording `i`, without effort channels."""
+    """Mean square whitened residual of a trajectory without effort channels. It is (N + 1, nx) of recording `i`."""
     shared, _ = problem.theta_and_initial_state_deviation(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
@@ -144,7 +144,7 @@ def _resting(
 
 
 def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array) -> Array:
-    """Initial unknown vector (nx,) with every free effect slightly active.
+    """Initial unknown vector with every free effect slightly active, shape (nx,).
 
     At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the
     slope by its amplitude is that of whatever shape the settings name: a spring that would have to push from there

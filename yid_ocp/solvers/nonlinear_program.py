@@ -47,7 +47,7 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function y(v; d, s) with its derivatives. Columns v are local variables, d data and s shared data.
+    """Symbolic function of local variables with its derivatives: y(v; d, s) of variables v, data d and shared data s.
 
     The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. Derivatives may be
     compiled; the value stays CasADi's own, so that whoever builds upon it can differentiate it.
@@ -143,7 +143,7 @@ class MappedFunctionTerm:
 
 @dataclass(frozen=True)
 class ResidualTerm:
-    """Residual term of a program's objective: r = weight (combination values - target)."""
+    """Residual term of a program's objective, r = weight (combination values - target)."""
 
     term: MappedFunctionTerm
     combination: ca.DM | None = None  # shape (nr, ny K); None takes the values as they are
@@ -177,7 +177,7 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Sparse Jacobian (nr, nw) of the residuals r by the program's unknowns w."""
+        """Sparse Jacobian of the residuals by the program's unknowns w, shape (nr, nw)."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
         matrix = self._residual_jacobian_by_term_values(p)
@@ -210,7 +210,7 @@ class ResidualTerm:
 
 @dataclass(frozen=True)
 class GaussNewtonHessianRidge:
-    """Curvature added to the Gauss-Newton Hessian only: factor * mean square residual / max(|w_i|, scale_i)^2.
+    """Curvature added to the Gauss-Newton Hessian only, factor * mean square residual / max(|w_i|, scale_i)^2.
 
     Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
     The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.
@@ -306,7 +306,7 @@ def available_memory_bytes() -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NonlinearProgram(ReprMixin):
-    """Nonlinear program in CasADi: minimise f(w, p) subject to bounds and constraints.
+    """Nonlinear program in CasADi that minimises f(w, p) under bounds and constraints.
 
     `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
     is short for `nlp["q[NAME]"]`.
@@ -360,7 +360,7 @@ class NonlinearProgram(ReprMixin):
         return tuple(named)
 
     def constraint_names(self) -> tuple[str, ...]:
-        """Names of all constraint rows: term, row and place. Rows of `with_user_terms` are `added.I`."""
+        """Names of all constraint rows by term, row and place. Rows of `with_user_terms` are `added.I`."""
         places = ((t, k) for t in self.constraint_terms for k in range(len(t.variable_indices)))
         terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))

@@ -1,4 +1,4 @@
-"""Calibrate a sequence's camera (pose, depth, clock) from the visible arm, and find late frame stamps.
+"""Calibrate a sequence's camera in pose, depth and clock from the visible arm, and find late frame stamps.
 
 What stays uncertain is an error common to all frames, and enters the standard deviation of every point. A frame whose
 own clock offset is another than the common one was stamped late. Offset and latency are one number, stamp minus joint
@@ -212,7 +212,7 @@ class CameraCalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """Result of a camera calibration, with camera state, covariance, prior state, arm visibility and message."""
+    """Result of a camera calibration, with camera state, covariance, prior and arm visibility."""
 
     camera_state: CameraState  # what is used: pose, depth, clock
     prior_state: CameraState

@@ -63,7 +63,7 @@ _MIN_CURVATURE_FRACTION = 0.2  # of the robust sum, of that of its weights
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Estimated camera state: pose, depth scale and offset, clock offset and drift."""
+    """Estimated camera state, with pose, depth scale and offset, and clock offset and drift."""
 
     pose: Array  # (4, 4), camera in the world, R and t
     depth_scale: float = 1.0  # on a measured depth, g
@@ -73,7 +73,7 @@ class CameraState:
     clock_reference_stamp: float = 0.0  # s0 [s]
 
     def measured_to_world_points(self, points: Array) -> Array:
-        """Transform measured points (N, 3) from the camera's frame to the world [m]."""
+        """Transform measured points from the camera's frame to the world, shape (N, 3) [m]."""
         placed = np.asarray(points @ self.pose[:3, :3].T)
         if self.depth_scale != 1.0 or self.depth_offset != 0.0:
             placed *= (self.depth_scale + self.depth_offset / points[:, 2])[:, None]
@@ -81,7 +81,7 @@ class CameraState:
         return placed
 
     def world_to_measured_points(self, points: Array) -> Array:
-        """Transform world points (N, 3) to what the camera would measure [m]."""
+        """Transform world points to the camera's measurements, shape (N, 3) [m]."""
         own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         return np.asarray(own * ((1.0 - self.depth_offset / own[:, 2:3]) / self.depth_scale))
 
@@ -91,7 +91,7 @@ class CameraState:
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
     def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
-        """Jacobian of world points (N, 3) by pose and depth, shape (N, 3, 8)."""
+        """Jacobian of world points by pose and depth, shape (N, 3, 8)."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
@@ -104,7 +104,7 @@ class CameraState:
         return result
 
     def with_state_increment(self, change: Array) -> CameraState:
-        """Add a change: rotation (world axes), translation, log depth scale, depth and clock offset, drift."""
+        """Add rotation (world axes), translation, log depth scale, depth and clock offset, and drift to the state."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
@@ -374,7 +374,7 @@ class SurfaceVisibilityFractions:
 def pooled_surface_visibility_fractions(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
 ) -> SurfaceVisibilityFractions:
-    """Fractions of the arm's surface in view that clouds contain (within `within` [m]), occlude or see through."""
+    """Fractions of the arm's visible surface that clouds contain, occlude or see through. `within` is in metres."""
     counts = np.zeros(4)
     for glimpse in glimpses:
         points, _ = arm.visible_surface_points(state, glimpse.stamp)

@@ -1,4 +1,4 @@
-"""Robust fit of the object's shape to a cloud with derivatives, equation (3) of Caldwell et al. (2014).
+"""Robust fit of the object's shape to a cloud with derivatives. It solves equation (3) of Caldwell (ISER 2014).
 
     q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
 

@@ -323,7 +323,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
 
 
 def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
-    """Whether links (K, 2, 3) with radii (K,) [m] touch each other at parts that are far apart along the shape."""
+    """Whether parts of a shape that are far apart along it touch. Links are (K, 2, 3), radii (K,) [m]."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
     edges = np.where(near < _TOUCHING_DISTANCE, 1e-6, 0.0)  # zero is no way

@@ -40,7 +40,7 @@ _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """Intrinsics of a camera (x right, y down, z ahead). `DataError` for an unknown distortion model.
+    """Intrinsics of a camera with x right, y down and z ahead. `DataError` for an unknown distortion model.
 
     Focal lengths and principal point [pixels] of  u = fx x/z + cx,  v = fy y/z + cy  without distortion.
     """
@@ -80,7 +80,7 @@ class CameraIntrinsics:
         return _rays(self)
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
-        """Convert a depth image (height, width) [m] to points (N, 3) in the camera's frame, row by row.
+        """Convert a depth image to points in the camera's frame, row by row, (height, width) to (N, 3) [m].
 
         Zero or NaN is where nothing was measured; errors as `measured_depth_mask`.
         """
@@ -188,7 +188,7 @@ class FrameSequence:
     def from_clouds(
         t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence"
     ) -> FrameSequence:
-        """Make a frame sequence from clouds in memory, each (N, 3) in the camera's frame [m], at `t` (M,) [s]."""
+        """Make a frame sequence from clouds (N, 3) [m] in the camera's frame. The stamps are `t` (M,) [s]."""
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
         camera = validated_camera_pose(pose, source)
@@ -196,7 +196,7 @@ class FrameSequence:
 
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """Pose of a camera (x right, y down, z ahead) at `eye` that looks at `target`, shape (4, 4) [m]."""
+    """Pose of a camera at `eye` that looks at `target`, (4, 4) [m]. Its axes are x right, y down, z ahead."""
     ahead = np.asarray(target, float) - np.asarray(eye, float)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, np.asarray(up, float))

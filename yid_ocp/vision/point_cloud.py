@@ -154,7 +154,7 @@ class ReachableObjectRegion:
         self._base = np.mean(bases, axis=0) if bases else None
 
     def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
-        """Make a test of whether points (N, 3) are in the region. Configuration (n,), camera position (3,) [m]."""
+        """Make a test of which points (N, 3) are in the region, for a configuration (n,) and camera at (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:

@@ -1,4 +1,4 @@
-"""Calibration shared by all frames of a sequence: camera, background, foreign objects and object dimensions.
+"""Calibration shared by all frames of a sequence, for camera, background, foreign objects and dimensions.
 
 Of every frame the least cost about the sizes x (logarithms of lengths and radii over the model's), the bends following,
 is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). Together, with a wide prior P, the frames fitted anew at every x,
@@ -50,7 +50,7 @@ class BackgroundPoints:
         return cKDTree(self.points)
 
     def is_near_background(self, points: Array, beyond: float = 0.0) -> BoolArray:
-        """Whether points (N, 3) lie within `match_distance + beyond` of the background [m]."""
+        """Whether points lie within `match_distance + beyond` of the background [m]. Points (N, 3), result (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
@@ -64,7 +64,7 @@ class BackgroundPoints:
     def from_point_clouds(
         clouds: Sequence[Array], voxel: float, noise: float, shapes: Sequence[TubeLinks] | None = None, near: float = 0
     ) -> BackgroundPoints:
-        """Find background in world clouds (N, 3): an empty scene, or points static in most frames, off fitted shapes.
+        """Find background in world clouds: an empty scene, or points static in most frames and off fitted shapes.
 
         Counted in cubes of an edge `voxel`, with points of standard deviation `noise`; what ever was nearer than `near`
         to the surface of a tube may be the object's, all in [m].

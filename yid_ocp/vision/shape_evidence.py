@@ -1,4 +1,4 @@
-"""Assess a shape by a frame's cloud: own points, foreign points, and links without points.
+"""Assess a shape by a frame's cloud, from own points, foreign points, and links without points.
 
 Of the points that are not near the tubes' surface, those that hang together and are as many as a piece of tube as long
 as it is wide would have are a thing. Where a thing's surface goes on from the shape's, points within two tubes' reach
@@ -50,7 +50,7 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Project points (N, 3) on the nearest of links (K, 2, 3), nearest to `share` of the radius (K,) [m].
+    """Project points (N, 3) on the nearest of links (K, 2, 3). Nearness is to `share` of the radius (K,) [m].
 
     Index of the link and place along it from 0 to 1, both (N,), unit vectors (N, 3) from the centre line to the points,
     and distances (N,) from it [m].
@@ -70,13 +70,13 @@ def tube_link_projections(
 
 
 def link_axes(link_ends: Array) -> Array:
-    """Unit vectors along links (K, 2, 3), shape (K, 3)."""
+    """Unit vectors along links, shape (K, 3). The links are (K, 2, 3)."""
     edge = link_ends[:, 1] - link_ends[:, 0]
     return np.asarray(edge / np.linalg.norm(edge, axis=1)[:, None])
 
 
 def link_normals_perpendicular_to_sight(link_ends: Array, camera: Array) -> Array:
-    """Unit vectors perpendicular to links (K, 2, 3) and to the sight of a camera at (3,), shape (K, 3)."""
+    """Unit vectors perpendicular to links (K, 2, 3) and to a camera's line of sight, shape (K, 3)."""
     across = np.cross(link_ends[:, 1] - link_ends[:, 0], link_ends.mean(axis=1) - camera)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None])
 
@@ -97,7 +97,7 @@ class ForeignCluster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQuality:
-    """Fit quality of a shape in one frame: noise, distances, link coverage, end offsets and foreign clusters."""
+    """Fit quality of a shape in one frame, with noise, distances, link coverage, end offsets and foreign clusters."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
@@ -109,14 +109,14 @@ class ShapeFitQuality:
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
     def covered_fraction_of_visible_links(self, lengths: Array) -> float:
-        """Fraction of the visible length of links, lengths (K,) [m], with own points. 0 if none is visible."""
+        """Fraction of the visible length of links with own points. Lengths are (K,) [m]. 0 if none is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQualityAndPointClasses(ShapeFitQuality):
-    """Fit quality of a shape, with classes of the frame's points: own, contested or foreign."""
+    """Fit quality of a shape, with the frame's own, contested and foreign points."""
 
     # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
     is_own: BoolArray
@@ -213,7 +213,7 @@ def fit_quality_and_point_classes(
 
 
 def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
-    """Masks of skeleton nodes (K,) and of points by nearest node (N,) where the cloud is as narrow as the tube.
+    """Masks of skeleton nodes and points where the cloud is as narrow as the tube, (K,) and (N,).
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
     spread as far in two.

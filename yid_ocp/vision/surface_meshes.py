@@ -79,7 +79,7 @@ class ObservedScene:
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A mesh of triangles: `vertices` (V, 3) [m] and `faces` (F, 3), which are indices."""
+    """A mesh of triangles, with vertices (V, 3) [m] and vertex indices of each face (F, 3)."""
 
     vertices: Array
     faces: IntArray
@@ -127,7 +127,7 @@ class TriangleMesh:
 
 
 class ArticulatedSurfaces:
-    """Surface meshes on the joints of a numeric mechanism (-1: the world), with ray and distance queries.
+    """Surface meshes on the joints of a numeric mechanism, with ray and distance queries. -1 is the world.
 
     Every joint keeps one scene in its own frame, to which rays and points are brought: nothing is rebuilt as it moves.
     """
@@ -167,7 +167,7 @@ class ArticulatedSurfaces:
     def is_within_surface_distance(
         self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
     ) -> BoolArray:
-        """Whether world points (N, 3) are within `reach` of any, or any moving, surface at a configuration [m]."""
+        """Whether world points (N, 3) are within `reach` [m] of any, or any moving, surface at a configuration."""
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
             asked = np.flatnonzero(~result)
@@ -224,7 +224,8 @@ class ArticulatedSurfaces:
         return depth, cosine, owner
 
     def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, IntArray]:
-        """Find the first intersection of rays from one world place (3,) along directions (N, 3) with any surface.
+        """Find the first intersection of rays with any surface. They leave one world place (3,) along directions (N,
+        3).
 
         Distances (N,) in lengths of the directions, unit normals (N, 3) towards the origin, and parts (N,); infinite,
         zero and -1 for rays that meet nothing.
@@ -268,7 +269,7 @@ def _tensor(values: NDArray[Any]) -> Any:
 def load_robot_meshes_by_joint(
     urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual"
 ) -> dict[int, TriangleMesh]:
-    """Load meshes of a robot's links by the joint that carries them (-1: immobile), in that joint's frame.
+    """Load meshes of a robot's links by the joint that carries them, in its frame. -1 stands for immobile links.
 
     The numeric mechanism was read from the URDF file, or `package:baxter`, alone or joined with others. `ModelError`
     where there is no such file, a mesh is missing or cannot be read, or there is no mesh at all.
@@ -317,7 +318,7 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
 
 
 def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
-    """Load meshes missing from the URDF by the index of the joint that carries them (-1: the world).
+    """Load meshes missing from the URDF by the index of their joint. The world has -1.
 
     `ConfigError` where there is no such link, or not exactly one shape; `ModelError` for a file that cannot be read.
     """

@@ -1,4 +1,4 @@
-"""Results of tracking: frame reports, shapes and points of the good frames, and figures."""
+"""Results of tracking, with frame reports, shapes and points of good frames, and figures."""
 
 from __future__ import annotations
 

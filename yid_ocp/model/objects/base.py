@@ -1,4 +1,4 @@
-"""Interface of a kind of flexible object: settings, geometry, refinement, clamps and `init` templates."""
+"""Interface of a kind of flexible object, with settings, geometry, refinement, clamps and `init` templates."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
 
 
 def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
-    """Start values of each segment's bending rigidity (ratio x weight x length^2) and damping, with comments."""
+    """Start values of each segment's damping and bending rigidity, ratio x weight x length^2, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
@@ -211,7 +211,7 @@ class ObjectKind:
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
-        """Frame that carries the object's root (None: world), and the root's pose in it (None: identity), (4, 4)."""
+        """Frame that carries the object's root (None: world) and the root's pose in it (4, 4) (None: identity)."""
         return None, None
 
     @property

@@ -1,4 +1,4 @@
-"""The foam letter Y of Caldwell et al. (ISER 2014). Three tubes of four links each stand on the ground."""
+"""The foam letter Y of Caldwell (ISER 2014). Three tubes of four links each stand on the ground."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
 class FoamY(MountedObjectKind):
-    """The foam letter Y of Caldwell et al. (2014). Without a mount its foot is at the default place."""
+    """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the default place."""
 
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
         "foam_y": InitCommandObjectFactory(4, _init_object)
