@@ -1,4 +1,4 @@
-"""Data quality issues, their limits, and what single channels say: repeated values, quantization, noise, saturation"""
+"""Find repeated values, quantization, noise and saturation in single channels of a recording."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
 
 
 def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
-    """Issues for channels stuck at one value, although they are noisy elsewhere or their velocity is not zero."""
+    """Find channels stuck at one value, although they are noisy elsewhere or their velocity is not zero."""
     joints = recording.joints
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) <= QUALITY_LIMITS.min_stuck_samples:
@@ -95,7 +95,7 @@ def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
 
 
 def white_noise_std(t: Array, values: Array) -> float:
-    """Robust standard deviation of a channel's white noise; zero if the clock is uneven or the channel rests long."""
+    """Robust standard deviation of a channel's white noise. Zero if the clock is uneven or the channel rests long."""
     if len(t) < NOISE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
@@ -130,7 +130,7 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
 
 
 def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
-    """Issues for channels whose quantization or noise exceeds the stated noise; channels below 20 Hz are skipped."""
+    """Find channels whose quantization or noise exceeds the stated noise. Channels below 20 Hz are skipped."""
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) < 100 or median_sample_period(t) > 0.05:
             continue
@@ -161,7 +161,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
 
 
 def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
-    """Issues for channels whose noise is far below the stated noise; channels of equal stated noise are pooled.
+    """Find channels with noise far below the stated noise. Channels of equal stated noise are pooled.
 
     Noise in settings may represent model error; only a fit shows whether it is too large. Noise need not
     be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so
@@ -205,7 +205,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
 
 
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
-    """Issues for joints whose recorded effort saturates: it repeatedly equals its extreme value exactly."""
+    """Find joints whose recorded effort saturates. It then repeatedly equals its extreme value exactly."""
     if recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command":
         return  # what a controller asks for ends at its own bound
     for group, channel, t, values in _channels(recording, "effort"):
@@ -229,7 +229,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
 def typical_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
-    """Distance [m] between the two points of every edge: mean over a recording's frames, median over recordings.
+    """Distance between the two points of every edge [m], mean over frames and median over recordings.
 
     Only so many `frames` from the start of each count, where that is given. `DataError` where there is no recording, or
     an edge that none of them ever shows.
@@ -293,7 +293,7 @@ QUALITY_LIMITS = _QualityLimits()
 
 @dataclass(frozen=True)
 class Issue:
-    """One data quality issue of a recording: cause, severity, evidence, advice, and where and when it occurs."""
+    """One data quality issue of a recording, with cause, severity, evidence and advice."""
 
     cause: str  # what is wrong, in one word of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # the same in one sentence, with numbers
@@ -317,12 +317,12 @@ class Issue:
 
     @property
     def certainty_word(self) -> str:
-        """Certainty of the issue in one word: `perhaps`, `likely` or `certain`."""
+        """Certainty of the issue in one word, `perhaps`, `likely` or `certain`."""
         return "perhaps" if self.evidence_ratio < 1.5 else "likely" if self.evidence_ratio < 3 else "certain"
 
     @property
     def where(self) -> str:
-        """Text that locates the issue: recording, group, channel and time."""
+        """Location of the issue as text, with recording, group, channel and time."""
         place = "/".join(part for part in (self.recording, self.group, self.channel) if part)
         span = "" if self.begin is None or self.end is None else f", {self.begin:.4g} to {self.end:.4g} s"
         return place + span
@@ -374,5 +374,5 @@ SensorOptionsLookup = Callable[[str], SensorOptions]
 
 
 def median_sample_period(t: Array) -> float:
-    """Median time between samples [s] of the times `t`; zero for fewer than two samples."""
+    """Median time between samples at the times `t` [s]. Zero for fewer than two samples."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0

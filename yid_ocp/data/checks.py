@@ -1,4 +1,4 @@
-"""Checks of one recording without a model: clocks, gaps, motion, channels and duplicated data.
+"""Check clocks, gaps, motion, channels and duplicated data of a recording without a model.
 
 Checks against a model are in `analysis.data_quality`. Limits come from physics or statistics.
 """
@@ -46,7 +46,7 @@ class _RecordingParts(NamedTuple):
 
 
 def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
-    """Split a recording at gaps in its joints, or without joints in the `driving` points; return parts and issues.
+    """Split a recording at gaps in its joints, or without joints in the `driving` points.
 
     Where a rollout may not start `anywhere`, in motion too, later parts are kept only where they start at rest.
     """
@@ -109,7 +109,7 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
 
 
 def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
-    """Data quality issues of one recording, from all checks that need no model.
+    """Find data quality issues of one recording by all checks that need no model.
 
     `choice` says how a group is used, its stated noise above all; `driving`, whether joints drive the model, so that
     what lies between their samples matters.
@@ -334,7 +334,7 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
 
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
-    """Issue of the second recording if both recordings hold the same samples, at least in part; else None."""
+    """Make an issue of the second recording if it shares samples with the first. Otherwise None."""
     others = {group.name: group for group in other.joint_and_point_groups}
     count = 0
     for group in one.joint_and_point_groups if one.joints is None else (one.joints,):

@@ -1,4 +1,4 @@
-"""Meaning of columns, tables and messages of other tools: loggers, motion capture exports, robot drivers."""
+"""Interpret columns, tables and messages of loggers, motion capture exports and robot drivers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS
 
 
 def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
-    """Meaning of every column by its name, None where that says nothing, and unit by quantity where names have one.
+    """Interpret every column by its name, and read units from the names. An unclear column has None.
 
     `sensor_components` are components of vectors that sensors on a link read, such as `force_x`.
     """
@@ -115,7 +115,7 @@ _MocapTable = tuple[PointGroup, str, tuple[str, ...]]
 
 
 def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
-    """Function that reads a motion capture export from its rows, chosen by the first row; None for other tables."""
+    """Choose a reader of a motion capture export by the table's first row. None for other tables."""
     first = first_row[0].strip() if first_row else ""
     if first == "Format Version":
         return _read_motive
@@ -248,7 +248,7 @@ JOINT_MESSAGE_TYPES = (
 
 
 def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
-    """Joint names and values by channel of a message of one of `JOINT_MESSAGE_TYPES`, absent channels left out."""
+    """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are left out."""
     if kind == JOINT_MESSAGE_TYPES[0]:
         return _franka_state(content)
     if kind == JOINT_MESSAGE_TYPES[1]:
@@ -262,7 +262,7 @@ def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
 
 
 def joint_values_of_fields(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
-    """Joint values of any message, from the path of an array by channel, such as `position` to `state.q`.
+    """Read joint values from any message, with the path of an array for each channel.
 
     Joints are called 1, 2 and so on. `DataError` where a channel or a path is not known, or holds no numbers.
     """

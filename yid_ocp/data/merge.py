@@ -1,4 +1,4 @@
-"""Merging recordings of one run by several devices, such as a robot's joints and a motion capture system's points."""
+"""Merge recordings of one run by several devices, such as a robot and a motion capture system."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _MotionLag(NamedTuple):
 
 
 def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str, float] | None = None) -> Recording:
-    """Merge recordings of one run into one, named after the first, with notes on clocks, offsets and interpolation.
+    """Merge recordings of one run into one named after the first. Notes report clocks, offsets and interpolation.
 
     Clocks that overlap are one clock, and nothing is shifted; if points then move later or earlier than the joints, a
     note says by how much. Clocks that have nothing in common are aligned by the motion, where the angles explain the

@@ -1,4 +1,4 @@
-"""Recordings in memory: joint groups, point groups and their validation."""
+"""Recordings in memory with joint groups and point groups, and their validation."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its en
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointGroup(ReprMixin):
-    """Joint measurements of a robot: N samples of nj joints on one clock; arrays are copied and read-only.
+    """Joint measurements of a robot, N samples of nj joints with a common clock. Arrays are copied and read-only.
 
     Attributes
     ----------
@@ -102,12 +102,12 @@ class JointGroup(ReprMixin):
 
     @property
     def values_by_channel(self) -> dict[str, Array]:
-        """Arrays (N, nj) of the recorded channels by name, such as `position`; units as in `JOINT_CHANNEL_UNITS`."""
+        """Recorded arrays by channel name, such as `position`, each (N, nj). Units: `JOINT_CHANNEL_UNITS`."""
         return {name: getattr(self, name) for name in JOINT_CHANNEL_UNITS if getattr(self, name) is not None}
 
     @property
     def effort_sampling_kind_or_default(self) -> EffortSamplingKind:
-        """`effort_kind`, or `sample` (as robot drivers publish) if the recording does not state it."""
+        """Recorded `effort_kind`. The default is `sample`, as robot drivers publish."""
         return self.effort_kind or "sample"
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -122,7 +122,7 @@ class JointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointGroup(ReprMixin):
-    """Positions of np named points over M frames of one sensor, on its own clock; arrays are copied and read-only.
+    """Positions of np named points over M frames of one sensor with its own clock. Arrays are copied and read-only.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class PointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorChannelGroup(ReprMixin):
-    """Samples of a further sensor, such as a current sensor, on one clock; channels as in `ChannelSpecification`.
+    """Samples of one additional sensor, for example a current sensor, with their own clock.
 
     Arrays are copied, made float64 and read-only.
 
@@ -219,7 +219,7 @@ class SensorChannelGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(ReprMixin):
-    """One recording of a robot or a virtual experiment, in SI units; unchecked until `validated_recording`.
+    """One recording of a robot or a virtual experiment in SI units. `validated_recording` checks it.
 
     Attributes
     ----------
@@ -269,12 +269,12 @@ class Recording(ReprMixin):
 
     @property
     def joint_and_point_groups(self) -> tuple[JointGroup | PointGroup, ...]:
-        """The joint group (if any), followed by the point groups."""
+        """The joint group, if any, followed by the point groups."""
         return ((self.joints,) if self.joints is not None else ()) + self.points
 
     @property
     def all_groups(self) -> tuple[JointGroup | PointGroup | SensorChannelGroup, ...]:
-        """All groups of the recording: joints first, then points, then channels of further sensors."""
+        """All groups of the recording. Joints precede points, then channels of additional sensors."""
         return (*self.joint_and_point_groups, *self.channel_groups)
 
     @property
@@ -287,7 +287,7 @@ class Recording(ReprMixin):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the recorded joints, length nj; empty without a joint group."""
+        """Names of the recorded joints, length nj. Empty without a joint group."""
         return () if self.joints is None else self.joints.names
 
     @property
@@ -297,17 +297,17 @@ class Recording(ReprMixin):
 
     @property
     def duration(self) -> float:
-        """Time [s] from the earliest to the latest sample of all groups."""
+        """Time from the earliest to the latest sample of all groups [s]."""
         return float(max(group.t[-1] for group in self.all_groups) - min(group.t[0] for group in self.all_groups))
 
     def with_effort_sampling_kind(self, kind: EffortSamplingKind | None) -> Recording:
-        """The recording with `effort_kind` replaced; unchanged if `kind` is None or there are no joints."""
+        """Replace `effort_kind`. The recording is unchanged if `kind` is None or there are no joints."""
         if kind is None or self.joints is None:
             return self
         return replace(self, joints=replace(self.joints, effort_kind=kind))
 
     def time_slice(self, start: float, stop: float) -> Recording:
-        """The recording's samples with start <= t <= stop [s]; times are kept, and groups without samples are dropped.
+        """Select samples with start <= t <= stop [s]. Times are kept, and groups without samples are dropped.
 
         `DataError` where nothing was recorded in between, or `start` is not before `stop`.
         """
@@ -324,7 +324,7 @@ class Recording(ReprMixin):
 
 
 def validated_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
-    """Check shapes, clocks, names, values and units of a recording, and return it unchanged.
+    """Check shapes, clocks, names, values and units of a recording. It is returned unchanged.
 
     `allow_nan_effort` says whether `effort` and `external_effort` may hold NaN, `where` what errors call the recording,
     its file for example; its name where empty.
@@ -374,7 +374,7 @@ def require_data(condition: object, what: str, where: str, allowed: str = "", hi
 
 
 def read_only_array(value: ArrayLike, where: str) -> Array:
-    """A read-only copy of an array as float64; `DataError` if it cannot be converted."""
+    """Copy an array as read-only float64. `DataError` if it cannot be converted."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

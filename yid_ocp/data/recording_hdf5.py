@@ -1,4 +1,4 @@
-"""Recordings as HDF5 files (`yid-recording/1`) with strict checks, and safe access to any HDF5 file.
+"""Read and write recordings as HDF5 files, with safe access to any HDF5 file. The format is `yid-recording/1`.
 
 The HDF5 library ends the process that meets a full disk while it writes, or certain damage while it reads, and takes
 links into other files for its own. None of this can be caught, so it is kept away from the process that does the work:
@@ -50,7 +50,7 @@ _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
-    """Read and check a `yid-recording/1` file; with `allow_nan_effort`, `effort` and `external_effort` may hold NaN.
+    """Read and check a `yid-recording/1` file. With `allow_nan_effort`, efforts may hold NaN.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Check a recording and write it atomically as a `yid-recording/1` file; efforts may hold NaN.
+    """Check a recording and write a `yid-recording/1` file atomically. Efforts may hold NaN.
 
     Errors as `validated_recording`, and `OutputError` where the file cannot be written; an older one is left as it was.
     """
@@ -220,7 +220,7 @@ _MAX_GROUP_DEPTH = 10
 
 
 def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
-    """Check in a forked process that a file can be read, so that a crash of the library cannot end this process.
+    """Check in a forked process that a file can be read. A crash of the library then cannot end this process.
 
     A fork, as a new process would take a second and a process of a pool may have no children. In it, `complaint` reads
     the file and says what stands against it, nothing where all of it can be read. `DataError` where the file is no
@@ -265,7 +265,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
 
 @contextlib.contextmanager
 def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """Context manager of a new HDF5 file in memory, written if the block succeeds; errors as in `atomic_write`."""
+    """Create an HDF5 file in memory, written only if the block succeeds (context manager). Errors: `atomic_write`."""
     with files.atomic_write(Path(path)) as temporary:
         with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
             yield file
@@ -276,7 +276,7 @@ def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 
 @contextlib.contextmanager
 def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """Context manager of an HDF5 file, opened after another process has checked that it can be read.
+    """Open an HDF5 file after another process has checked that it can be read (context manager).
 
     `DataError` where the file is damaged, holds more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers to
     other files, whose contents no hash of this one covers; errors of the library in the block, too.

@@ -1,4 +1,4 @@
-"""Earlier runs: their estimates as priors, how far parameters have moved, predictions without the effects found.
+"""Compare a diagnosis with earlier runs, use their estimates as priors, and predict without the effects found.
 
 Of a linear model with the prior N(m, C0), the estimate x with the covariance C moves by x - m, which has the covariance
 C0 - C where nothing changed. A misfit that makes the data's noise count k times adds (k - 1) C (1 - C/C0). An effect is
@@ -51,7 +51,7 @@ class _ParameterShift:
 
 @dataclass(frozen=True)
 class EarlierRunsComparison:
-    """Comparison of a fit with baseline runs: the runs, their agreement, and the shift of every parameter."""
+    """Comparison of a fit with baseline runs, with their agreement and the shift of every parameter."""
 
     baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
     is_baseline_explained: bool  # whether the model explained their recordings
@@ -62,13 +62,13 @@ class EarlierRunsComparison:
 
     @property
     def changed_parameters(self) -> tuple[_ParameterShift, ...]:
-        """Parameters that have changed significantly, smallest p-value first."""
+        """Parameters that have changed significantly. The smallest p-value comes first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
         return tuple(sorted(changed, key=lambda entry: entry.p_value))
 
 
 def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
-    """Return the problem with a baseline's estimates as a joint prior and its parameters free.
+    """Use a baseline's estimates as a joint prior of a problem, with its parameters free.
 
     Raises `ConfigError` for parameters or effects that the model lacks, or that differ between its recordings.
     """
@@ -108,7 +108,7 @@ class EarlierRunsBaseline:
 
     @staticmethod
     def from_runs(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> EarlierRunsBaseline:
-        """Combine the estimates of several runs, and reference recordings `without` the effect, into a baseline."""
+        """Combine the estimates of several runs and reference recordings `without` the effect into a baseline."""
         if not runs:
             return EarlierRunsBaseline(None, (), 0.0, 1.0, without)
         known, chi2, degrees = pool_estimates(runs)
@@ -117,7 +117,7 @@ class EarlierRunsBaseline:
         )
 
     def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> EarlierRunsComparison | None:
-        """Return how far the parameters of a fit have moved from its baseline prior; None if there are no runs."""
+        """Compute how far a fit's parameters have moved from its baseline prior. None if there are no runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
             return None
@@ -143,14 +143,14 @@ class EarlierRunsBaseline:
         return EarlierRunsComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
 
     def fit_parameters_differ_significantly(self, fit: RefittedModel, limits: Thresholds) -> bool:
-        """Whether any parameter of `fit` differs significantly from the earlier runs; False without runs."""
+        """Whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
     def errors_with_effects_removed_and_added(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> ErrorsWithEffectsRemovedAndAdded | None:
-        """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
+        """Predict reference recordings without the effects of `last`, and the diagnosed ones with these.
 
         None without effects or reference recordings. Without earlier runs, the parameters of the system without the
         effects are estimated on the reference recordings.
@@ -221,7 +221,7 @@ class _PredictionErrors:
 
 @dataclass(frozen=True)
 class ErrorsWithEffectsRemovedAndAdded:
-    """Prediction errors on reference recordings with the effects removed, and on the diagnosed ones with them added."""
+    """Prediction errors on reference recordings without the effects, and on the diagnosed ones with the effects."""
 
     # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted
     effects_removed: _PredictionErrors
@@ -229,7 +229,7 @@ class ErrorsWithEffectsRemovedAndAdded:
     effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """The prediction errors as a dictionary, the entry `counterfactual` of `yid-diagnosis/2`."""
+        """Convert the prediction errors to a dictionary, the entry `counterfactual` of `yid-diagnosis/2`."""
         return {"removed": self.effects_removed.to_dict(), "added": self.effects_added.to_dict()}
 
 

@@ -1,4 +1,4 @@
-"""Random blind cases of one experiment; their labels are sealed before any recording is looked at."""
+"""Generate random blind cases of one experiment. Their labels are sealed before a recording is looked at."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _MIN_CASES_PER_EXPERIMENT = 3  # cases below which an experiment is not worth it
 
 @dataclass(frozen=True)
 class PlannedBlindCase:
-    """Plan of one blind case: number, experiment, category and effect size."""
+    """Plan of one blind case, with number, experiment, category and effect size."""
 
     number: int
     experiment: str
@@ -67,7 +67,7 @@ def plan_blind_cases(
     chains: frozenset[str] = frozenset(),
     purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
-    """Return `count` planned blind cases, distributed over experiments by `weights` and ordered by the seed.
+    """Plan `count` blind cases, distributed over experiments by `weights` and ordered by the seed.
 
     The weights are how large a part of the cases each experiment gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none,
     but for the largest. The objects of `chains` can be made of finer links. `ConfigError` where there is no case.
@@ -132,7 +132,7 @@ _GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.08
 
 @dataclass(frozen=True)
 class CaseGroundTruth:
-    """Label of a blind case: its true effects and parameters, sealed until scoring."""
+    """True effects and parameters of a blind case, sealed until scoring."""
 
     case: str
     category: str  # null, single, pair, outside, left_out or finer_chain
@@ -142,19 +142,19 @@ class CaseGroundTruth:
     experiment: str = ""  # in which it was made
 
     def to_dict(self) -> dict[str, Any]:
-        """The label as a JSON-compatible dictionary."""
+        """Convert the label to a JSON-compatible dictionary."""
         return asdict(self)
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
-        """The label, restored from a dictionary that `to_dict` made."""
+        """Restore the label from a dictionary that `to_dict` made."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
         return CaseGroundTruth(**{**data, "injected": injected})
 
 
 @dataclass(frozen=True)
 class BlindCase:
-    """A blind case as given to the diagnosis: recordings and the effect kinds excluded from the candidates."""
+    """A blind case for the diagnosis, with recordings and the effect kinds excluded from the candidates."""
 
     name: str
     estimation_recordings: tuple[Recording, ...]
@@ -163,13 +163,13 @@ class BlindCase:
 
 
 def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
-    """Return the labels as JSON text, and the text's SHA-256 hash, which is published before the diagnosis."""
+    """Convert labels to JSON text, and hash the text by SHA-256. The hash is published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
-    """Read sealed labels from JSON `text`; raise `DataError` if its SHA-256 hash is not `commitment`."""
+    """Read sealed labels from JSON `text`. `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         raise DataError("the labels are not those that were committed to", where="sealed labels")
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
@@ -177,7 +177,7 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
 
 @dataclass(frozen=True)
 class SyntheticMeasurementConditions:
-    """Settings of an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
+    """Settings of an experiment's synthetic recordings, for number, sensor noise, simulation and camera."""
 
     estimation_count: int = 1  # to estimate on; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
@@ -192,7 +192,7 @@ amplitudes a move the residual."""
 
 
 class BlindCaseGenerator:
-    """Generator of random blind cases of one experiment; `ConfigError` where its system has no driven joints.
+    """Generates random blind cases of one experiment. `ConfigError` where its system has no driven joints.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ class BlindCaseGenerator:
         name: str,
         links: int = 1,
     ) -> Recording:
-        """Simulate one recording with injected effects; the recording has no description and no ground truth."""
+        """Simulate one recording with injected effects, without description and ground truth."""
         nominal, posture = self.simulated_system, self.initial_configuration
         system = nominal if links == 1 or self._finer is None else self._finer(links)
         values = truth if links == 1 else scale_parameters_to_more_links(nominal, system, truth)
@@ -279,7 +279,7 @@ class BlindCaseGenerator:
         )
 
     def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
-        """Return JSON-compatible sensitivities of all candidates, from which their detectable sizes follow."""
+        """Compute JSON-compatible sensitivities of all candidates. Their detectable sizes follow from these."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
@@ -299,7 +299,7 @@ class BlindCaseGenerator:
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
     def draw_planned_case(self, wanted: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
-        """Draw recordings and label of a planned case, as its seed determines; `ModelError` if no draw succeeds."""
+        """Draw recordings and label of a planned case by its seed. `ModelError` if no draw succeeds."""
         name = f"case_{wanted.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_CASE_DRAWS):
@@ -409,7 +409,7 @@ def simulate_random_motion(
     rng: np.random.Generator,
     conditions: SyntheticMeasurementConditions,
 ) -> Recording:
-    """Simulate a random motion, planned with the nominal system at `truth`, with the `simulated` system at `values`."""
+    """Simulate `simulated` at `values` along a random motion planned with the nominal system at `truth`."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
     seed = int(rng.integers(2**31))
@@ -426,7 +426,7 @@ def simulate_random_motion(
 
 
 def first_recorded_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
-    """Return the first recorded position of every driven joint, by name; `ConfigError` if one is not recorded."""
+    """First recorded position of every driven joint. `ConfigError` if one is not recorded."""
     joints = recording.joints
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
@@ -437,7 +437,7 @@ def first_recorded_driven_joint_positions(system: System, recording: Recording) 
 
 
 def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the same tubes with more links; joint stiffness and damping are scaled to match."""
+    """Scale joint stiffness and damping for the same tubes with more links."""
     start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
@@ -469,7 +469,7 @@ def diagnose_blind_case(
 def true_effects_gap_closure(
     ensemble: BlindCaseGenerator, case: BlindCase, label: CaseGroundTruth, candidates: CandidateNamesOrAll = "all"
 ) -> float:
-    """Return the fraction of the held-out gap that a refit of the true effects closes; NaN if the refit fails."""
+    """Fraction of the held-out gap that a refit of the true effects closes. NaN if the refit fails."""
     problem = ensemble._nominal_problem(case.estimation_recordings)
     effects = make_candidate_effects(problem.system, case.estimation_recordings, candidates)
     composed = AllCandidatesProblem.from_problem(problem, effects, [case.held_out_recording])

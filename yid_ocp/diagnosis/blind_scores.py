@@ -1,4 +1,4 @@
-"""Scores of blind diagnoses against their labels, rates over an ensemble, and thresholds calibrated from it.
+"""Score blind diagnoses against their labels, and calibrate thresholds from an ensemble.
 
 With n values of a statistic on cases of one kind, a further such case stays at or below the k-th smallest of them with
 probability k/(n + 1) at least (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715).
@@ -47,7 +47,7 @@ _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", _
 
 @dataclass(frozen=True)
 class BlindCaseScore:
-    """Score of one blind diagnosis against its label: correct answers, gap closure, errors and time."""
+    """Score of one blind diagnosis against its label, with correct answers, gap closure, errors and time."""
 
     case: str
     category: str
@@ -91,7 +91,7 @@ class BlindCaseScore:
 def score_blind_case(
     label: CaseGroundTruth, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
 ) -> BlindCaseScore:
-    """Score a `yid-diagnosis/2` result against its label; `best` is the closure by `true_effects_gap_closure`."""
+    """Score a `yid-diagnosis/2` result against its label. `best` is the closure by `true_effects_gap_closure`."""
 
     def labels(entries: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
         return tuple(f"{e['kind']}@{e['location']}" for e in entries)
@@ -168,7 +168,7 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 
 
 def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Rates of false alarms, detections, correct answers and more over an ensemble; a rate without cases is None.
+    """Rates over an ensemble, such as false alarms, detections and correct answers. None without cases.
 
     Cases that are not judged count in no rate; `not_judged` says how many they are.
     """
@@ -266,7 +266,7 @@ _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
 def permissive_thresholds(limits: Thresholds) -> Thresholds:
-    """Return thresholds that make any residual a gap and accept the best candidate, to calibrate against chance."""
+    """Make thresholds that call any residual a gap and accept the best candidate, to calibrate against chance."""
     sure = 1.0 + 1e-9
     return replace(
         limits,
@@ -364,7 +364,7 @@ def calibrate_thresholds(
     limits: Thresholds = DEFAULT_THRESHOLDS,
     coverage: float = _TARGET_COVERAGE,
 ) -> dict[str, Any]:
-    """Return conformal quantiles as thresholds, and the effect of each on the ensemble, as `yid-calibration/1`.
+    """Compute thresholds as conformal quantiles, and their effect on the ensemble (`yid-calibration/1`).
 
     Labels, marks and answers are of the same cases. An answer is a `result` with its `statistics`, and those with open
     thresholds (`open`) where no gap was seen; `limits` are those by which it was given.
@@ -434,7 +434,7 @@ _MIN_RECORDED_OVERLAP = 0.5  # part of a signature from which it is kept that tw
 
 
 def evidence_to_json(finding: DiagnosisResult) -> dict[str, Any]:
-    """Return the numbers on which a diagnosis' rules rest, from which `judge_recorded_case` judges it again."""
+    """Numbers on which a diagnosis' rules rest. `judge_recorded_case` judges the diagnosis again from them."""
     record, plain = finding.record, to_lossless_plain_data
     pairs = {
         name: [[[e.label for e in both], decrease] for both, _, decrease in own] for name, own in record.pairs.items()

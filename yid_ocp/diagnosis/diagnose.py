@@ -1,4 +1,4 @@
-"""Diagnosis of the sim-to-real gap: all steps in order, from the nominal fit to the verdict."""
+"""Run all steps of a diagnosis of the sim-to-real gap, from the nominal fit to the verdict."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def diagnose(
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
-    """Diagnose the gap between model and recordings: whether it exists, where, its cause, and how far it closes.
+    """Diagnose the gap between model and recordings. The result says whether it exists, where, why, and what closes it.
 
     Parameters
     ----------
@@ -521,7 +521,7 @@ def fit_nominal_model(
     store: RefitStore | None = None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
-    """Return the nominal model's fit within the problem with all candidates; `SolverError` if it cannot be fitted."""
+    """Fit the nominal model within the problem with all candidates. `SolverError` if it cannot be fitted."""
     known = load_stored_refit(composed, (), store)
     if known is not None and composed.problem.has_process_noise:
         known = load_stored_refit(composed.whitened_at(known.values), (), store)

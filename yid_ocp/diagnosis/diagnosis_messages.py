@@ -1,4 +1,4 @@
-"""Sentences on a diagnosis: its gap, places, effects and events, and the next experiment."""
+"""Write sentences on a diagnosis and the next experiment."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
 def recommended_experiment_text(
     judged: Judgement, where: Sequence[GapLocation], seen: Sequence[DetectableAmplitudes]
 ) -> str:
-    """Return a sentence that recommends the next recording, from verdict, gap location and confusable effects."""
+    """Recommend the next recording in a sentence, from verdict, gap location and confusable effects."""
     verdict = judged.verdict
     rivals = next((entry.equivalent_effects for entry in judged.accepted if len(entry.equivalent_effects) > 1), ())
     if rivals:
@@ -86,7 +86,7 @@ def recommended_experiment_text(
 
 
 def insufficient_data_message(verdict: str, seen: NominalEvidence, limits: Thresholds) -> str:
-    """Return a message why the data are insufficient; the empty string if they suffice."""
+    """Explain why the data are insufficient. Empty if they suffice."""
     if verdict != "insufficient_data":
         return ""
     if not any(entry.is_detectable for entry in seen.screening.detectability):
@@ -98,7 +98,7 @@ def insufficient_data_message(verdict: str, seen: NominalEvidence, limits: Thres
 
 
 def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
-    """Return a sentence on how far the nominal model follows a truncated held-out recording."""
+    """Say how far the nominal model follows a truncated held-out recording."""
     if cut.kept_duration == 0:
         return f"The nominal model cannot follow {cut.recording}; this recording is ignored."
     part = f"{cut.kept_duration:.3g} of {cut.full_duration:.3g} s"
@@ -106,7 +106,7 @@ def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
 
 
 def diagnosis_summary_text(finding: DiagnosisResult) -> str:
-    """Return a text that summarises a diagnosis: gap, locations, effects, events and the next experiment."""
+    """Summarise a diagnosis in a text on gap, locations, effects, events and the next experiment."""
     text = [_gap(finding)]
     if finding.stated_and_finer_time_step is not None:
         stated, used = (f"{step:.4g}" for step in finding.stated_and_finer_time_step)
@@ -317,7 +317,7 @@ def _event_sentences(events: EventSet) -> str:
 
 
 def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
-    """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
+    """One sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
     said, why = "s are ignored in", "moves too fast for the model."
     return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
 

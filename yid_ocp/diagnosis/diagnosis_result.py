@@ -1,4 +1,4 @@
-"""The result of a diagnosis: a dataclass and `yid-diagnosis/2`."""
+"""The result of a diagnosis as a dataclass and in the format `yid-diagnosis/2`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FORMAT = "yid-diagnosis/2"
 
 @dataclass(frozen=True)
 class NominalParameterChange:
-    """Change of one nominal parameter: value in the nominal model and in the model with the accepted effects."""
+    """Value of one nominal parameter in the nominal model and in the model with the accepted effects."""
 
     name: str
     unit: str
@@ -114,19 +114,19 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
-        """Effects of an `effect` or `confusable` verdict, in the order they were added; empty for other verdicts."""
+        """Effects of an `effect` or `confusable` verdict in the order they were added. Other verdicts have none."""
         return tuple(entry.effect for entry in self.accepted)
 
     @property
     def final_model(self) -> RefittedModel:
-        """The model with all accepted effects; the nominal model if there are none."""
+        """The model with all accepted effects, or the nominal model if there are none."""
         last = self.accepted[-1].refitted_model if self.accepted else self.nominal_model
         assert isinstance(last, RefittedModel)
         return last
 
     @property
     def model_error_by_unit(self) -> dict[str, tuple[str, float]]:
-        """Channel with the largest held-out error that the final model leaves beyond noise, and its RMS, by unit."""
+        """Channel with the largest held-out error beyond noise in the final model, and its RMS, by unit."""
         noise = {own.channel: own.noise_rmse for own in self.noise_floor}
         found: dict[str, tuple[str, float]] = {}
         for channel, (error, unit) in self.final_model.held_out_loss.channel_rmse.items():
@@ -135,7 +135,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
         return {unit: own for unit, own in found.items() if own[1] > 0}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
+        """Convert the result to a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
         smoothed, since, finer = self.smoother_result, self.baseline_comparison, self.stated_and_finer_time_step
         cuts = "recording kept=kept_duration whole=full_duration"
         carried = "effect=effect_label parameter value=estimation_value std=estimation_std again=held_out_value"
@@ -198,7 +198,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
 
 
 def judgement_to_dict(judged: Judgement, seen: NominalEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
-    """Return what is scored of a diagnosis as a JSON-compatible dictionary: the part of a result that rules decide."""
+    """Convert the rule-based part of a diagnosis, which is scored, to a JSON-compatible dictionary."""
     closed = judged.gap_closure if judged.accepted else None
     rivals = [entry.equivalent_effects for entry in judged.accepted if len(entry.equivalent_effects) > 1]
     return {
@@ -212,7 +212,7 @@ def judgement_to_dict(judged: Judgement, seen: NominalEvidence, where: Sequence[
 
 
 def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
-    """Return the statistics that are compared with `Thresholds` as a JSON-compatible dictionary, for calibration.
+    """Collect the statistics that are compared with `Thresholds` in a JSON-compatible dictionary.
 
     `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the worst
     channel), `candidate` (p-value of the best, as the best of so many), `evidence` (rise of the log evidence by unknown

@@ -1,4 +1,4 @@
-"""Events: pushes, snags and wrong samples, each in its place and window; a gap that lives there is no effect's.
+"""Find events such as pushes, snags and wrong samples, each in its place and time window.
 
 Along prescribed joints whose efforts are compared the unknown force is measured minus needed torque, sample by sample;
 elsewhere it is what the smoother's linear model says of the force at one coordinate, everything else as the smoother
@@ -62,7 +62,7 @@ _WRONG_SAMPLE_Z = 8.0  # standard deviations of noise, and robust ones of its ne
 
 @dataclass(frozen=True)
 class ForceOrFaultEvent:
-    """A brief local disturbance: an external force on one coordinate, or wrong samples of one channel."""
+    """A brief local disturbance, either an external force on one coordinate or wrong samples of one channel."""
 
     recording: str
     location: str
@@ -83,7 +83,7 @@ class ForceOrFaultEvent:
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
     def to_dict(self) -> dict[str, Any]:
-        """The event as a dictionary, which is an entry of `events` in result.json."""
+        """Convert the event to a dictionary, an entry of `events` in result.json."""
         names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
         return object_attributes_to_json_dict(self, f"{names} std=impulse_std")
 
@@ -99,7 +99,7 @@ class _Overspeed:
 
 @dataclass(frozen=True)
 class EventSet:
-    """Events of a diagnosis by recording and time, recordings' overspeeds, and force estimates at the events."""
+    """Events of a diagnosis by recording and time, with overspeeds and force estimates at the events."""
 
     disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
@@ -109,18 +109,18 @@ class EventSet:
         return bool(self.disturbances or self.overspeeds)
 
     def has_same_disturbances(self, other: EventSet) -> bool:
-        """Whether both sets have the same number of events, in the same channels at overlapping times."""
+        """Whether both sets have equally many events, in the same channels at overlapping times."""
         pairs = list(zip(self.disturbances, other.disturbances, strict=False))
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
     def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
-        """Two sets: the force events alone, and all other events with the overspeeds."""
+        """Split into force events alone, and all other events with the overspeeds."""
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 
     def for_recording(self, recording: str) -> tuple[ForceOrFaultEvent, ...]:
-        """Return the events of one recording."""
+        """Events of one recording."""
         return tuple(event for event in self.disturbances if event.recording == recording)
 
     def _end_of(self, recording: str) -> float:
@@ -411,7 +411,7 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 
 
 def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
-    """Return the problem with force events compensated and affected samples excluded.
+    """Compensate force events in a problem and exclude affected samples.
 
     Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
     of an event there, wrong samples, and all that follows an overspeed do not count. Forces on an object and at servos

@@ -38,7 +38,7 @@ model is lost already, and a fit on less of the recording may fail earlier."""
 def make_candidate_effects(
     system: System, recordings: Sequence[Recording], choice: CandidateNamesOrAll
 ) -> list[EffectBase]:
-    """Return the candidate effects for a system, without the effects that its nominal model already has.
+    """Make the candidate effects for a system, without effects that its nominal model already has.
 
     The choice is "all", or names of the form `kind` (wherever a diagnosis tries it) or `kind@location`. `ConfigError`:
     no such kind, one that has no place here, an effect of the nominal model, an empty list; `ModelError`: no such
@@ -72,7 +72,7 @@ def make_candidate_effects(
 
 
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Return the candidates without those named, as `kind` or `kind@location`.
+    """Exclude the candidates named as `kind` or `kind@location`.
 
     They stay in the compiled step at their neutral values, so that no recompilation is needed. `ConfigError` where a
     name is no candidate, or none is left.
@@ -90,18 +90,18 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
 
 
 def neutral_effect_parameter_values(effects: Sequence[EffectBase]) -> dict[str, float]:
-    """Return the parameter values, by name, at which the given effects change nothing."""
+    """Parameter values at which the given effects change nothing."""
     return {name: value for effect in effects for name, value in effect.neutral_values.items()}
 
 
 def join_effect_labels(effects: Sequence[EffectBase]) -> str:
-    """Join the effects' labels `kind@location` with "and"; return "the nominal model" if there are no effects."""
+    """Join the effects' labels `kind@location` with "and". No effects give "the nominal model"."""
     return " and ".join(effect.label for effect in effects) or "the nominal model"
 
 
 @dataclass(frozen=True)
 class TruncatedHeldOutRecording:
-    """Name and durations of a held-out recording that is truncated where the nominal model stops following it."""
+    """Name and durations of a held-out recording, truncated where the nominal model stops following it."""
 
     recording: str
     kept_duration: float  # how much of it is compared [s]; 0 where nothing is
@@ -110,7 +110,7 @@ class TruncatedHeldOutRecording:
 
 @dataclass(frozen=True)
 class AllCandidatesProblem:
-    """Estimation problem of a system with all candidate effects, any of which can be freed without recompiling.
+    """Estimation problem of a system with all candidate effects. Any can be freed without recompiling.
 
     Sensors, statics and corrections are differentiated by everything once, recordings are placed on the nodes once, and
     the tracking filter is that of the nominal start, the same for every hypothesis."""
@@ -124,7 +124,7 @@ class AllCandidatesProblem:
     def from_problem(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> AllCandidatesProblem:
-        """Add candidate effects to a problem; `DataError` if a recording is both estimated on and held out."""
+        """Add candidate effects to a problem. `DataError` if a recording is both estimated on and held out."""
         effects = tuple(effects)
         joint = compile_step_like(problem.step, problem.step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
@@ -141,7 +141,7 @@ class AllCandidatesProblem:
 
     @property
     def nominal_free_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that are free in the nominal problem."""
+        """Names of the free parameters of the nominal problem."""
         return self.problem.free
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
@@ -161,7 +161,7 @@ class AllCandidatesProblem:
         return replace(self, problem=self.problem.with_episodes(episodes, self.problem.held_out))
 
     def with_time_step(self, time_step: float) -> AllCandidatesProblem:
-        """The problem of the whole recordings with another time step [s], whitened by sensor noise alone."""
+        """Use another time step [s] for the whole recordings, whitened by sensor noise alone."""
         made = self.problem.with_time_step(time_step)
         if self.is_split_in_blocks:
             return replace(self, problem=_in_blocks(made))
@@ -171,7 +171,7 @@ class AllCandidatesProblem:
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], margin: float
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
-        """Truncate held-out recordings where the rollout fails; return the new problem and the truncated recordings.
+        """Truncate held-out recordings where the rollout fails. Also return the truncated recordings.
 
         `margin` is the part that is kept of what the nominal model follows. Where nothing worth predicting is left,
         recordings to estimate on are split in blocks. Weights are those of the sensors' noise; see `whitened_at`.
@@ -194,14 +194,14 @@ class AllCandidatesProblem:
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
     def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
-        """Return the estimation problem with the nominal parameters and the parameters of `effects` free."""
+        """Make the estimation problem with the nominal parameters and those of `effects` free."""
         own = (name for effect in effects for name in effect.parameters.names)
         return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameters, *own))
 
     def with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return the problem with `effects` free; filters are relinearised about the torque offsets at the values `at`.
+        """Free `effects`, and relinearise filters about the torque offsets at the values `at`.
 
         Filters of held-out recordings are left as they are: see `with_relinearized_held_out_filters`.
         """
@@ -211,7 +211,7 @@ class AllCandidatesProblem:
     def with_relinearized_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """`own` of `with_effects_and_relinearized_filters`, held-out filters relinearised at the fitted values."""
+        """Relinearise held-out filters at the fitted values. `own` is from `with_effects_and_relinearized_filters`."""
         return (
             problem_with_relinearized_held_out_whitening(own, *_beside(own, effects, at))
             if own.has_process_noise
@@ -263,5 +263,5 @@ def _masked(episode: Episode, parity: int) -> Episode:
 
 
 def mask_out_samples(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
-    """Return measurements in which the samples of the mask `hidden` (M, k) do not count."""
+    """Exclude masked samples from measurements. The mask `hidden` is (M, k)."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

@@ -1,4 +1,4 @@
-"""A law where names end: a torque at the gap's place as a smooth function of what the model knows there.
+"""Estimate a law for a gap that no named effect explains. It is a torque as a smooth function of known quantities.
 
 Functions compete with each other, and with a torque over time, by the evidence of a linearised fit; the best few are
 refitted with the nominal parameters and judged on held-out recordings like any effect.
@@ -48,7 +48,7 @@ _MIN_LEFTOVER_CLOSURE = 0.2  # part of the residual gap that a law beside effect
 
 @dataclass(frozen=True)
 class GapLaw:
-    """A law estimated where nothing in the library explains the gap, with its held-out closure."""
+    """A law for a gap that nothing in the library explains, with its held-out closure."""
 
     location: str
     tables: tuple[LawTable, ...]  # one for every quantity that it depends on
@@ -60,12 +60,12 @@ class GapLaw:
 
     @property
     def depends_on(self) -> str:
-        """The quantities that the torque depends on, joined with `+`."""
+        """Quantities on which the torque depends, joined with `+`."""
         return "+".join(table.quantity for table in self.tables)
 
     @property
     def sentence(self) -> str:
-        """Sentence on the law: place, quantity, size, and the closed part of the gap."""
+        """Describe the law in a sentence, with place, quantity, size and closed part of the gap."""
         if self.depends_on == "time":
             head = f"{self.location} carries a torque that depends on nothing the model knows better than on time"
         else:
@@ -84,7 +84,7 @@ class GapLaw:
         return f"{head} ({', '.join(sizes)}); {closed}. It is not in the library."
 
     def to_dict(self) -> dict[str, Any]:
-        """The law as a JSON-compatible dictionary: location, depends_on, table, closure, visited_range, runner_up."""
+        """Convert the law to a dictionary. Keys: location, depends_on, table, closure, visited_range, runner_up."""
         rows = [
             {"quantity": t.quantity, "unit": LAW_QUANTITY_UNITS[t.quantity], "at": x, "torque": f, "std": s}
             for t in self.tables
@@ -122,7 +122,7 @@ def find_gap_law(
     places: Sequence[str],
     events: EventSet,
 ) -> GapLaw | None:
-    """Estimate the law of the gap that a model leaves; None where no place is possible or nothing closes any of it.
+    """Estimate the law of the gap that a model leaves. None where no place is possible or nothing closes any of it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Pulses in the history of an unknown force: short, of one sign, on a slow or load-dependent background.
+"""Detect short pulses of one sign in the history of an unknown force on a slow or load-dependent background.
 
 The data say log p(data | f) = g'f - f'L f / 2 of the force's values f. It is a sum of pulses and a Gaussian rest:
 
@@ -47,7 +47,7 @@ class _TorqueTermSizes:
 
 
 class InverseDynamicsModel:
-    """Inverse dynamics M(q) a + c(q, v) + g(q) = tau of a step's system, built once for all recordings."""
+    """Inverse dynamics of a step's system, built once for all recordings: M(q) a + c(q, v) + g(q) = tau."""
 
     def __init__(self, step: Step) -> None:
         self._step = step
@@ -57,7 +57,7 @@ class InverseDynamicsModel:
         return _function(self._step.system, self._step.time_step)
 
     def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
-        """Return magnitudes of the inverse dynamics' terms at increasing nodes (M,), accelerations by differences."""
+        """Magnitudes of the inverse dynamics' terms at increasing nodes (M,). Accelerations are differences."""
         system, time_step = self._step.system, self._step.time_step
         n = system.n_coordinates
         q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
@@ -125,7 +125,7 @@ _MAX_PULSE_RANGE_RATIO = 1.5  # times the range of the history about it that one
 
 @dataclass(frozen=True)
 class ForceEstimate:
-    """Estimate of an unknown force f over time at one location, by its Gaussian log likelihood g'f - f'L f / 2."""
+    """Estimate of an unknown force f over time at one place, by its log likelihood g'f - f'L f / 2."""
 
     recording: str
     location: str
@@ -145,26 +145,26 @@ class ForceEstimate:
         return float(np.median(np.diff(self.t)))
 
     def subset_at_indices(self, keep: IntArray) -> ForceEstimate:
-        """Return the estimate restricted to the time points with the indices `keep`."""
+        """Restrict the estimate to the time points with the indices `keep`."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
         return replace(self, information=information, **parts)
 
     @property
     def allowed_model_error(self) -> Array:
-        """Allowed force error of the model at every time point, shape (M,), in `unit`."""
+        """Allowed force error of the model at every time point in `unit`, shape (M,)."""
         return np.hypot(self.model_error_std, self.friction_limit)
 
     @property
     def max_likelihood_forces(self) -> Array:
-        """Maximum-likelihood force at every time point, shape (M,), in `unit`."""
+        """Maximum-likelihood force at every time point in `unit`, shape (M,)."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
         return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
 
 
 @dataclass(frozen=True)
 class DetectedForcePulse:
-    """A detected force pulse that rises and falls within a time window: times, peak, shape and p-value."""
+    """A force pulse that rises and falls within a time window, with peak, shape and p-value."""
 
     start_time: float  # [s]
     end_time: float
@@ -175,16 +175,16 @@ class DetectedForcePulse:
 
     @property
     def impulse_per_unit_peak(self) -> float:
-        """Integral over time of the pulse shape with a peak of one [s]."""
+        """Time integral of the pulse shape with a peak of one [s]."""
         return (self.end_time - self.start_time) * (1 - _FLAT_RAMP_FRACTION / 2 if self.is_flat_topped else 0.5)
 
     @property
     def impulse(self) -> float:
-        """Signed integral of the pulse over time, in the force's unit times s."""
+        """Signed time integral of the pulse, in the force's unit times s."""
         return self.peak_value * self.impulse_per_unit_peak
 
     def filtered_force_at(self, t: Array, cutoff: float = math.inf) -> Array:
-        """Return the pulse's force at times `t` after a low-pass filter at `cutoff` [Hz]."""
+        """Force of the pulse at times `t` after a low-pass filter at `cutoff` [Hz]."""
         window = _Windows(*map(np.atleast_1d, (self.start_time, self.end_time, self.is_flat_topped)))
         return self.peak_value * _Filter.of(cutoff)(window, t)[:, 0]
 
@@ -306,7 +306,7 @@ class _Rest:
 def detect_force_pulses(
     history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[list[DetectedForcePulse], float]:
-    """Return the pulses in one force estimate, largest evidence first, and the number of windows searched.
+    """Detect pulses in one force estimate, largest evidence first. Also return the number of windows searched.
 
     p-values are those of single windows; the number counts disjoint windows of lengths a factor of two apart.
     """

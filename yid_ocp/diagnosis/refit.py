@@ -1,4 +1,4 @@
-"""Step six: full refits of the nominal parameters and those of some effects, judged on held-out recordings.
+"""Refit the nominal parameters with those of some effects, and judge the fits on held-out recordings.
 
 Every loss is a mean square of whitened residuals over blocks of held-out time, the same blocks for every model, so that
 differences between models are paired. G = max(0, chi2/n - 1) is the gap.
@@ -46,7 +46,7 @@ _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effe
 
 @dataclass(frozen=True)
 class HeldOutLoss:
-    """Whitened squared prediction errors (nb,) of a model in nb time blocks of the held-out recordings."""
+    """Whitened squared prediction errors of a model in nb time blocks of the held-out recordings, (nb,)."""
 
     block_chi2: Array  # sums of whitened squares; infinite where a rollout failed
     block_sample_counts: Array
@@ -61,7 +61,7 @@ class HeldOutLoss:
 
     @property
     def chi2_per_sample(self) -> float:
-        """`total_chi2` divided by the number n of held-out samples; 1 is expected of noise alone."""
+        """`total_chi2` divided by the number n of held-out samples. Noise alone gives 1 on average."""
         return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
 
     @property
@@ -72,7 +72,7 @@ class HeldOutLoss:
 
 @dataclass(frozen=True)
 class StoredFit:
-    """Stored result of a refit: values and standard deviations, from which one evaluation restores `RefittedModel`."""
+    """Stored values and standard deviations of a refit. One evaluation restores `RefittedModel` from them."""
 
     values: dict[str, float]  # of every unknown
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing
@@ -82,7 +82,7 @@ class StoredFit:
 
 @dataclass(frozen=True)
 class RefitStatistics(StoredFit):
-    """All that a rule asks of a refit: where it ended, and how well it predicts both sets of recordings."""
+    """Statistics of a refit that rules use, with estimates and predictions of both sets of recordings."""
 
     effects: tuple[EffectBase, ...]
     cost: float
@@ -96,7 +96,7 @@ class RefitStatistics(StoredFit):
         return sum(len(effect.parameters) for effect in self.effects)
 
     def effect_parameters_as_reported(self, effect: EffectBase) -> dict[str, ReportedParameterValue]:
-        """Return an effect's fitted parameters in reported units with standard deviations, by name."""
+        """Fitted parameters of an effect in reported units, with standard deviations."""
         return effect.parameters_as_reported(self.values, self.std)
 
 
@@ -110,10 +110,10 @@ class RefittedModel(RefitStatistics):
 
 
 class RefitStore(Protocol):
-    """Interface of a store of finished refits, from which an interrupted diagnosis resumes; two threads call it."""
+    """Interface of a store of finished refits, from which an interrupted diagnosis resumes. Two threads call it."""
 
     def get(self, name: str) -> StoredFit | None:
-        """Return the refit stored under a name; None if there is none."""
+        """Find the refit stored under a name. None if there is none."""
 
     def put(self, name: str, refitted: StoredFit) -> None:
         """Store a refit under a name."""
@@ -121,7 +121,7 @@ class RefitStore(Protocol):
 
 @dataclass(frozen=True)
 class NominalSolutionAndRefitStore:
-    """Results known before a diagnosis begins: the nominal problem's solution, and refits of an interrupted run."""
+    """Solution of the nominal problem and refits of an interrupted run, known before a diagnosis."""
 
     solution: Solution | None = None
     store: RefitStore | None = None  # told of every further refit
@@ -129,7 +129,7 @@ class NominalSolutionAndRefitStore:
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """What a search for effects was answered, by name, so that other rules can be tried on it without a refit."""
+    """Record of the answers that a search for effects received, by name. Other rules can use it without refits."""
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None where there is no fit
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # beside effects that were added
@@ -137,12 +137,12 @@ class SearchRecord:
 
 
 class UnrecordedRefitError(LookupError):
-    """What rules ask was not worked out by the search whose record they are tried on."""
+    """Raised when rules require a refit that the recorded search did not make."""
 
 
 @dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress, store and deadline of one diagnosis; what rules ask is answered by refits.
+    """Problem, thresholds, progress, store and deadline of one diagnosis. Refits answer what rules ask.
 
     With `is_finished` it is answered from the record alone, and `UnrecordedRefitError` says that it is not there; the
     problem then does not matter.
@@ -159,7 +159,7 @@ class RefitContext:
     is_finished: bool = False
 
     def note_skip_past_deadline(self, *what: str) -> bool:
-        """Whether the deadline for refits has passed; if so, `what` is noted as skipped."""
+        """Whether the deadline for refits has passed. `what` is then noted as skipped."""
         is_late = time.perf_counter() >= self.deadline
         self.skipped.extend(what if is_late else ())
         return is_late
@@ -167,12 +167,12 @@ class RefitContext:
     def refit(
         self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str = ""
     ) -> RefitStatistics | None:
-        """Return the model with some effects refitted, by a name that says from where; None if no rollout succeeds."""
+        """Refit the model with some effects, under a name that says from where. None if no rollout succeeds."""
         asked = (self.problem, effects, start, self.store, name, self.thresholds)
         return self._answer(self.record.refits, name or join_effect_labels(effects), lambda: refit_with_effects(*asked))
 
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
-        """Return the same effects fitted on the held-out recordings; None where that cannot be done."""
+        """Fit the same effects on the held-out recordings. None where that cannot be done."""
         name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
         return self._answer(self.record.refits, name, lambda: self._turned(fit, name))
 
@@ -190,13 +190,13 @@ class RefitContext:
         return refit_with_effects(turned, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
-        """Return all candidates screened beside some effects, by a name that says at which fit's values."""
+        """Screen all candidates beside some effects, under a name that says at which fit's values."""
         return self._answer(
             self.record.screenings, name, lambda: screen_candidates(self.problem, base, values, self.thresholds)
         )
 
     def ranked_pairs(self, screened: ScreeningResult, without: str = "") -> tuple[CandidatePair, ...]:
-        """Return the pairs of candidates that promise most, without one label; see `_MAX_RECORDED_PAIRS`."""
+        """Rank the most promising pairs of candidates, without one label. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
         found = screened.joint_score_model.ranked_pairs(labels)
         return self._answer(self.record.pairs, without, lambda: tuple(itertools.islice(found, _MAX_RECORDED_PAIRS)))
@@ -236,7 +236,7 @@ def refit_with_effects(
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel | None:
-    """Fit nominal and effect parameters and predict held-out recordings; return None if no rollout succeeds.
+    """Fit nominal and effect parameters and predict held-out recordings. None if no rollout succeeds.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def refit_with_effects(
 def load_stored_refit(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], store: RefitStore | None, name: str = ""
 ) -> RefittedModel | None:
-    """Return a refit restored from the store by one evaluation; None if the store does not have it."""
+    """Restore a refit from the store by one evaluation. None if the store does not have it."""
     known = None if store is None else store.get(name or join_effect_labels(effects))
     unknowns = {*problem.with_nominal_and_effects_free(effects).unknown_names}
     amplitudes = {amplitude for effect in effects for amplitude in effect.amplitude_names}
@@ -420,7 +420,7 @@ def refit_with_each_effect(
     values: Mapping[str, float],
     where: str = "",
 ) -> list[RefitStatistics]:
-    """Refit the model with each of several effects or pairs added to `base`; return the refits that succeed.
+    """Refit the model with each of several effects or pairs added to `base`. Failed refits are left out.
 
     Each of those `tried` stands beside the parameters at which it begins, `values` is where all other unknowns begin,
     and `where` says so in the store if the same effects are refitted from elsewhere too.
@@ -493,7 +493,7 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
 
 
 def held_out_channel_errors(found: Sequence[tuple[Episode, EpisodePrediction | str]]) -> dict[str, tuple[float, str]]:
-    """Root mean square error and unit, by channel, over the held-out recordings that could be predicted."""
+    """Root mean square error and unit of each channel over the predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_unit_and_count_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
     return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}

@@ -44,7 +44,7 @@ class _EffectSignature:
 
 @dataclass(frozen=True)
 class AllCandidatesLinearization:
-    """Residual and candidate signatures linearised at one point, with the model's free parameters projected out."""
+    """Residual and candidate signatures linearised at one point. The model's free parameters are projected out."""
 
     projected_residual: Array  # P r, shape (nr,)
     signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
@@ -52,7 +52,7 @@ class AllCandidatesLinearization:
 
 @dataclass(frozen=True)
 class DetectableAmplitudes:
-    """Smallest amplitudes of a candidate that would be detected, from sensitivity and noise alone."""
+    """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
 
     effect: EffectBase
     detectable_amplitudes: dict[str, float]  # in the parameter's unit
@@ -61,7 +61,7 @@ class DetectableAmplitudes:
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """Result of a candidate's score test (Lagrange multiplier): predicted values, chi2 decrease and p-value."""
+    """Result of a candidate's score test, with predicted values, chi2 decrease and p-value."""
 
     effect: EffectBase
     predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values
@@ -131,7 +131,7 @@ def _basis(matrix: Array) -> Array:
 def _candidate_detectable_amplitudes(
     point: AllCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
 ) -> tuple[DetectableAmplitudes, ...]:
-    """Return the smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
+    """Smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
     found: dict[str, DetectableAmplitudes] = {}
     for signature in point.signatures:
         effect, neutral = signature.effect, signature.effect.neutral_values
@@ -190,7 +190,7 @@ def _score_candidates(
     series: Sequence[ResidualChannel],
     visible: Sequence[DetectableAmplitudes],
 ) -> tuple[CandidateScore, ...]:
-    """Return the score test of every detectable candidate, largest predicted decrease of r'r first."""
+    """Score every detectable candidate. The largest predicted decrease of r'r comes first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
     scores: dict[str, list[CandidateScore]] = {}
     for signature in point.signatures:
@@ -208,7 +208,7 @@ def _score_candidates(
 
 
 def bonferroni_min_p_value(ranked: Sequence[CandidateScore]) -> float:
-    """Return the Bonferroni-corrected smallest p-value of the candidates; 1 if there are none."""
+    """Bonferroni-corrected smallest p-value of the candidates. 1 if there are none."""
     return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
 
@@ -251,13 +251,13 @@ def _values(effect: EffectBase, step: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class ConfusabilityMatrix:
-    """Fractions of each candidate's signature that each other explains, beyond what nominal parameters explain."""
+    """Fractions of each candidate's signature that the others explain, beyond what nominal parameters explain."""
 
     labels: tuple[str, ...]
     overlap_fractions: Array  # shape (nj, nj): of row j's signature by column i's
 
     def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
-        """Return labels of the other candidates that explain at least the fraction `limit` of one's signature."""
+        """Labels of the other candidates that explain at least the fraction `limit` of one's signature."""
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
@@ -280,7 +280,7 @@ class AllCandidatesScoreModel:
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
     def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
-        """Yield all pairs of the candidates labelled in `among`, largest predicted decrease of r'r first.
+        """Yield all pairs of candidates labelled in `among`. The largest predicted decrease of r'r comes first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
         """
@@ -306,7 +306,7 @@ class AllCandidatesScoreModel:
 def _make_joint_score_model(
     point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
 ) -> AllCandidatesScoreModel:
-    """Return the joint linear model of all candidates, at the shape values of `chosen` or the middle of the grid."""
+    """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
     groups: dict[str, list[_EffectSignature]] = {}
     for signature in point.signatures:
@@ -337,7 +337,7 @@ def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityM
 
 @dataclass(frozen=True)
 class ScreeningResult:
-    """Detectability, score tests and confusability of all candidate effects at one point, with their joint model."""
+    """Detectability, score tests and confusability of all candidates at one point, with their joint model."""
 
     detectability: tuple[DetectableAmplitudes, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
@@ -351,7 +351,7 @@ def screen_candidates(
     values: Mapping[str, float],
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> ScreeningResult:
-    """Screen all candidates not in `base`; return their detectability, scores and confusability at `values`."""
+    """Screen all candidates not in `base` at `values` for detectability, scores and confusability."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
     visible = _candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
     ranked = _score_candidates(point, residual_channel_indices(problem.problem), visible)

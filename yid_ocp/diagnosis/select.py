@@ -1,4 +1,4 @@
-"""Step seven: which effects are added, one after the other, by what they close of the held-out gap.
+"""Select effects one after the other by how much of the held-out gap they close.
 
 1 - G_after/G_before of the held-out losses is what was closed; its interval comes from resampling blocks (Kuensch 1989,
 doi:10.1214/aos/1176347265).
@@ -26,7 +26,7 @@ _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 @dataclass(frozen=True)
 class GapClosure:
-    """Fraction of the held-out gap that a model closes, with its 95 % interval; NaN if there is no gap."""
+    """Fraction of the held-out gap that a model closes, with its 95 % interval. NaN if there is no gap."""
 
     fraction: float
     ci_low: float
@@ -50,7 +50,7 @@ class SelectedEffect:
 def held_out_gap_closure(
     before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> GapClosure:
-    """Return the fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
+    """Fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
     sure = _lr_decisive(before, after, limits)
     if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
         return replace(UNDEFINED_GAP_CLOSURE, is_decisive=sure)
@@ -76,7 +76,7 @@ def _is_noise(loss: HeldOutLoss, limits: Thresholds) -> bool:
 
 
 def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
-    """Return the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
+    """Decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
     total = float(before.block_sample_counts.sum())
     difference = before.block_chi2 - after.block_chi2
     if not np.all(np.isfinite(difference)):
@@ -379,7 +379,7 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
 def selection_without(
     search: RefitContext, nominal: RefitStatistics, kept: Sequence[SelectedEffect], entry: SelectedEffect
 ) -> tuple[SelectedEffect, ...]:
-    """Return the selected effects without one of them, the others refitted; empty if they cannot be."""
+    """Remove one of the selected effects and refit the others. Empty if that is not possible."""
     full, rest = kept[-1].refitted_model, [other for other in kept if other is not entry]
     name = f"{join_effect_labels(full.effects)} without {entry.effect.label}"
     without = search.refit(tuple(other.effect for other in rest), full.values, name)

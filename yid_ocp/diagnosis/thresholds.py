@@ -18,7 +18,7 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 
 @dataclass(frozen=True)
 class Thresholds(SmootherThresholds):
-    """Thresholds of every step of a diagnosis: null test, screening, refits, selection, localisation and events.
+    """Thresholds of every step of a diagnosis, from the null test to the events.
 
     Every field has its description beside it; the settings' reference (section `diagnosis`) repeats them.
     """

@@ -1,4 +1,4 @@
-"""Step eight: whether there is a gap, whether the effects carry over to the held-out recordings, and the verdict.
+"""Decide whether there is a gap, whether effects carry over to held-out recordings, and the verdict.
 
 Two or three effects together imitate almost anything on the recordings on which they were fitted. What is true of the
 robot comes out the same wherever it is fitted; so the held-out recordings are fitted in turn, and values are compared.
@@ -34,7 +34,7 @@ _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
 @dataclass(frozen=True)
 class EffectAmplitudeTransferCheck:
-    """Comparison of one effect parameter's estimates from the estimation recordings and from the held-out ones."""
+    """Comparison of one effect parameter's estimates from the estimation and the held-out recordings."""
 
     effect_label: str
     parameter: str
@@ -47,7 +47,7 @@ class EffectAmplitudeTransferCheck:
 
     @property
     def both_estimates_text(self) -> str:
-        """Text with both estimates, their standard deviations and unit."""
+        """Format both estimates with their standard deviations and unit."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
@@ -69,7 +69,7 @@ class LocatedGap:
 
 @dataclass(frozen=True)
 class NominalEvidence:
-    """Evidence on a gap before the search for effects."""
+    """Evidence for a gap before effects are searched for."""
 
     nominal_model: RefitStatistics
     nominal_test: NullTestResult  # on the recordings to estimate on
@@ -94,14 +94,14 @@ class NominalEvidence:
         return residuals_exceed_noise(tests, whole) or min(along, default=1.0) * max(len(ranked), 1) < level
 
     def has_enough_samples(self, limits: Thresholds) -> bool:
-        """Whether there are enough effective samples for the unknowns."""
+        """Whether the effective samples suffice for the unknowns."""
         enough = limits.min_samples_per_unknown * len(self.nominal_model.values)
         return self.nominal_test.degrees_of_freedom >= enough
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What follows from the numbers of a diagnosis: verdict, effects, and the statistics on which they rest."""
+    """Verdict and effects that follow from the numbers of a diagnosis, with the statistics behind them."""
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
     unknown_reason: UnknownVerdictReason
@@ -113,7 +113,7 @@ class Judgement:
 
     @property
     def accepted(self) -> tuple[SelectedEffect, ...]:
-        """The effects of an `effect` or `confusable` verdict, in the order they were added; empty for others."""
+        """Effects of an `effect` or `confusable` verdict in the order they were added. Other verdicts have none."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     @property
@@ -184,7 +184,7 @@ def judge(
     locate: Callable[[], LocatedGap],
     finished: Callable[[str], None] = lambda _: None,
 ) -> Judgement:
-    """Return the verdict that follows from what is known of the gap and from what a search for effects is answered.
+    """Decide the verdict from the evidence for a gap and from the answers to a search for effects.
 
     A function of numbers alone: refits, screenings and the smoother (`locate`) are asked for by name, and are answered
     from a record as well. `finished` is called with the name of each stage.

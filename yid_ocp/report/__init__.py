@@ -1,1 +1,1 @@
-"""Output for people: figures, report sections and the page; a new section is one file in `sections`."""
+"""Figures, report sections and the HTML page. A new section is one file in `sections`."""

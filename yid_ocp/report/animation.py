@@ -1,4 +1,4 @@
-"""Animation data: sticks, points, robot meshes and acting forces over time, measured and predicted."""
+"""Animation data over time, measured and predicted: sticks, points, robot meshes and acting forces."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class _AnimatedMotion:
 
 @dataclass(frozen=True)
 class Animation:
-    """Several motions on a common time axis t (F,) [s], for one animation."""
+    """Several motions for one animation, on a common time axis t (F,) [s]."""
 
     title: str
     t: Array
@@ -80,7 +80,7 @@ class Animation:
 
 
 def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dict[str, Any]:
-    """JSON-ready data of scenes: places as integers in units of 0.1 mm, null where unknown, and meshes by joint.
+    """Convert scenes to JSON-ready data, with meshes by joint. Places are integers in 0.1 mm, null where unknown.
 
     The arm of a scene's last model, or of its measured motion where it has no model, wears the meshes of the robot's
     URDF. Without any that can be read there are none, and the arm is sticks.
@@ -149,7 +149,7 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
 
 @dataclass(frozen=True)
 class ConfigurationTrajectory:
-    """Trajectory of a model: configurations q (N, n) at times t (N,) [s].
+    """Trajectory of a model, with configurations q (N, n) at times t (N,) [s].
 
     `acting` is what a page marks: label, where it acts (a joint, segment, grasp or frame), unit, and values (N, k): a
     vector in world axes, one size, or nothing, as for an effect.
@@ -258,7 +258,7 @@ def _shown_frames(system: System) -> list[str]:
 def animation_of_trajectories(
     title: str, told: Sequence[ConfigurationTrajectory], recording: Recording | None = None
 ) -> Animation:
-    """Animation of model trajectories and of the recorded motion; the first trajectory sets the times and joints.
+    """Animate model trajectories and the recorded motion. The first trajectory sets the times and joints.
 
     Of a recording its points are shown, and its arms where it recorded their angles; at most `_MAX_FRAMES` frames.
     """
@@ -272,7 +272,7 @@ def animation_of_trajectories(
 def recording_animation(
     title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
 ) -> Animation | None:
-    """Animation of a recording alone; None where it holds no positions.
+    """Animate a recording alone. None where it holds no positions.
 
     With `has_straight_object` beside it the model on the recorded angles, its object and marked frames as unbent.
     """

@@ -1,4 +1,4 @@
-"""Summaries of a diagnosis, of its blind validation, and of several methods or runs side by side."""
+"""Summarise a diagnosis, its blind validation, and several methods or runs side by side."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
-    """The tables of a `yid-blind/1` result as Markdown, an empty line between two."""
+    """Write the tables of a `yid-blind/1` result as Markdown, with an empty line between two."""
     lines: list[str] = []
     for head, *rows in (table.rows for table in _blind_tables(result)):
         lines += ["", *(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))]

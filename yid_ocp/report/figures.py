@@ -1,4 +1,4 @@
-"""Plotly figures of the report (the extra `report`): over time, as curves, and with one row per name."""
+"""Plotly figures of the report, over time, as curves, and with one row per name. They need the extra `report`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _line_color(i: int) -> str:
 
 
 def figure_html(figure: Figure) -> str:
-    """HTML element of a figure; the page's script draws it in light or dark colors."""
+    """Convert a figure to an HTML element. The page's script draws it in light or dark colors."""
     figure.update_layout(template=None)  # all is said here; the default one is some kilobytes each
     told = str(figure.to_json()).replace("<", "\\u003c")
     script = f'<script type="application/json">{told}</script>'
@@ -75,7 +75,7 @@ def _add_curves(figure: Figure, curves: Iterable[tuple[str, _Curve]], later_dash
 
 
 def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
-    """Figure of the cost at every accepted point, one curve per intermediate horizon."""
+    """Plot the cost at every accepted point, one curve per intermediate horizon."""
     figure = _styled_figure(320, "accepted point", "cost")
     figure.update_yaxes(**_POWERS)
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
@@ -85,7 +85,7 @@ def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -
 
 @dataclass(frozen=True)
 class TimePlotData:
-    """Data of one plot over time: measured values (M,) at t (M,), predicted lines (t, value), shaded intervals."""
+    """Data of one plot over time, with measured values, predicted lines and shaded intervals."""
 
     axis_title: str
     lines: Mapping[str, tuple[Array, Array]]
@@ -105,7 +105,7 @@ def prediction_and_residual_plots(
     lines: Mapping[str, Array],
     course: tuple[Array, Array] | None = None,
 ) -> tuple[TimePlotData, TimePlotData]:
-    """Two plots: measured and predicted values, and their residual with a band of two noise standard deviations.
+    """Plot measured and predicted values, and their residual with a band of two noise stds.
 
     All are (M,); `course` (t (K,), value (K,)) is the first of the lines at more times, for what is measured seldom.
     """
@@ -127,7 +127,7 @@ def prediction_and_residual_plots(
 def time_plots_figure(
     curves: Sequence[TimePlotData], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
 ) -> Figure:
-    """Figure with measured points and lines, one row per plot.
+    """Plot measured points and lines over time, one row per plot.
 
     `dots` is the color of what is measured, `lines` are those of the lines by name; one after the other when absent.
     """
@@ -189,7 +189,7 @@ def _axis_title(text: str, y: float) -> dict[str, Any]:
 
 
 def lines_over_time_figure(curve: TimePlotData) -> Figure:
-    """Figure of the lines of one plot, each in its own color."""
+    """Plot the lines of one plot, each in its own color."""
     figure = _styled_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
         dash = _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]
@@ -204,7 +204,7 @@ def lines_over_time_figure(curve: TimePlotData) -> Figure:
 
 
 def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure:
-    """Histogram figure of whitened residuals per sensor group, with the standard normal density."""
+    """Plot a histogram of whitened residuals per sensor group, with the standard normal density."""
     figure = _styled_figure(340, "residual in standard deviations", "density")
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
     for i, (name, values) in enumerate(residuals.items()):
@@ -220,7 +220,7 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure
 
 
 def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> Figure:
-    """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
+    """Plot each method's relative excess cost over wall time, from (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     figure.update_yaxes(**_POWERS)
     least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}
@@ -229,7 +229,7 @@ def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> Figure:
 
 
 def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
-    """Error-bar settings of plotly for values with lower ends `low` and upper ends `high`."""
+    """Make plotly's error-bar settings for values with lower ends `low` and upper ends `high`."""
     above, below = np.maximum(np.subtract(high, values), 0.0), np.maximum(np.subtract(values, low), 0.0)
     return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
 
@@ -237,7 +237,7 @@ def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: S
 def rate_intervals_figure(
     curves: Mapping[str, Mapping[float, Mapping[str, float]]], x: str, y: str, is_calibration: bool
 ) -> Figure:
-    """Figure of rates between 0 and 1 with intervals; each entry has `rate`, `low` and `high`.
+    """Plot rates between 0 and 1 with intervals. Each entry has `rate`, `low` and `high`.
 
     A calibration has its diagonal, all others a logarithmic axis.
     """
@@ -255,7 +255,7 @@ def rate_intervals_figure(
 
 
 def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> Figure:
-    """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
+    """Plot the increase of chi2 over the parameter's value relative to the estimate (profile likelihood)."""
     figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items(), "dash")
     figure.add_hline(y=level, line={"color": _TEXT_COLOR, "dash": "dot"}, annotation_text="95 %")
     figure.update_xaxes(type="log", range=[-1.0, 1.0])
@@ -263,7 +263,7 @@ def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> Fig
 
 
 def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> Figure:
-    """Figure of points (x, y) by name."""
+    """Plot points by name at (x, y)."""
     figure = _styled_figure(340, x, y)
     for i, (name, (across, up)) in enumerate(clouds.items()):
         points = {"x": np.asarray(across, np.float32), "y": np.asarray(up, np.float32)}
@@ -274,7 +274,7 @@ def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) ->
 def estimated_curve_figure(
     curve: tuple[Array, Array, Array], others: Mapping[str, Array], visited: tuple[float, float], x: str, y: str
 ) -> Figure:
-    """Figure of a curve (x, y, std) with two standard deviations, other curves dashed, and the visited x marked."""
+    """Plot a curve with two standard deviations, other curves dashed. The visited x are marked."""
     figure, (at, middle, std) = _styled_figure(340, x, y), curve
     edges = np.concatenate([middle + 2 * std, (middle - 2 * std)[::-1]])
     band = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False, "opacity": 0.25}
@@ -303,7 +303,7 @@ def _rows_figure(height: int, names: Sequence[str], title: str) -> Figure:
 
 
 def estimates_figure(values: Mapping[str, tuple[float, float | None, float, bool]], unit: str) -> Figure:
-    """Figure of estimates ± 2 std and initial values, one row per parameter: (value, std, initial, found)."""
+    """Plot estimates ± 2 std and initial values, one row per parameter. Values are (value, std, initial, found)."""
     names = list(values)
     figure = _rows_figure(110 + 34 * len(names), names, unit)
     marker = {"color": _GRID_COLOR, "size": 10, "symbol": "diamond", "line": {"color": _TEXT_COLOR, "width": 1}}
@@ -323,7 +323,7 @@ def estimates_figure(values: Mapping[str, tuple[float, float | None, float, bool
 def parameter_values_by_source_figure(
     rows: Mapping[str, Mapping[str, tuple[float, float | None]]], unit: str
 ) -> Figure:
-    """Figure of values ± 2 std from several sources, one row per parameter and one color per source."""
+    """Plot values ± 2 std from several sources, one row per parameter and one color per source."""
     sources = list(dict.fromkeys(source for row in rows.values() for source in row))
     names = list(rows)
     figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), unit, "")
@@ -355,7 +355,7 @@ def _heat_figure(figure: Figure, rows: Sequence[str], columns: Sequence[str], pa
 
 
 def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> Figure:
-    """Confusion-matrix figure of counts, truth by row and first answer by column, colored by share of the row."""
+    """Plot a confusion matrix of counts, truth by row and first answer by column. Colors are shares of the row."""
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
     figure = _heat_figure(_styled_figure(200 + 24 * len(rows), "said first", "true"), rows, columns, parts, -50)
     text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]
@@ -363,7 +363,7 @@ def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts:
 
 
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> Figure:
-    """Heat-map figure of explained fractions `values` (n, n), row explained by column, shown in per cent."""
+    """Plot a heat map of explained fractions in per cent, (n, n). The column explains the row."""
     figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
     text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
     hover = "%{y} explained by %{x}: %{z:.2f}<extra></extra>"
@@ -382,7 +382,7 @@ class ValueBeforeAfter:
 
 
 def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]) -> Figure:
-    """Figure of values before and after, one row each; error bars are two standard deviations.
+    """Plot values before and after, one row each. Error bars are two standard deviations.
 
     `axis` says what the numbers are, with their unit; `words` name before, after and the marks.
     """
@@ -419,7 +419,7 @@ def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, 
 
 @dataclass(frozen=True)
 class TimeHeatMapRow:
-    """One row of a heat map over time; rows of one group stand together."""
+    """One row of a heat map over time. Rows of one group stand together."""
 
     name: str
     group: str
@@ -428,7 +428,7 @@ class TimeHeatMapRow:
 
 
 def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> Figure:
-    """Heat-map figure over time with interval edges (J + 1,) [s], one row per quantity; grey: not informed by the data.
+    """Plot a heat map over intervals with edges (J + 1,) [s], one row per quantity. Grey: no information in the data.
 
     `axis` says what the colors are.
     """
@@ -468,7 +468,8 @@ def _even(value: Any) -> Any:
 def candidate_ranking_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, promised: str
 ) -> Figure:
-    """Figure that ranks candidates by refitted closure with its interval [%] (or None), and by predicted decrease.
+    """Plot candidates ranked by refitted closure with interval [%], and by predicted decrease. Closure may be None.
+    Closure may be None.
 
     `closed` and `promised` are the titles of the two axes.
     """

@@ -1,4 +1,4 @@
-"""HTML report: one self-contained page built from the registered sections."""
+"""Build the HTML report, one self-contained page of the registered sections."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 
 def write_shared_plotly_script(folder: Path) -> None:
-    """Write one copy of plotly's script to a folder, shared by pages up to two levels below; raises `OutputError`."""
+    """Write one copy of plotly's script to a folder, for pages up to two levels below. Raises `OutputError`."""
     if _installed():
         name, text = _plotly_script()
         if not _is_plotly_script(folder / name):

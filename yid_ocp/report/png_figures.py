@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
-    """Observed rates by nominal level in a blind validation: coverage of effect parameters, and p-values."""
+    """Observed rates by nominal level in a blind validation, for coverage of effect parameters and p-values."""
     labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
     rates = {label: result["calibration"][key] for key, label in labels.items()}
     return {label: {entry["level"]: entry for entry in own if entry["of"]} for label, own in rates.items()}
@@ -101,7 +101,7 @@ _MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; b
 
 
 def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern]]) -> None:
-    """Write a PNG of rows of sparsity patterns, their blocks separated and named; raises `OutputError`.
+    """Draw rows of sparsity patterns as PNG, their blocks separated and named. Raises `OutputError`.
 
     Patterns without rows or columns are left out.
     """

@@ -1,4 +1,4 @@
-"""Summary of every command's result, by result format; shared by terminal and HTML report."""
+"""Summarise every command's result, by result format. Terminal and HTML report share the summaries."""
 
 from __future__ import annotations
 
@@ -531,7 +531,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-export/1")
 def export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of an export: what of the model the format cannot express, and errors of the replay in MuJoCo."""
+    """Summarise an export, with what the format cannot express and errors of the replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     changed = {
         name: entry

@@ -1,4 +1,4 @@
-"""Summary blocks (statements, tables, code), parts that several summaries share, and their lines on a terminal."""
+"""Summary blocks, parts that summaries share, and their lines on a terminal. Blocks are statements, tables, code."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class SummaryStatement:
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """A table of text cells whose first row is the header; empty columns are not shown."""
+    """A table of text cells whose first row is the header. Empty columns are not shown."""
 
     rows: TableRows
     title: str = ""
@@ -75,7 +75,7 @@ SUMMARY_BY_RESULT_FORMAT: dict[str, _Summary] = {}
 def register_summary(
     result_format: str,
 ) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]], _Summary]:
-    """Decorator that registers a function as summary of a result format and makes its output a list of blocks.
+    """Register a function as summary of a result format, and make its output a list of blocks (decorator).
 
     Texts without a word and tables without a row below the header are left out.
     """
@@ -93,23 +93,23 @@ def register_summary(
 
 
 def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:
-    """Scale factor and unit for display: metres become millimetres, other units stay."""
+    """Scale factor and unit for display. Metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, str]:
-    """Formatted value and display unit of an error; a dash for None."""
+    """Format an error's value and display unit. None gives a dash."""
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     return ("–" if value is None else f"{factor * value:.3g}"), shown
 
 
 def p_value_text(p_value: float) -> str:
-    """Text of a p-value, `< 1e-12` for smaller ones."""
+    """Format a p-value. Values below 1e-12 give `< 1e-12`."""
     return f"{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
 
 
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary blocks on issues of the recordings: a table and advice."""
+    """Summarise issues of the recordings in a table and advice."""
     doubts = result.get("doubts", ())
     rows: TableRows = [("in doubt", "where", "certainty", "times its limit")]
     advice: list[StatementTableOrCode | str] = []
@@ -130,7 +130,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
 def misfit_summary_blocks(
     fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
 ) -> SummaryBlockOrTextIterator:
-    """Conclusions on a poor fit: where a guess predicts better, what is not explained, and which numbers count still.
+    """Draw conclusions on a poor fit, such as better guesses, unexplained parts, and numbers that still count.
 
     Of `parameters` those count that are known to 10 % by a standard deviation that includes the misfit.
     """
@@ -162,7 +162,7 @@ def misfit_summary_blocks(
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
-    """One sentence per refined discretisation on the estimates it shifts by more than their standard deviation."""
+    """One sentence per refined discretisation on estimates that it shifts by more than their std."""
     said = []
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
@@ -176,7 +176,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
-    """Table rows of the torque offsets of a result, one per joint; only the header without offsets."""
+    """Table rows of the torque offsets of a result, one per joint. Without offsets there is only the header."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
     rows: TableRows = [("torque offset [N m]", *shown, "expected")]
@@ -191,13 +191,13 @@ def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
 
 
 def parameter_bounds_text(entry: Mapping[str, Any], digits: int) -> str:
-    """Bounds of a parameter, `-inf` and `inf` where it has none."""
+    """Format the bounds of a parameter. Missing ones are `-inf` and `inf`."""
     ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
     return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
 
 
 def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
-    """Text lines of summary blocks: aligned tables, wrapped sentences and notes."""
+    """Format summary blocks as text lines, with aligned tables, wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:
         if isinstance(block, SummaryTable):
@@ -215,7 +215,7 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 
 def recording_summary_lines(recording: Recording) -> list[str]:
-    """Text lines on the contents of a recording."""
+    """Describe the contents of a recording in text lines."""
     rows: TableRows = [("group", "samples", "Hz", "s", "channels", "names")]
     for group in recording.all_groups:
         rate, span = mean_sample_rate(group.t), f"{group.t[-1] - group.t[0]:.4g}"
@@ -235,7 +235,7 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
 
 
 def third_party_file_summary_lines(contents: FilePreview) -> list[str]:
-    """Text lines on the contents of a file of another tool."""
+    """Describe the contents of another tool's file in text lines."""
     rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
     for source in contents.sources:
         rate = f"{source.mean_rate:.4g}" if math.isfinite(source.mean_rate) else ""
@@ -248,7 +248,7 @@ def _note_lines(notes: Sequence[str]) -> list[str]:
 
 
 def aligned_table_lines(rows: TableRows) -> list[str]:
-    """Text lines of a table with aligned columns, header first; columns without an entry below it are left out."""
+    """Format a table with aligned columns, header first. Columns without an entry below it are left out."""
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in columns]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]
@@ -256,7 +256,7 @@ def aligned_table_lines(rows: TableRows) -> list[str]:
 
 
 def names_by_pattern_text(names: Sequence[str]) -> str:
-    """Names in one line; three or more that differ by one consecutive number are one, as `joint_coulomb@joint1..7`.
+    """Join names in one line. Three or more consecutive ones are merged, as in `joint_coulomb@joint1..7`.
 
     Of a long line only the beginning, and how many names are left.
     """

@@ -1,1 +1,1 @@
-"""Virtual experiments: MuJoCo, an independent engine, simulates the robot and implements the effects itself."""
+"""Virtual experiments in MuJoCo, an independent engine that simulates the robot and implements the effects itself."""

@@ -1,4 +1,4 @@
-"""Virtual experiments: a robot moves a flexible object in MuJoCo, recorded with known noise and errors of sensors."""
+"""Virtual experiments in which a robot moves a flexible object in MuJoCo, with known noise and sensor errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
 def baxter_foam_y_system(arms: int) -> System:
-    """The system of Caldwell et al. (2014): Baxter with one or two arms that hold the foam Y by point grasps.
+    """Build the system of Caldwell (ISER 2014). One or two arms of Baxter hold the foam Y by point grasps.
 
     The left arm holds the tip of T2 (43 coordinates), the right one that of T3 (50); every arm joint is driven, viscous
     damping is 0.05 N m s/rad on every coordinate. `ConfigError` of another number of arms.
@@ -59,7 +59,7 @@ def baxter_foam_y_system(arms: int) -> System:
 
 @dataclass(frozen=True)
 class ArmSensorNoise:
-    """Standard deviations of the arm's sensor noise; noise is drawn per sample, the effort bias per recording.
+    """Standard deviations of the arm's sensor noise. Noise is drawn per sample, the effort bias per recording.
 
     Of a joint's reading [rad], [rad/s], of a recorded (not the applied) torque, white and constant, one or nj [N m],
     and of each coordinate of a grasped point [m]. The recording always states the others, torques' where
@@ -90,7 +90,7 @@ class PointCamera:
 
 @dataclass(frozen=True)
 class VirtualExperimentSettings:
-    """Settings of a virtual experiment: motion, simulation, sensors and noise.
+    """Settings of a virtual experiment for motion, simulation, sensors and noise.
 
     Each sensor's noise has its own stream of the `seed`, so that leaving one out changes no other.
     """
@@ -110,7 +110,7 @@ class VirtualExperimentSettings:
 def run_virtual_experiment(
     system: System, values: Mapping[str, float] | None = None, experiment: VirtualExperimentSettings | None = None
 ) -> Recording:
-    """Simulate a robot moving the object and return the recording of encoders, torques, points and camera.
+    """Simulate a robot that moves the object and record encoders, torques, points and camera.
 
     `points_arm` has the grasped points at the times of the joints, `points_camera` its own clock, `true_parameters` all
     stiffness, damping and mass parameters: `values`, nominal where absent. `ConfigError` of noise of other joints'
@@ -135,7 +135,7 @@ def run_virtual_experiment(
 def record_simulation(
     system: System, values: Mapping[str, float] | None, experiment: VirtualExperimentSettings, run: SimulationResult
 ) -> Recording:
-    """Return the recording of a finished simulation `run` with the experiment's sensors and noise."""
+    """Record a finished simulation `run` with the experiment's sensors and noise."""
     chosen, streams = experiment, _random_generators(experiment.seed)
     held, visible = _held_and_visible_points(system)
     groups = [_arm_points(system, held, run, chosen.arm_noise, streams)] if held else []
@@ -261,7 +261,7 @@ _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[st
 def recording_with_sensor_error(
     recording: Recording, system: System, kind: str, place: str, values: Mapping[str, float]
 ) -> Recording:
-    """Copy of a recording with one sensor error: the sensor effect `kind` at `place` with parameters `values`."""
+    """Copy a recording with one sensor error, the sensor effect `kind` at `place` with parameters `values`."""
     if kind.startswith("camera") or kind == "surface_offset":
         last = recording.duration
         points = (g if g.pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)

@@ -1,4 +1,4 @@
-"""Unmodelled effects added to a virtual experiment in MuJoCo's own terms, independently of `yid_ocp.effects`.
+"""Add unmodelled effects to a virtual experiment in MuJoCo's own terms, independently of `yid_ocp.effects`.
 
 Whatever MuJoCo has a term of its own for (joint damping, armature, inertias, sites) is set in its model; other forces
 are worked out here in NumPy at every inner step; errors of sensors and clocks are put into the finished recording. None
@@ -408,7 +408,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
 
 @dataclass(frozen=True)
 class InjectedEffect:
-    """An effect in the simulated data that the model lacks: kind, location and parameter values.
+    """An effect in the simulated data that the model lacks, with kind, location and parameter values.
 
     `values` are as in the vocabulary; for kinds outside it `size`, in the unit of the force that it makes.
     """
@@ -419,7 +419,7 @@ class InjectedEffect:
 
     @property
     def label(self) -> str:
-        """Name of the effect, `kind@location`."""
+        """Label `kind@location` of the effect."""
         return f"{self.kind}@{self.location}"
 
 
@@ -429,7 +429,7 @@ def run_experiment_with_effects(
     effects: Sequence[InjectedEffect],
     experiment: VirtualExperimentSettings | None = None,
 ) -> Recording:
-    """Return the recording of a virtual experiment with effects that the system's description lacks.
+    """Record a virtual experiment with effects that the system's description lacks.
 
     `system` is nominal, with driven joints; `true_parameters` of the recording are those `values`, and the experiment's
     own `injected_terms` are replaced. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that

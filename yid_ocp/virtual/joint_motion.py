@@ -1,4 +1,4 @@
-"""Motions of the driven joints: the angles at which grippers meet what they hold, and random multisines from there."""
+"""Random multisine motions of the driven joints, from angles at which the grippers meet the object."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class JointMotion(Protocol):
         """Names of the nj joints that the motion moves."""
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays (nj,)."""
 
 
 @dataclass(frozen=True)
 class MultisineMotion:
-    """A multisine motion of the driven joints about their initial angles, starting at rest.
+    """Multisine motion of the driven joints about their initial angles, from rest.
 
     offset_j(t) = r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji), with the ramp
     r = 10 s^3 - 15 s^4 + 6 s^5, s = min(t / ramp, 1), twice continuously differentiable.
@@ -54,7 +54,7 @@ class MultisineMotion:
     ramp_time: float = 1.0  # [s]
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays (nj,)."""
         omega = 2 * math.pi * self.frequency
         angle = omega * t + self.phase
         sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
@@ -95,7 +95,7 @@ def random_multisine_motion(
     initial_joint_angles: Mapping[str, float] | None = None,
     excitation: MultisineOptions | None = None,
 ) -> MultisineMotion:
-    """A random multisine motion, scaled to the requested travel of the grippers.
+    """Draw a random multisine motion, scaled to the requested travel of the grippers.
 
     Amplitudes fall in inverse proportion to the frequency and towards the base. Where absent, parameter values are
     nominal and initial angles [rad or m] those of `grasping_joint_angles`.
@@ -185,7 +185,7 @@ def grasping_joint_angles(
     start_angles: Mapping[str, float] | None = None,
     offsets: Mapping[str, ArrayLike] | None = None,
 ) -> dict[str, float]:
-    """Arm joint angles at which every gripper meets the end of the undeformed object, or a point near it.
+    """Find arm joint angles at which every gripper meets the end of the undeformed object, or a point near it.
 
     They are those of every driven joint and of all that carry a grasp's holder and are not elastic, which are sought,
     in configuration order [rad or m]. Only positions are matched, by the solution near the start. `ModelError` where

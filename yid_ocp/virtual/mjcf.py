@@ -1,4 +1,4 @@
-"""A system in the terms of a rigid-body engine, and as a MuJoCo model (MJCF), for virtual experiments and for export.
+"""Express a system in the terms of a rigid-body engine and as a MuJoCo model (MJCF).
 
 An effect is classified by the parts of the description it changes and by its equations, so kinds from outside the
 package are treated like those of the library.
@@ -74,7 +74,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 @dataclass(frozen=True)
 class JointDynamicsTerms:
-    """Terms at one joint, in SI units: force = constant - stiffness q - cubic q^3 - damping v - friction."""
+    """Terms at one joint in SI units. Force = constant - stiffness q - cubic q^3 - damping v - friction."""
 
     stiffness: float = 0.0
     constant_force: float = 0.0
@@ -88,7 +88,7 @@ class JointDynamicsTerms:
 
 
 class ParameterEvaluator:
-    """Evaluator of CasADi expressions at parameter values, else nominal values; matrices are flattened by columns."""
+    """Evaluates CasADi expressions at parameter values, nominal by default. Matrices are flattened by columns."""
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
         self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
@@ -138,7 +138,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ParameterEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
-    """Terms by joint that an effect adds, and `MODEL_ASPECT_DESCRIPTIONS` keys of the aspects that it changes."""
+    """Terms by joint that an effect adds, and the `MODEL_ASPECT_DESCRIPTIONS` keys that it changes."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
@@ -163,7 +163,7 @@ def effect_joint_terms_and_changed_aspects(
 
 
 def system_joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
-    """Springs, dampers, rotor inertia and friction by joint, from the description and from effects at one joint."""
+    """Springs, dampers, rotor inertia and friction by joint, from the system's description and effects at one joint."""
     found: dict[str, JointDynamicsTerms] = {}
 
     def add(joint: str, own: JointDynamicsTerms) -> None:
@@ -263,7 +263,7 @@ def mujoco_xml(
     actuators: bool = False,
     gear_play: Mapping[str, float] | None = None,
 ) -> str:
-    """The MuJoCo model (MJCF, an XML text) of a system.
+    """Write the MuJoCo model of a system as MJCF, an XML text.
 
     Joints keep their names. Consecutive joints that carry no mass and sit at one place become one body with several
     joints, which is the same kinematics. Every point and every end of a grasp is a site: points under their own name,
@@ -453,7 +453,7 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
 
 
 def import_mujoco() -> ModuleType:
-    """The imported mujoco package; `DataError` if it is not installed."""
+    """Import the mujoco package. `DataError` if it is not installed."""
     try:
         import mujoco
     except ImportError as error:
@@ -463,7 +463,7 @@ def import_mujoco() -> ModuleType:
 
 
 def mujoco_model_from_mjcf(text: str) -> Any:
-    """A `mujoco.MjModel` compiled from MJCF text; `ModelError` if MuJoCo rejects it."""
+    """Compile MJCF text to a `mujoco.MjModel`. `ModelError` if MuJoCo rejects it."""
     try:
         return import_mujoco().MjModel.from_xml_string(text)
     except ValueError as error:
@@ -540,5 +540,5 @@ def _inertial(body: Inertia) -> dict[str, str]:
 
 
 def format_xml_numbers(numbers: Iterable[float]) -> str:
-    """Numbers as text with all their digits, separated by spaces, for an XML attribute."""
+    """Format numbers for an XML attribute with all their digits, separated by spaces."""
     return " ".join(f"{float(number):.17g}" for number in numbers)

@@ -1,4 +1,4 @@
-"""Simulation in MuJoCo: a controller moves driven joints from equilibrium along a motion, or a recording is replayed.
+"""Simulate in MuJoCo a controller that moves driven joints along a motion, or the replay of a recording.
 
 The simulator shares the description of the system with the estimator and nothing else: its equations, its integrator
 and its treatment of the grasps are MuJoCo's own, so that an estimate is never checked against its own mistakes.
@@ -46,10 +46,10 @@ class InjectedSimulatorTerms(Protocol):
         """Edit the compiled `mujoco.MjModel`."""
 
     def start_motion(self, data: Any) -> None:
-        """Prepare for the motion; called once when it begins, at rest."""
+        """Prepare for the motion. This is called once when it begins, at rest."""
 
     def add_forces(self, model: Any, data: Any) -> None:
-        """Add generalized forces to `data.qfrc_passive`; called at every inner step."""
+        """Add generalized forces to `data.qfrc_passive`. This is called at every inner step."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
+    """Noise-free result of a simulation, with q, v, efforts and points at times `t` and camera frame times.
 
     `effort` is the torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were
     commanded at t_k; its last row was computed and not applied. Points are `system.point_frames` in the world.
@@ -122,7 +122,7 @@ def simulate_in_mujoco(
     injected: InjectedSimulatorTerms | None = None,
     gear_play: Mapping[str, float] | None = None,
 ) -> SimulationResult:
-    """Simulate the controller following a motion in MuJoCo, from static equilibrium at the initial joint angles.
+    """Simulate a controller that follows a motion in MuJoCo, from equilibrium at the initial joint angles.
 
     Position servos are MuJoCo's own: they are commanded the motion about the posture, and rest where that leaves them.
 
@@ -176,7 +176,7 @@ def simulate_in_mujoco(
 
 @dataclass(frozen=True, eq=False)
 class MujocoScene:
-    """A MuJoCo model with its state and the ids of joints, moved joints and points in it."""
+    """A MuJoCo model with its state, and the ids of joints, moved joints and points."""
 
     mujoco: ModuleType
     model: Any
@@ -187,7 +187,7 @@ class MujocoScene:
 
     @staticmethod
     def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoScene:
-        """The scene of a compiled model; its driven joints are moved, or its prescribed ones if none is driven."""
+        """Make the scene of a compiled model. Its driven joints are moved, or its prescribed ones if none is driven."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
@@ -210,7 +210,7 @@ def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | 
 
 
 def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
-    """Bring the scene to static equilibrium with the driven joints held; return their torques [N m].
+    """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
 
     `damping` replaces the joints' own damping meanwhile, which could decide which of several equilibria is found.
     """
@@ -245,7 +245,7 @@ def _lost(scene: MujocoScene) -> bool:
 
 
 class TrackingController:
-    """Computed-torque controller: inverse dynamics along the motion, plus the grasps' load at rest, plus feedback.
+    """Computed-torque controller with inverse dynamics along the motion, the grasps' load at rest, and feedback.
 
     The scene is at rest, before the motion; `balance` (nu,) are the torques that hold it there [N m].
     """
@@ -260,7 +260,7 @@ class TrackingController:
         self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
 
     def apply_input(self, t: float) -> Array:
-        """Apply the torques at time t [s], from the scene's state then, and return them, shape (nu,) [N m]."""
+        """Apply and return the torques at time t [s], from the scene's state then, shape (nu,) [N m]."""
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
         reference = self._rest[driven] + offset
@@ -388,7 +388,7 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 @dataclass(frozen=True)
 class ReplayErrorAgainstRecording:
-    """RMS error of a replayed model against the recording in one channel or group; for points, of the distance.
+    """RMS error of a replayed model against the recording in one channel or group. Points count by distance.
 
     `noise_rms` is expected from sensor noise alone, zero if the recording does not state it.
     """
@@ -399,14 +399,14 @@ class ReplayErrorAgainstRecording:
 
     @property
     def rmse_beyond_noise(self) -> float:
-        """Root mean square deviation in excess of the noise, zero if noise explains all."""
+        """Root mean square deviation beyond the noise. Zero if noise explains all."""
         return float(np.sqrt(max(self.rmse**2 - self.noise_rms**2, 0.0)))
 
 
 def replay_mismatch_by_channel(
     text: str, system: System, recording: Recording
 ) -> dict[str, ReplayErrorAgainstRecording]:
-    """Replay a recording with a system's MJCF text (`mujoco_xml` with actuators) and return the deviations by channel.
+    """Replay a recording with a system's MJCF text and measure deviations. The text is `mujoco_xml` with actuators.
 
     Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
     angles (`REPLAY_FEEDBACK_BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos

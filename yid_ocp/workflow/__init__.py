@@ -1,1 +1,1 @@
-"""The library calls behind the commands; a new command is one file here and one row in `cli`."""
+"""Library calls behind the commands. A new command is one file here and one row in `cli`."""

@@ -1,4 +1,4 @@
-"""The command `batch`: one run per configuration or recording, with a common table and report."""
+"""The command `batch` makes one run per configuration or recording, with a common table and report."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 def batch_runs_from_configs(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
 ) -> list[_BatchRun]:
-    """Runs of a batch: one per configuration, or one per configuration and recording that matches a pattern.
+    """List the runs of a batch, one per configuration, or one for each recording that matches a pattern.
 
     With a pattern, such as `fleet/*.h5`, `**` for any folders, a run estimates on one recording and holds none out,
     unless the overrides, `a.b=c` each, say otherwise. `ConfigError` where a configuration is not there or given twice,
@@ -104,7 +104,7 @@ def run_batch(
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
 ) -> CommandOutcome[None]:
-    """Run `solve` or `diagnose` for every run of `batch_runs_from_configs`; finished runs in the folder are reused.
+    """Run `solve` or `diagnose` for every run of `batch_runs_from_configs`. Finished runs in the folder are reused.
 
     Successful where all runs were; those that failed say why. The folder `out` then holds `runs/NAME/` (a run folder
     each), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which

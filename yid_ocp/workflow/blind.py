@@ -1,4 +1,4 @@
-"""The command `blind`: diagnoses synthetic cases without their labels, then opens the labels and scores.
+"""The command `blind` diagnoses synthetic cases without their labels, then opens the labels and scores.
 
 Experiments are variations of configurations; each has an ensemble, from which its cases are drawn.
 """
@@ -77,7 +77,7 @@ def run_blind(
     workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
     purpose: str = blind.ALLOWED_ENSEMBLE_PURPOSES[0],
 ) -> CommandOutcome[None]:
-    """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
+    """Run a blind validation of the diagnosis in several processes. Finished parts in the folder are reused.
 
     Models, postures and sensors are those of the runs' first recordings, varied (`EXPERIMENT_VARIATIONS`) as far as
     there are cases for it; the same seed draws other cases for each purpose, 'report' and 'calibration'.
@@ -159,7 +159,7 @@ def _write_result(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
 def rescore_blind(
     folder: str | Path, out: str | Path, overrides: Sequence[str] = (), progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[None]:
-    """Judge the finished cases of a blind validation again by the rules of now and other thresholds, without a refit.
+    """Judge finished cases of a blind validation again by present rules and other thresholds, without a refit.
 
     `out` gets `result.json` (`yid-blind/1`), with `rescored`: the cases whose verdict or effects differ from what was
     said, and how many are `not_judged`, because these thresholds ask for a refit that the diagnosis did not make.

@@ -1,4 +1,4 @@
-"""Builds the system of a run from its settings: robot or clamps, object, frames, effects, parameters; and its step."""
+"""Build the system of a run from its settings, and the compiled step."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 def build_system(run: RunSettings, link_division: int = 1) -> System:
-    """Return the mechanical model of a run; its parameters have the values and bounds of the settings.
+    """Build the mechanical model of a run. Parameters have the values and bounds of the settings.
 
     Each of the object's links is divided into `link_division`, the stiffness and damping of a tube kept; a cable's
     edges stay as they are. `ConfigError` or `ModelError`, which name the setting, for names that do not exist and
@@ -96,13 +96,13 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
 
 
 def urdf_reader_options(run: RunSettings) -> dict[str, Any]:
-    """Which joints and links of its robot a run takes, as options of `read_urdf`."""
+    """Options of `read_urdf` for the joints and links that a run takes of its robot."""
     arms = run.model.arms
     return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}
 
 
 def build_step(run: RunSettings, system: System | None = None) -> Step:
-    """The compiled discrete Euler-Lagrange step of a run's system."""
+    """Compile the discrete Euler-Lagrange step of a run's system."""
     said = run.problem
     system = build_system(run) if system is None else system
     return compile_step(
@@ -111,12 +111,12 @@ def build_step(run: RunSettings, system: System | None = None) -> Step:
 
 
 def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
-    """The system that a configuration file describes; errors as `load_config` and `build_system`."""
+    """Build the system that a configuration file describes. Errors are as in `load_config` and `build_system`."""
     return build_system(load_config(path, overrides))
 
 
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
-    """Measured vertices and clamps of a run's cable held by clamps; None for an object without clamps of its own."""
+    """Measured vertices and clamps of a run's cable. None for an object without clamps of its own."""
     with add_setting_location_to_errors(run, "model", "object"):
         return run.model.object.topology() if isinstance(run.model.object, ClampedObject) else None
 
@@ -245,7 +245,7 @@ def _matches(name: str, key: str) -> bool:
 
 
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
-    """Settings by parameter name, for every name or pattern that matches; later keys override earlier ones.
+    """Settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
     Before them go those of the sections `model.friction` and `model.arms.servo.motor`. `ConfigError` for a name or
     pattern that matches nothing.
@@ -265,7 +265,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
 
 
 def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
-    """Joints with friction by `model.friction`: those named, or all of the arms; empty without that section."""
+    """Joints with friction by `model.friction`, either those named or all of the arms. Empty without that section."""
     if run.model.friction is None:
         return ()
     known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
@@ -276,7 +276,7 @@ def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
 
 
 def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
-    """Names of the parameters for the amount of a run's joint friction, joint damping included."""
+    """Names of the parameters of a run's joint friction, joint damping included."""
     if run.model.friction is None:
         return []
     wanted = run.model.friction.joints
@@ -321,13 +321,13 @@ def free_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
 
 
 def divided_link_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
-    """Factor on an elastic joint's parameter that keeps the object's stiffness when each link is divided."""
+    """Factor on an elastic joint's parameter that keeps the object's stiffness when links are divided."""
     item = run.model.object
     return 1 if item is None else item.link_division_parameter_factor(name, link_division)
 
 
 def system_with_second_arm_holding_object(run: RunSettings, system: System) -> System | None:
-    """The run's system with the second arm at a free end of the object; None where impossible."""
+    """Add the second arm at a free end of the object to a run's system. None where impossible."""
     model, joints = run.model, run.model.arms.joints
     if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
         return None

@@ -1,4 +1,4 @@
-"""Builds the estimation problem of a run: recordings, options and free parameters on a compiled step.
+"""Build the estimation problem of a run from recordings, options and free parameters on a compiled step.
 
 Recordings are checked before: those given twice count once, gaps are cut out; everything else is said and left.
 """
@@ -55,7 +55,7 @@ _MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
 
 
 def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
-    """Options of the estimation problem that a run's settings describe.
+    """Make the options of the estimation problem that a run's settings describe.
 
     Values that differ from recording to recording (a cable's edges, places of markers) are those of `recordings`.
     """
@@ -134,7 +134,7 @@ def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:
 def build_problem(
     run: RunSettings, step: Step | None = None, reference_recordings: Sequence[Recording] = ()
 ) -> EstimationProblem:
-    """Estimation problem of a run; its options also hold marker positions of `reference_recordings`.
+    """Build the estimation problem of a run. It also has marker positions of `reference_recordings`.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def build_problem(
 
 
 def min_initial_closure_error_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Least possible distance [m] between each grasp's two frames at a recording's first arm angles, by name."""
+    """Least possible distance between each grasp's two frames at a recording's first arm angles [m]."""
     system = problem.system
     if not system.grasps:
         return {}
@@ -217,7 +217,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
 
 
 def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """Estimation problem of a configuration file, or of the embedded one for None; errors as `build_problem`."""
+    """Build the estimation problem of a configuration file (None: the embedded one). Errors: `build_problem`."""
     return build_problem(load_config(path, overrides))
 
 
@@ -253,7 +253,7 @@ def _check_recordings(
 
 
 def recording_quality_issues_with_model(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
-    """All data quality issues of one uncut recording; errors as `build_problem`."""
+    """Find all data quality issues of one uncut recording. Errors are as in `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
     arm = RecordedJointsModel.from_system(system, system.parameters.vector())
@@ -374,7 +374,7 @@ def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
 
 
 def issues_to_plain_data(doubts: Sequence[Issue]) -> list[dict[str, Any]]:
-    """Data quality issues as JSON-ready dicts, gravest first, for the key `doubts` of a result."""
+    """Convert data quality issues to JSON-ready dicts, gravest first, for the key `doubts` of a result."""
     found = []
     for doubt in _gravest_first(doubts):
         own = {"evidence" if key == "evidence_ratio" else key: value for key, value in asdict(doubt).items()}

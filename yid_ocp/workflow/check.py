@@ -1,4 +1,4 @@
-"""The command `check`: validates a run without solving it and checks its discretisation."""
+"""The command `check` validates a run and its discretisation without solving."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Common shell of all commands: progress display, printed summary, run folder location and exit codes."""
+"""Shared steps of all commands, such as progress display, printed summary, run folder and exit codes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _CommandOutput = TypeVar("_CommandOutput")
 
 @dataclass(frozen=True)
 class CommandOutcome(Generic[_CommandOutput]):
-    """Run folder of a command, contents of its result.json, what it computed, and whether it reached its goal."""
+    """Outcome of a command with run folder, contents of result.json, computed result and success."""
 
     folder: Path
     result: dict[str, Any]
@@ -43,7 +43,7 @@ class CommandOutcome(Generic[_CommandOutput]):
 
 
 def command_with_settings(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
-    """Return a command that calls `work(settings, out, progress, ...)`, where `...` are the arguments `names`."""
+    """Make a command that calls `work(settings, out, progress, ...)`. `...` are the arguments `names`."""
 
     def run(arguments: argparse.Namespace) -> int:
         settings = load_config(arguments.config, arguments.overrides)
@@ -54,7 +54,7 @@ def command_with_settings(work: Callable[..., CommandOutcome[Any]], *names: str)
 
 
 def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progress], CommandOutcome[Any]]) -> int:
-    """Run a command's function, print the summary of its result and its run folder, and return its exit code."""
+    """Run a command's function, print its summary and run folder, and return its exit code."""
     with stderr_progress_display(arguments) as progress:
         outcome = work(progress)
     path, near, result = str(outcome.folder), os.path.relpath(outcome.folder), outcome.result
@@ -67,7 +67,7 @@ def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progres
 def print_result(
     arguments: argparse.Namespace, result: Mapping[str, Any], texts: Callable[[], Sequence[str]], place: str, path: str
 ) -> None:
-    """Print a command's result: its text and then `place`, the path alone (`quiet`) or JSON (`json`).
+    """Print a command's result as text and `place`, as path alone (`quiet`) or as JSON (`json`).
 
     Beside JSON nothing else goes to standard output; the place goes to standard error.
     """
@@ -82,7 +82,7 @@ def print_result(
 
 
 def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:
-    """Available workers from `--workers` or `--scheduler`, None where neither is given; errors as `WorkerConfig`."""
+    """Workers from `--workers` or `--scheduler`. None where neither is given. Errors as `WorkerConfig`."""
     if arguments.workers is None and not arguments.scheduler:
         return None
     workers = WorkerConfig(arguments.workers, arguments.scheduler)
@@ -169,7 +169,7 @@ def _format_iterate(entry: Iterate) -> str:
 
 
 class StderrLogLinesProgress(Progress):
-    """Progress as lines on standard error: one per stage, iterate, tenth of a stage, and after some silence."""
+    """Progress as lines on standard error, one per stage, iterate or tenth of a stage, and after some silence."""
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._tenths, self._last, self._left = 0, 0.0, _RemainingTime(import_time)
@@ -187,7 +187,7 @@ class StderrLogLinesProgress(Progress):
         print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """Print a line for every tenth of the stage, or where the last one is some seconds old."""
+        """Print a line for every tenth of the stage, or if the last line is some seconds old."""
         tenths, left = 10 * done // max(total, 1), self._left.of_parts(done, total)
         # a line for every frame would be too many
         if tenths > self._tenths or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
@@ -235,7 +235,7 @@ class _BarProgress(Progress):
 
 @contextlib.contextmanager
 def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]:
-    """Context manager for progress on standard error: bars on a terminal, else lines; nothing if `--quiet`."""
+    """Show progress on standard error, by bars on a terminal, else by lines (context manager). Not with `--quiet`."""
     terminal, import_time = sys.stderr.isatty(), time.monotonic() - arguments.begin_time
     if arguments.quiet or (arguments.json and not terminal):
         yield NULL_PROGRESS

@@ -1,4 +1,4 @@
-"""Proposes a configuration from robot and recordings: arms, mode, marker positions, noise, rates."""
+"""Propose arms, mode, marker positions, noise and rates of a configuration from robot and recordings."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class _GroupNoise:
 
 @dataclass(frozen=True)
 class ProposedConfigChoices:
-    """Choices proposed for a generated configuration, and the reasons for them."""
+    """Proposed choices for a generated configuration, with reasons."""
 
     joints: tuple[str, ...]  # recorded ones that move the object, in the URDF's order
     unused_joints: tuple[str, ...]  # recorded ones that the model does not need or know
@@ -101,7 +101,7 @@ class ProposedConfigChoices:
     ]  # a guess by joint [N m]; empty where the recording states it, or has no effort
 
     def to_dict(self) -> dict[str, Any]:
-        """The proposal as plain data, under the keys of `yid-init/1`."""
+        """Convert the proposal to plain data under the keys of `yid-init/1`."""
         return named_attributes(self, f"{_KEYS} {_MORE_KEYS} {_LAST_KEYS}") | {
             "arms": [named_attributes(arm, "joints frames=tool_frames") for arm in self.arms],
             "places": {
@@ -113,7 +113,7 @@ class ProposedConfigChoices:
 
     @property
     def is_identified_from_efforts(self) -> bool:
-        """Whether arms move as prescribed and there is no object, or nothing but joint efforts depends on it."""
+        """Whether prescribed arms have no object, or only joint efforts depend on it."""
         seen = any(not group.startswith("imu") for group in self.point_placements)
         return self.arm_mode == "prescribed" and not (self.has_object and seen)
 
@@ -127,7 +127,7 @@ def propose_config_choices(
     grasps: Mapping[str, str] | None = None,
     standing: bool = False,
 ) -> ProposedConfigChoices:
-    """Choices for a configuration, from a robot and its recordings, of which at least one has joints.
+    """Propose choices for a configuration from a robot and its recordings. At least one recording has joints.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 
 
 def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
-    """Time [s] of rest in a recording's later part at which the held-out part begins; None if it never rests.
+    """Time of rest in a recording's later part, where the held-out part begins [s]. None if it never rests.
 
     What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
     """

@@ -1,4 +1,4 @@
-"""The command `diagnose`: detects, locates and explains the gap; finished refits survive an interruption."""
+"""The command `diagnose` detects, locates and explains the gap. Finished refits survive an interruption."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[DiagnosisResult]:
-    """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused."""
+    """Diagnose and write the run folder. Finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
         folder.record_run_start(run, "diagnose", _flags(run))
         refits = _SingleJsonFileRefitStore(

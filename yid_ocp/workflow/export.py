@@ -1,4 +1,4 @@
-"""The command `export`: recordings as CSV or MCAP, signals of a run as MCAP, models for other engines."""
+"""The command `export` writes recordings as CSV or MCAP, run signals as MCAP, and models for other engines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `friction`: every law of the friction ladder, judged by motions that it was not fitted to."""
+"""The command `friction` judges every law of the friction ladder by motions that it was not fitted to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `identifiability`: Fisher information of recordings and of changed experiments, on workers too."""
+"""The command `identifiability` analyses Fisher information of recordings and of changed experiments."""
 
 from __future__ import annotations
 

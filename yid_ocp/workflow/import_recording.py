@@ -1,4 +1,4 @@
-"""The command `import`: converts files of other tools to a recording, merges several, or previews their contents."""
+"""The command `import` converts files of other tools to a recording, merges several, or previews their contents."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
 
 
 def recording_doubt_lines(recording: Recording) -> list[str]:
-    """Sentences on what a recording by itself makes doubtful: units, clocks, few samples, no motion, channels."""
+    """Describe doubts about a recording itself, such as units, clocks, few samples, no motion, channels."""
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     said = [f"in doubt ({issue.certainty_word}): {issue.what}; {issue.advice}" for issue in found]
     known = {issue.cause for issue in found}
@@ -191,13 +191,13 @@ def _merged(
 
 
 def recording_contents_summary(recording: Recording) -> dict[str, Any]:
-    """Contents of a recording as plain data: duration, groups and notes."""
+    """Summarise a recording's duration, groups and notes as plain data."""
     groups = {group.name: {"samples": len(group.t), "names": list(group.names)} for group in recording.all_groups}
     return {"duration": recording.duration, "groups": groups, "notes": list(recording.notes)}
 
 
 def read_third_party_recording(file: str | Path, options: Mapping[str, Any], progress: Progress) -> Recording:
-    """Recording read from a file of another tool, the file's hash in `source`; options and errors as `read_any`."""
+    """Read a recording from another tool's file, its hash in `source`. Options and errors as in `read_any`."""
     progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)
     if recording.sha256 is None or has_native_recording_suffix(file):
@@ -206,12 +206,12 @@ def read_third_party_recording(file: str | Path, options: Mapping[str, Any], pro
 
 
 def has_native_recording_suffix(file: str | Path) -> bool:
-    """Whether a file is a recording of this package, judged by its suffix."""
+    """Whether a file has the suffix of this package's recordings."""
     return Path(file).suffix.lower() in (".h5", ".hdf5")
 
 
 def reader_options_from_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Reader options from the command-line flags; `ConfigError` or `DataError` for one that cannot be understood."""
+    """Read reader options from command-line flags. `ConfigError` or `DataError` for an invalid one."""
     options = {name: getattr(arguments, name) for name in _SINGLE if getattr(arguments, name) is not None}
     for key in (*_LISTS, *_MAPPINGS):
         if entries := _split(getattr(arguments, key)):

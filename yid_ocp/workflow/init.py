@@ -1,4 +1,4 @@
-"""The command `init`: writes a commented configuration from robot, recordings and object dimensions."""
+"""The command `init` writes a commented configuration from robot, recordings and object dimensions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `plan`: motions of the arms with the identified model, to a target or for information."""
+"""The command `plan` plans arm motions with the identified model, to a target or for information."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _Plan = TargetMotionPlan | InformativeMotionPlan
 def run_plan(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[_Plan]:
-    """Plan the motion of a run's goal; write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
+    """Plan the motion of a run's goal, and write recording, CSV tables, `trajectory.json`, result.json and report.
 
     Successful where the goal was reached within all limits; the run folder says why not.
     """
@@ -104,7 +104,7 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
 def identified_parameters_with_covariance(
     run: RunSettings, step: Step
 ) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
-    """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings."""
+    """Parameters and their covariance, from a run folder of `solve` or from the settings, with their source."""
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run is None:
@@ -242,7 +242,7 @@ def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> 
 def discrimination_plan_settings(
     confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path
 ) -> dict[str, Any] | None:
-    """Settings of `plan` for a motion that discriminates confusable effects; None without any."""
+    """Make settings of `plan` for a motion that discriminates confusable effects. None without any."""
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]

@@ -1,4 +1,4 @@
-"""Output files of predictions: trajectories, held-out errors with baselines, estimated torque offsets."""
+"""Write trajectories, held-out errors with baselines, and estimated torque offsets of predictions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from yid_ocp.solvers.base import EpisodeAndPrediction
 
 
 def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
-    """Estimated torque offset by recording and joint: `value`, `std`, `prior_std` [N m], held-out included.
+    """Estimated torque offset of every recording, also held-out, and joint: `value`, `std`, `prior_std` [N m].
 
     The problem's weights are frozen near `x`, shape (nx,); without them, or where offsets are no part of the model, the
     result is empty.
@@ -57,7 +57,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
 
 
 def numbers_to_use(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
-    """Lines to copy from an estimate, for the parameters that are found; empty if none is found.
+    """Make lines to copy from an estimate, for the parameters that are found. Empty if none is found.
 
     `values` with total standard deviations, `joints` (of each segment and deformation the number of links and the
     lowest and highest stiffness of a joint [N m/rad]), lines of `yaml` and `mjcf`, rows of `latex`, the command that
@@ -113,7 +113,7 @@ def _has_torque_bias(episode: Episode) -> bool:
 def predicted_configuration_trajectory(
     name: str, problem: EstimationProblem, episode: Episode, prediction: EpisodePrediction, theta: Array
 ) -> ConfigurationTrajectory:
-    """Trajectory of a predicted recording, to be animated; `theta`: parameters of all recordings, shape (ntheta,)."""
+    """Make the trajectory of a predicted recording for an animation. `theta` (ntheta,) holds all parameters."""
     system, q = problem.system, prediction.rollout.state[:, : problem.system.n_coordinates]
     own = problem.predictor.theta_with_episode_values(episode, theta)
     return ConfigurationTrajectory(name, system, own, episode.grid.node_times, q)

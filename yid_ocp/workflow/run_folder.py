@@ -1,4 +1,4 @@
-"""Run folders: written under a temporary name and renamed when complete."""
+"""Create run folders under a temporary name, and rename complete ones."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _FULL_HINT = "choose a folder on a disk with room, with --out"
 
 @dataclass
 class RunFolder:
-    """A run folder that is being written: its paths, log and hashes of inputs."""
+    """A run folder during writing, with its paths, log and hashes of inputs."""
 
     final_path: Path  # its name when complete
     path: Path  # where it is now
@@ -47,7 +47,7 @@ class RunFolder:
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
-        """Write config.yaml, hash what the run reads, log the start of a command; errors as `input_files_by_name`."""
+        """Write config.yaml, hash the inputs and log the start of a command. Errors: `input_files_by_name`."""
         self.write_text_file("config.yaml", config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
@@ -58,12 +58,12 @@ class RunFolder:
         self.log_command_start([command, *said, *flags])
 
     def log_command_start(self, words: Sequence[str]) -> None:
-        """Log the start of a command with its inputs; `words`: the command line that reproduces its result."""
+        """Log the start of a command with its inputs. The command line `words` reproduces its result."""
         self._command_line = shlex.join(["yid-ocp", *words])
         self.log_event("start", command=words[0], versions=software_and_plugin_versions(), inputs=self.input_hashes)
 
     def write_result(self, result: Mapping[str, Any], name: str = "result.json") -> dict[str, Any]:
-        """Write a result with command, date, inputs and versions; infinities become null and are listed in `notes`."""
+        """Write a result with command, date, inputs and versions. Infinities become null and are listed in `notes`."""
         made = {"command": self._command_line, "date": local_time_text(), "inputs": self.input_hashes}
         notes: list[str] = []
         clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_and_plugin_versions()}, notes)
@@ -75,7 +75,7 @@ class RunFolder:
     def write_result_and_report(
         self, run: RunSettings, shown: Progress, result: Mapping[str, Any], name: str = "result.json", /, **known: Any
     ) -> dict[str, Any]:
-        """Write result.json and, if the settings want it, report.html; `known`: more attributes of `ReportData`."""
+        """Write result.json and, if set, report.html. `known`: more attributes of `ReportData`."""
         written = self.write_result(result, name)
         if run.output.write_report:
             shown.begin_stage("writing the report", 1.5)
@@ -114,7 +114,7 @@ def _grouped(notes: list[str]) -> list[str]:
 
 @contextlib.contextmanager
 def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
-    """Context manager for a new run folder, which appears under its name only if the block ends without an error.
+    """Create a run folder that appears under its name only if the block succeeds (context manager).
 
     The name is reserved first: two runs never write to one folder, and a run that ends finds its name free. What
     killed runs left beside it is cleared away. `OutputError` where the folder exists and is not empty, another run is
@@ -314,5 +314,5 @@ def local_time_text() -> str:
 
 
 def software_and_plugin_versions() -> dict[str, str]:
-    """Versions of Python, this package, what its numbers depend on, and packages whose plug-ins are in use."""
+    """Versions of Python, this package, its numerical dependencies, and packages whose plug-ins are in use."""
     return installed_versions() | plugin_versions()

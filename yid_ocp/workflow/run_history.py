@@ -1,4 +1,4 @@
-"""Earlier runs: their estimates, as baseline of a diagnosis and in the command `report`; two runs overlaid."""
+"""Read the estimates of earlier runs as a diagnosis baseline and for the command `report`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 
 
 def read_estimates(folder: str | Path) -> RunEstimates:
-    """Estimates and covariance of the free parameters that a `solve` or `diagnose` found, read from its run folder.
+    """Read estimates and covariance of free parameters from the run folder of a `solve` or `diagnose`.
 
     `DataError` where there is no finished run, its result cannot be read, is one of another command or of an older
     format, or its solve failed.
@@ -79,7 +79,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
 
 
 def parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Values of the parameters of effects, by the effect's label and the parameter's own name."""
+    """Values of effect parameters, by the effect's label and the parameter's own name."""
     found: dict[str, dict[str, float]] = {}
     for name, value in parameters.items():
         label, _, quantity = name.rpartition(".")
@@ -89,7 +89,7 @@ def parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[st
 
 
 def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
-    """Settings with the given effects (by label) added to the model at their values; existing effects are kept."""
+    """Add effects to the model settings at their values, by label. Existing effects are kept."""
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
     added = [EffectSettings(kind=kind, location=location, values=values) for (kind, _, location), values in parts]
@@ -97,7 +97,7 @@ def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[
 
 
 def read_estimation_result(folder: str | Path) -> dict[str, Any]:
-    """Contents of result.json of a successful `solve` or `diagnose`; errors as `read_estimates`."""
+    """Read result.json of a successful `solve` or `diagnose`. Errors are as in `read_estimates`."""
     file = Path(folder) / "result.json"
     result = read_result_file(file)
     if result.get("format") not in ESTIMATE_RESULT_FORMATS.values():
@@ -110,7 +110,7 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
 
 
 def read_result_file(file: Path) -> dict[str, Any]:
-    """Contents of any command's result.json; `DataError` if it cannot be read or is of an old version."""
+    """Read any command's result.json. `DataError` if it cannot be read or is of an old version."""
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
@@ -125,7 +125,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
 
 
 def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]:
-    """Estimates of the runs in `diagnosis.baseline`; `ConfigError` for one of another model, or given twice."""
+    """Estimates of the runs in `diagnosis.baseline`. `ConfigError` for one of another model, or given twice."""
     found: list[RunEstimates] = []
     for i, folder in enumerate(run.diagnosis.baseline):
         where = ("diagnosis", "baseline", i)
@@ -195,7 +195,7 @@ def _settings(folder: str | Path) -> RunSettings | None:
 
 
 def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
-    """Settings with the baseline's effects at their estimated values; parameters estimated there are free."""
+    """Add a baseline's effects at their estimated values to the settings. Parameters estimated there are free."""
     if not runs:
         return run
     known, _, _ = pool_estimates(runs)
@@ -212,7 +212,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 
 
 def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
-    """Recordings without the sought effect, from settings or baseline, and a text on why none exist."""
+    """Load recordings without the sought effect, from settings or baseline. A text says why none exist."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
         file = resolve_recording_path(path)
@@ -274,7 +274,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
 
 
 def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
-    """Parameter estimates over several runs as a `yid-history/1` result, without inputs and versions."""
+    """Convert parameter estimates over several runs to a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drifts:
         known = zip(entry.run_names, entry.values, entry.std, strict=True)

@@ -1,4 +1,4 @@
-"""Inputs of a run: files, recordings and plug-ins, and the place of its settings in messages."""
+"""Read a run's files, recordings and plug-ins, and locate its settings in messages."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _line(error: BaseException, path: Path) -> int | None:
 
 @contextlib.contextmanager
 def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
-    """Context manager that adds the location of a setting to errors raised in its block."""
+    """Add the location of a setting to errors raised in a block (context manager)."""
     try:
         yield
     except YidError as error:
@@ -120,12 +120,12 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
 
 
 def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
-    """A `ConfigError` (not raised here) about an unknown name in the settings, with the nearest known one."""
+    """Make a `ConfigError` about an unknown name in the settings, with the nearest known one. It is not raised."""
     return run.config_error(f"there is no {noun} '{name}'", *path, hint=nearest_name_hint(name, known))
 
 
 def input_files_by_name(run: RunSettings) -> dict[str, Path]:
-    """Every file that a run reads, by its name in the settings: configuration, plug-ins, robot, recordings.
+    """Find every file that a run reads, such as configuration, plug-ins, robot and recordings, by its name.
 
     `ConfigError` where one does not exist, which names the setting and the nearest file that does.
     """
@@ -155,14 +155,14 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
 
 
 def resolve_recording_path(path: str) -> Path:
-    """Path of a recording named in the settings; `default:NAME` is one shipped with the package."""
+    """Find the path of a recording named in the settings. `default:NAME` is one shipped with the package."""
     if not path.startswith("default:"):
         return Path(path)
     return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
 
 
 def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
-    """The first `count` (None: all) recordings under `recordings.estimate` or `held_out`, uniquely named.
+    """Read the first `count` recordings of `recordings.estimate` or `held_out`, uniquely named. None means all.
 
     Errors as `read_recording`, which name the setting.
     """

@@ -1,4 +1,4 @@
-"""The command `simulate`: simulates robot and sensors and writes a recording."""
+"""The command `simulate` simulates robot and sensors and writes a recording."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run_simulate(
     seed: int = 0,
     noise: bool = False,
 ) -> CommandOutcome[Recording | None]:
-    """Write `recording.h5`: the model moved by the inputs of the first recording, or a virtual experiment without one.
+    """Write `recording.h5` of the model under the first recording's inputs, or without one of a virtual experiment.
 
     With a recording under `recordings.estimate`, its torques or prescribed motion drive the model with the parameters'
     initial values, and every sensor is predicted at the times at which it measured. Without one, MuJoCo simulates a

@@ -1,4 +1,4 @@
-"""The command `solve`: estimates the free parameters, predicts held-out recordings, writes the run folder."""
+"""The command `solve` estimates the free parameters, predicts held-out recordings, writes the run folder."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _BARS, _SPARKLINE_WIDTH = "▁▂▃▄▅▆▇█", 24
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS, is_live: bool = False
 ) -> CommandOutcome[Solution]:
-    """Estimate, validate and write the run folder; successful where the solver converged.
+    """Estimate, validate and write the run folder. It succeeds if the solver converged.
 
     Where it failed the run folder holds the reason and the best point. `is_live`: report a table of cost and parameters
     at every iterate, which a terminal renews.
@@ -75,7 +75,7 @@ run_from_arguments = command_with_settings(run_solve, "live")
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> ChosenCableMemoryFit:
-    """Solution by the run's solver, every iterate logged, and the decision whether a cable keeps its memory."""
+    """Solve with the run's solver, log every iterate, and decide whether a cable keeps its memory."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.solve(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
@@ -131,7 +131,7 @@ def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dic
 def solution_to_result_dict(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> dict[str, Any]:
-    """Contents of a `yid-solve/1` result.json, without inputs and versions."""
+    """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = prediction_errors_and_units(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
     worse = channels_worse_than_naive_guess(errors, units)
@@ -155,5 +155,5 @@ def solution_to_result_dict(
 def discretisation_shifts_to_dict(
     shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Discretisation shifts of estimates for result.json, with each parameter's standard deviation from the data."""
+    """Convert estimates' discretisation shifts for result.json, with parameters' standard deviations from data."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}

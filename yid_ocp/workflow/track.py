@@ -1,4 +1,4 @@
-"""The command `track`: points in depth-camera frames, frame by frame on workers, written to a recording."""
+"""The command `track` tracks points in depth-camera frames, frame by frame on workers, and writes a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings of any known format; a new format is one file in this folder with one registration."""
+"""Readers of recordings in all known formats. A new format is one file in this folder with one registration."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ for _format in iter_modules(__path__):
 
 
 def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS, **options: Any) -> Recording:
-    """Read and check a recording in any known format; the path's suffix selects the reader.
+    """Read and check a recording in any known format. The path's suffix selects the reader.
 
     It is an HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
     The options are those of the reader in `READERS`, by name. `DataError` where the format or an option is not known,
@@ -47,14 +47,14 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
 
 
 def reader_option_names(path: str | os.PathLike[str]) -> list[str]:
-    """Names of the options that `read_any` takes for a file or folder of its format; errors as `read_any`."""
+    """Names of the options that `read_any` takes for a file or folder of its format. Errors are as in `read_any`."""
     parameters = inspect.signature(READERS[_format_of(Path(path))]).parameters
     names = [entry.name for entry in fields(parameters["options"].default)] if "options" in parameters else parameters
     return [name for name in names if name not in ("path", "progress")]
 
 
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:
-    """Preview of a file in any known format: its data sources and options for `read_any`; errors as `read_any`."""
+    """Preview the data sources of a file in any known format, with options for `read_any`. Errors as there."""
     path = Path(path)
     known_as = _format_of(path)
     if known_as in FILE_PREVIEWERS:

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, and MCAP files: joint states, stamped points and poses, wrist sensors and IMUs."""
+"""Read joint states, stamped points and poses, wrist sensors and IMUs from ROS bags and MCAP files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One message of a bag: source (topic), time of recording and header stamp [ns], and decoded content."""
+    """One message of a bag with topic, time of recording and header stamp [ns], and decoded content."""
 
     source: str
     logged: int
@@ -62,7 +62,7 @@ _MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
 
 
 class OpenBag:
-    """An open ROS 1 bag, ROS 2 bag or MCAP file: its topics and the `reader` of rosbags; `DataError` if unreadable."""
+    """An open ROS 1 bag, ROS 2 bag or MCAP file with its topics and reader. `DataError` if unreadable."""
 
     def __init__(self, path: Path) -> None:
         highlevel, typesys = (
@@ -85,7 +85,7 @@ class OpenBag:
 
     @contextmanager
     def read_errors_as_data_errors(self) -> Iterator[None]:
-        """Context manager that turns every error while the bag is read into a `DataError`."""
+        """Turn every error while the bag is read into a `DataError` (context manager)."""
         try:
             with limited_memory():  # what is packed may say nothing, or lie, about its size
                 yield
@@ -100,13 +100,13 @@ class OpenBag:
         return [topic.name for topic in self.topics if topic.kind in kinds]
 
     def check_topic_is_known(self, name: str, known: Sequence[str], noun: str) -> None:
-        """Raise `DataError` if the topic `name` is not in `known`; `noun` says what the topic should provide."""
+        """Raise `DataError` if the topic `name` is not in `known`. `noun` says what the topic provides."""
         if name not in known:
             what = f"there are no {noun} on the topic '{name}'"
             raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known))
 
     def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
-        """The `DataError` to raise for a bag without usable topics; it lists the topics that the bag holds."""
+        """Make the `DataError` for a bag without usable topics. It lists the bag's topics."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
         return DataError(what, where=str(self.path), allowed=allowed, hint=f"it holds {held}")
 
@@ -114,7 +114,7 @@ class OpenBag:
 def relative_message_time_function(
     messages: Sequence[BagMessage], origins: Sequence[BagMessage] | None = None
 ) -> Callable[[BagMessage], float]:
-    """Function that returns a message's time [s] since the first of `origins`, or since the first of `messages`."""
+    """Make a function for a message's time [s] since the first of `origins`, or of `messages`."""
     # one message without a stamp makes the two clocks incomparable, so then no stamp is used
     stamped = all(message.stamp > 0 for message in (*messages, *(origins or ())))
     origin = min((message.stamp if stamped else message.logged for message in origins or messages), default=0)
@@ -142,7 +142,7 @@ class _Contents:
 
 @dataclass(frozen=True)
 class BagOptions(base.SelectionAndUnitOptions):
-    """Options of `read_bag`: topics, joints and points to read, their names in the recording, and their units.
+    """Options of `read_bag` for topics, joints and points, with their names in the recording and units.
 
     Joints are needed where the messages of a topic do not all have the same ones; messages that lack one are skipped.
     Points are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`; all topics of points, poses and transforms

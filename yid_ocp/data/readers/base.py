@@ -1,4 +1,4 @@
-"""Registries of readers and previews, and their shared steps: selection, renaming, units, torques, one clock."""
+"""Registries of readers and previews, and shared steps such as selection, renaming and unit conversion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _RecordingReader = Callable[..., Recording]
 
 @dataclass(frozen=True)
 class TopicOrColumnSummary:
-    """One data source (topic, column or marker) of a file to import, with sample count, rate and imported name."""
+    """One topic, column or marker of a file to import, with sample count, rate and imported name."""
 
     # what the file calls it, and its type
     name: str
@@ -37,7 +37,7 @@ class TopicOrColumnSummary:
 
 @dataclass(frozen=True)
 class FilePreview:
-    """Preview of a file to import: summaries of its data sources, suggested reader options, and notes."""
+    """Preview of a file to import, with its data sources, suggested reader options and notes."""
 
     sources: tuple[TopicOrColumnSummary, ...]
     reader_options: Mapping[str, Any] = field(default_factory=dict)  # named options of the reader
@@ -68,7 +68,7 @@ _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 
 
 def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
-    """Unit by quantity, from words such as `deg` or `velocity=rpm`; `DataError` for an unknown or conflicting unit."""
+    """Parse units by quantity from words such as `deg` or `velocity=rpm`. `DataError` if unknown or conflicting."""
     units, exact = dict[str, str](), dict[str, str]()
     for word in words:
         quantity, equals, unit = word.partition("=")
@@ -111,7 +111,7 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
 
 
 def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
-    """Recorded to new names, parsed from `name` or `recorded=name`; `DataError` for an empty or repeated name."""
+    """Parse new names from entries `name` or `recorded=name`. `DataError` for an empty or repeated name."""
     found: dict[str, str] = {}
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))
@@ -126,7 +126,7 @@ def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class SelectionAndUnitOptions:
-    """Options shared by readers: joints and points to keep, their new names, and the units of the file."""
+    """Options shared by readers, for the selection and names of joints and points and the file's units."""
 
     joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
     points: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
@@ -138,7 +138,7 @@ class SelectionAndUnitOptions:
 
 
 def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
-    """Convert a recording from the units of its file to SI units, select joints and points, and validate the result.
+    """Convert a recording to SI units, select joints and points, and validate the result.
 
     `DataError` for a joint, point, quantity or unit that is not known, a current without torque constants, and as
     `validated_recording`.
@@ -225,7 +225,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
 
 
 def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
-    """Import and return a module of an optional dependency; `DataError` with an install hint if it is missing."""
+    """Import a module of an optional dependency. `DataError` with an install hint if it is missing."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -233,13 +233,13 @@ def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
 
 
 def mean_sample_rate(t: Array) -> float:
-    """Mean sample rate [Hz] of the times `t` [s]; NaN for fewer than two samples."""
+    """Mean sample rate [Hz] of the times `t` [s]. NaN for fewer than two samples."""
     span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
     return (len(t) - 1) / span if span > 0 else math.nan
 
 
 def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Guess units of values that cannot be in SI units; return the unit by quantity, and the reasons as sentences."""
+    """Guess units of values that cannot be in SI units. The reasons are sentences."""
     units: dict[str, str] = {}
     notes = []
     joints = recording.joints
@@ -266,7 +266,7 @@ _MAX_INTERPOLATED_PERIODS = 5.0  # of a source, in the longest gap that is inter
 
 
 def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
-    """Merge joint groups of several named sources on the fastest clock; return the group, and notes on the merge.
+    """Merge joint groups of several named sources on the fastest clock, with notes on the merge.
 
     Values of the others are interpolated linearly between their samples. A time at which one of them has no sample
     within five of its periods on both sides is left out, so that a gap stays a gap. `DataError` where two sources have

@@ -1,4 +1,4 @@
-"""C3D files of motion capture (Vicon, Qualisys, OptiTrack): markers as points."""
+"""Read markers from C3D files of motion capture (Vicon, Qualisys, OptiTrack) as points."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_c3d(
     frame: str = "world",
     description: str = "",
 ) -> Recording:
-    """Read the markers of a C3D file as one point group `points`; its nominal clock starts at zero.
+    """Read the markers of a C3D file as one point group `points`. Its nominal clock starts at zero.
 
     The file says its rate and its unit; `units` where it does not or wrongly. A marker that was not seen in a frame
     (residual -1, NaN, or exactly the origin) is NaN. A subject in front of the name (`Subject:tip`) is left out where

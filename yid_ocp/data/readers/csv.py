@@ -1,4 +1,4 @@
-"""Tables of text (CSV): one row per time, with a header row or without."""
+"""Read CSV tables with one row per time, with or without a header row."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _LISTED = 5  # numbers of bad lines in a note
 
 @dataclass(frozen=True)
 class CsvOptions(base.SelectionAndUnitOptions):
-    """Options of `read_csv`: meaning of the table's columns, columns to keep, delimiter, header and clock.
+    """Options of `read_csv` for the meaning of columns, columns to keep, delimiter, header and clock.
 
     `columns` say what a column means where its name does not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
     column's name matches any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
@@ -67,7 +67,7 @@ _DEFAULTS = CsvOptions()
 
 
 def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> Recording:
-    """Read a recording from a CSV table with one row per time; its points become one group `points`.
+    """Read a recording from a CSV table with one row per time. Its points become one group `points`.
 
     Columns are understood by their names: `t`, `time` or `timestamp`; a channel and a joint, `q_<joint>`,
     `position_<joint>`, `velocity_<joint>`, `effort_<joint>` and so on, also as other loggers write them: `pos_<joint>`,

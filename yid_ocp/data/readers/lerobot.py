@@ -1,4 +1,4 @@
-"""LeRobot datasets (versions 2.0, 2.1 and 3.0): state and action of one episode as joints."""
+"""Read state and action of one episode of a LeRobot dataset (version 2.0, 2.1 or 3.0) as joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Report sections: their input data, registration and rendering; each file of this folder registers some.
+"""Input data, registration and rendering of report sections. Each file of this folder registers some.
 
 A file outside the package does as well, once it is imported; its template `NAME.html` stands beside it.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Input data of a report: `result` as in result.json, and problem, solution and further objects of one run.
+    """Input data of a report, with `result` as in result.json, and problem, solution and further objects of a run.
 
     `animations` are what moves where that does not follow from `problem`, `solution` and `held_out`; `section_data` is
     whatever else a command's own sections need; `robot` is the URDF file whose meshes arms wear.
@@ -55,7 +55,7 @@ REPORT_SECTIONS: Registry[_ReportSection] = Registry("report section")
 
 
 def register_report_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
-    """Decorator that registers a function as the report section `name`; sections of lower `order` come first.
+    """Register a function as the report section `name` (decorator). Sections of lower `order` come first.
 
     It returns what the template `NAME.html` needs, or pairs of title and figure, which need none; None, or no pair,
     where it has nothing to say.
@@ -71,7 +71,7 @@ def register_report_section(name: str, order: int, title: str) -> Callable[[_Pre
 def figures_by_unit(
     rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any]
 ) -> list[tuple[str, Any]]:
-    """Pairs (empty title, figure): one figure per unit, drawn from all rows (name, unit, row) with that unit."""
+    """Draw one figure per unit from the rows (name, unit, row) with that unit. Pairs have an empty title."""
     grouped: dict[str, dict[str, _Row]] = {}
     for name, unit, row in rows:
         grouped.setdefault(unit, {})[name] = row
@@ -79,7 +79,7 @@ def figures_by_unit(
 
 
 def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
-    """Name, title and HTML of every section with content, in order."""
+    """Render name, title and HTML of every section with content, in order."""
     result = []
     sections = {name: REPORT_SECTIONS[name] for name in REPORT_SECTIONS}
     for name, section in sorted(sections.items(), key=lambda entry: entry[1].order):

@@ -1,4 +1,4 @@
-"""Section: gap, locations, candidates and predictions of a diagnosis, as sentences and figures."""
+"""Report section on the gap, locations, candidates and predictions of a diagnosis."""
 
 from __future__ import annotations
 

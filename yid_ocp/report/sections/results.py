@@ -1,4 +1,4 @@
-"""Report sections common to all commands: conclusions, estimates, motion and measurements."""
+"""Report sections common to all commands, on conclusions, estimates, motion and measurements."""
 
 from __future__ import annotations
 
