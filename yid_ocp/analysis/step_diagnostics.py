@@ -243,7 +243,7 @@ _ZERO_RTOL = 1e-14  # of the largest entry: rounding
 
 
 class NamedIndexRange(NamedTuple):
-    """Name, first index and end index of a block of matrix rows or columns."""
+    """Name of a block of matrix rows or columns, with its first index and its end."""
 
     name: str
     start: int

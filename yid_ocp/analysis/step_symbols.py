@@ -189,7 +189,7 @@ class SymbolBlock:
 
 @dataclass(frozen=True)
 class EquationOrDerivativeFormula:
-    """Formula of one step equation or, if a column is named, of its derivative by that variable."""
+    """Formula of one step equation or, if a column is named, of its derivative with respect to that variable."""
 
     row_name: str
     column_name: str
@@ -287,7 +287,7 @@ class NamedStepEquations(ReprMixin):
 
     @cached_property
     def full_jacobian_sparsity_pattern(self) -> ca.Sparsity:
-        """Sparsity of the Jacobian of all equations by all variables."""
+        """Sparsity of the Jacobian of all equations with respect to all variables."""
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
         return found
 
@@ -309,7 +309,7 @@ class NamedStepEquations(ReprMixin):
         return slice(ends[at], ends[at + 1])
 
     def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:
-        """Find an equation by name or, for `ROW, COLUMN`, its derivative by a variable.
+        """Find an equation by name or, for `ROW, COLUMN`, its derivative with respect to a variable.
 
         `text` is such as `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]` or `constraint[left.x], T2.length`. Raises
         `ConfigError` for neither one name nor two, or one that does not exist.

@@ -72,7 +72,7 @@ class HeldOutLoss:
 
 @dataclass(frozen=True)
 class StoredFit:
-    """Stored values and standard deviations of a refit. One evaluation restores `RefittedModel` from them."""
+    """Stored values and standard deviations of a refit. `RefittedModel` is restored from them by one evaluation."""
 
     values: dict[str, float]  # of every unknown
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing

@@ -127,7 +127,7 @@ class EffectBase(Effect):
 
     @property
     def label(self) -> str:
-        """Label `kind@location` of the effect."""
+        """Label of the effect, `kind@location`."""
         return f"{self.kind}@{self.location}"
 
     @property

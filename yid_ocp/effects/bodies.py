@@ -172,7 +172,7 @@ class Payload(EffectBase):
     def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
-        """Reported mass and acting first moments. Beyond the position limit, moments have no standard deviation."""
+        """Reported mass and acting first moments of the payload. Limited moments have no standard deviation."""
         found = super().parameters_as_reported(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION

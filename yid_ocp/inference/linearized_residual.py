@@ -56,7 +56,7 @@ def nominal_trajectory_from_prediction(
 
 @dataclass(frozen=True)
 class ResidualDerivativesAtNodes:
-    """Derivatives of r residuals of a recording by states and efforts at the nodes around each sample.
+    """Derivatives of r residuals with respect to states and efforts at the nodes around each sample.
 
     Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
     """
@@ -122,7 +122,7 @@ class ResidualDerivativesAtNodes:
         return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
     def select_states(self, kept: IntArray) -> ResidualDerivativesAtNodes:
-        """Keep only derivatives by the states at the indices `kept`."""
+        """Keep only derivatives with respect to the states at the indices `kept`."""
         return replace(self, by_state=self.by_state[:, :, kept])
 
     def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesAtNodes:
@@ -130,7 +130,7 @@ class ResidualDerivativesAtNodes:
         return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Residual derivatives in d directions. Node states' are (K, nx, d), efforts' (K, nc, d), the result's (r, d).
+        """Residual derivatives (r, d) in d directions, from node states' (K, nx, d) and efforts' (K, nc, d).
 
         The K nodes begin with `first`; a residual beyond them uses the last one.
         """

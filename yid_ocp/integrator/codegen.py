@@ -56,7 +56,7 @@ class StepFunctions:
 
     @property
     def internal_residual_at_rest(self) -> ca.Function:
-        """Internal equations at rest and their derivatives by (q, z, lam, u). Both nodes are the same."""
+        """Internal equations at rest and their derivatives with respect to (q, z, lam, u). Both nodes are equal."""
         return self._function("resting")
 
     @property

@@ -432,7 +432,7 @@ class NlpStepConstraints:
     effort_jacobians: dict[str, ca.SX]
 
     def parameter_jacobians(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
-        """Sparse derivatives of `residual` and `prescribed_effort` by the parameters `names`, (..., len(names))."""
+        """Sparse derivatives of `residual` and `prescribed_effort` with respect to parameters, (..., len(names))."""
         parameters = self.equations.system.parameters
         chosen = ca.vertcat(ca.SX(0, 1), *(parameters[name].symbol for name in names))
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)

@@ -121,7 +121,7 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of the next state by state, input and parameters, from implicit functions.
+        """Derivatives of the next state with respect to state, input and parameters, from implicit functions.
 
         Returns A (nx, nx) by (q, p, z)_k, B_u (nx, nu) and B_theta (nx, len(names)), by all of theta without `names`.
         """

@@ -218,7 +218,7 @@ class EffectMomentumShift:
                 self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
 
     def momentum_derivative_by_previous_torque(self, theta: Array) -> Array:
-        """Derivative of the momentum by the torques of the previous step, (nu, nu) [s]."""
+        """Derivative of the momentum with respect to the previous step's torques, (nu, nu) [s]."""
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
@@ -287,7 +287,7 @@ class EffectMomentumShift:
 
 
 def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative of the applied torque by an error of the recorded torque, including feedback, (..., nu, nu).
+    """Derivative of the applied torque with respect to a recorded torque's error, with feedback, (..., nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
     `gain` (..., nu, nb) is that of a step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.

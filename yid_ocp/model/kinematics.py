@@ -40,7 +40,7 @@ class Kinematics:
         return self._columns(frame, lambda screw: screw[3:] + ca.cross(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Jacobian of a frame's angular velocity in world axes by the joint rates, shape (3, n)."""
+        """Jacobian of a frame's angular velocity with respect to joint rates, in world axes, shape (3, n)."""
         return self._columns(frame, lambda screw: screw[:3])
 
     def _frame(self, frame: str | Frame) -> Frame:

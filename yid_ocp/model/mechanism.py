@@ -66,7 +66,7 @@ class Inertia:
         return replace(self, mass=self.mass * factor, inertia_about_com=self.inertia_about_com * factor)
 
     def transformed_by(self, placement: Placement) -> Inertia:
-        """Express the inertia in another frame. `placement` is the pose of the present frame in it."""
+        """Express the inertia in another frame, in which `placement` is the pose of the present frame."""
         rotation = placement.rotation
         com = rotation @ self.center_of_mass + placement.translation
         return replace(self, center_of_mass=com, inertia_about_com=rotation @ self.inertia_about_com @ rotation.T)

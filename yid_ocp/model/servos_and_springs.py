@@ -133,7 +133,7 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class PositionServoOptions:
-    """Settings of all position servos, for interpolation, gravity compensation, motor and firmware."""
+    """Settings of all position servos except for their gains, which are parameters."""
 
     command_interpolation: Annotated[
         _CommandInterpolation,

@@ -53,7 +53,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """The result of a task. It is what the function returned, as read from its file, or why it failed."""
+    """Return value of a task, as read from its file, or the reason why it failed."""
 
     name: str
     value: Any = None
@@ -141,7 +141,8 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Get the values of all tasks. A failure raises `WorkerError` for an error of this package, else `RuntimeError`."""
+    """Get the values of all tasks, or raise the first failure. It is a `WorkerError` or, if foreign, a
+    `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]

@@ -116,7 +116,7 @@ class PlanOptions:
 
 
 class FramePositionEvaluator:
-    """Numeric evaluator of world positions of named frames and their Jacobian by the configuration.
+    """Numeric world positions of named frames, and their Jacobian with respect to the configuration.
 
     Raises `ConfigError` for a frame that does not exist.
     """
@@ -231,7 +231,7 @@ class PathSimulator:
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """Simulate the path of coefficients (K, nc). Sensitivities are by named parameters, then coefficients."""
+        """Simulate the path of coefficients (K, nc), with sensitivities to named parameters, then coefficients."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0

@@ -307,7 +307,7 @@ class ParameterizedExperiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
-        """Differences of `search_problem_sensitivities` by w, (w.size, nr, columns). None if one fails."""
+        """Differences of `search_problem_sensitivities` in w, (w.size, nr, columns). None if one fails."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()

@@ -113,7 +113,7 @@ class EpisodePredictor:
     def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode's rollout, and its derivative by (`wanted` parameters, `offset`).
+        """Initial state of an episode's rollout, with derivatives with respect to `wanted` parameters and `offset`.
 
         `theta` is that of `theta_with_episode_values`, `offset` that of an estimated initial state from equilibrium,
         and `guess` (n,) a configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of
@@ -181,7 +181,7 @@ class EpisodePredictor:
         return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
-        """Correct recorded torques, angles and paths for effects, with derivatives by the parameters `wanted`."""
+        """Correct recorded torques, angles and paths for effects, with derivatives along the parameters `wanted`."""
         corrections = self.model_functions.input_corrections
         torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
@@ -412,7 +412,7 @@ class EpisodePredictor:
     def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
-        """Gradient of a cost of an episode's predictions by its unknowns. These are shared, local and start ones.
+        """Gradient of a cost of an episode's predictions with respect to its (shared, local, start) unknowns.
 
         `result` is predicted at the same unknowns, `pulls` (M, k) are the cost's derivatives by every prediction.
         """

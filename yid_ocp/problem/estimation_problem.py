@@ -276,7 +276,7 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Compute cost, gradient and evaluation. The gradient is by adjoint, with process noise by sensitivities.
+        """Compute cost, gradient and evaluation. The gradient uses the adjoint, or sensitivities with process noise.
 
         An `evaluation` at `x` that is known already saves the rollout, most of the work; it is returned, without a
         Jacobian.
@@ -304,7 +304,7 @@ class EstimationProblem(ReprMixin):
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
     def prior_residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Residual of the stated and weak priors, and its Jacobian by the unknowns."""
+        """Residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
         stated, weak, start = self._stated, self._weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
         spread = np.log(max(self.options.weak_prior_geometric_std, 1.0 + 1e-9))
@@ -315,7 +315,7 @@ class EstimationProblem(ReprMixin):
     def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode, with derivatives by (free parameters, offset from equilibrium).
+        """Initial state of an episode, with derivatives with respect to free parameters and equilibrium offset.
 
         `guess` (n,) is a configuration near the equilibrium.
         """

@@ -158,7 +158,7 @@ class SensorMeasurements:
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
-        """Map a cost's gradient by residual to that by prediction (M, k), as adjoint of `whitened_residual`."""
+        """Convert a cost's gradient in the residual to that in the prediction, both (M, k) (adjoint)."""
         if self.residual_decorrelation_matrix is not None:
             pull = pull.copy()
             pull[self.positive_weight_mask] = self.residual_decorrelation_matrix.T @ pull[self.positive_weight_mask]

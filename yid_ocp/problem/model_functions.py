@@ -46,7 +46,7 @@ class CorrectedInputs:
         return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
 
     def initial_known_coordinates_sensitivity(self, width: int) -> Array:
-        """Derivative of `initial_known_coordinates` by the parameters, shape (nk, d)."""
+        """Derivative of `initial_known_coordinates` with respect to the parameters, shape (nk, d)."""
         by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
@@ -357,7 +357,7 @@ class ModelFunctions:
     def compiled_sensor_function(
         self, sensor: Sensor, wanted: tuple[str, ...] = ()
     ) -> Callable[[TimeGridStateValues, Array], _SensorReadings]:
-        """Compiled function of a sensor's readings at nodes, with derivatives by `wanted`."""
+        """Compiled function of a sensor's readings at nodes, with derivatives with respect to `wanted`."""
         function, columns = self._sensors((sensor, bool(wanted))), [self.parameter_names.index(name) for name in wanted]
 
         def read(at: TimeGridStateValues, theta: Array) -> _SensorReadings:

@@ -58,7 +58,8 @@ def mean_step_input_delay_derivative(
     delay: Array,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Derivative of `mean_step_inputs` by each joint's delay, (steps, nu). At a jump both sides are averaged."""
+    """Derivative of `mean_step_inputs` with respect to each joint's delay, (steps, nu). Jumps have the mean of both
+    sides."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))

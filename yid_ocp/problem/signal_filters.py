@@ -112,7 +112,7 @@ class NodeSmoother:
         return smooth
 
     def smoothing_adjoint(self, pull: Array) -> Array:
-        """Map a cost's gradient (N, k) by smoothed values to the gradient by input values, as adjoint of `smooth`."""
+        """Convert a cost's gradient in the smoothed values to that in the input values, both (N, k) (adjoint)."""
         passed = pull.copy()
         passed[self.nodes] = 0.0
         return np.asarray(passed + self.matrix.T @ pull[self.nodes])
@@ -179,7 +179,7 @@ class FirstOrderLag:
         return followed, total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Map a cost's gradient (N, k) by lagged node values to those by input and parameters (adjoint)."""
+        """Convert a cost's gradient in lagged node values to those in input and parameters (adjoint)."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         by_time = self._by_time(value, self._straight(value, decay, share))

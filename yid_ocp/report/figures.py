@@ -85,7 +85,7 @@ def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -
 
 @dataclass(frozen=True)
 class TimePlotData:
-    """Data of one plot over time, with measured values, predicted lines and shaded intervals."""
+    """Data of one plot over time: measured values (M,) at t (M,), predicted lines (t, value), shaded intervals."""
 
     axis_title: str
     lines: Mapping[str, tuple[Array, Array]]
@@ -274,7 +274,7 @@ def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) ->
 def estimated_curve_figure(
     curve: tuple[Array, Array, Array], others: Mapping[str, Array], visited: tuple[float, float], x: str, y: str
 ) -> Figure:
-    """Plot a curve with two standard deviations, other curves dashed. The visited x are marked."""
+    """Plot a curve with two standard deviations, (x, y, std). Others are dashed, and the visited x marked."""
     figure, (at, middle, std) = _styled_figure(340, x, y), curve
     edges = np.concatenate([middle + 2 * std, (middle - 2 * std)[::-1]])
     band = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False, "opacity": 0.25}
@@ -468,8 +468,7 @@ def _even(value: Any) -> Any:
 def candidate_ranking_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, promised: str
 ) -> Figure:
-    """Plot candidates ranked by refitted closure with interval [%], and by predicted decrease. Closure may be None.
-    Closure may be None.
+    """Plot candidates ranked by refitted closure [%] with interval (None: unknown), and by predicted decrease.
 
     `closed` and `promised` are the titles of the two axes.
     """

@@ -128,7 +128,7 @@ class _RecordedGroup(Protocol):
 
 
 class RecordedPointGroup(_RecordedGroup, Protocol):
-    """Interface of a recorded point group. `data.recording.PointGroup` implements it."""
+    """Interface of a recorded point group with times and positions. `data.recording.PointGroup` implements it."""
 
     @property
     def sensor(self) -> str: ...
@@ -141,7 +141,7 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
 
 
 class RecordedJointGroup(Protocol):
-    """Interface of recorded joints. `data.recording.JointGroup` implements it."""
+    """Interface of recorded joints with names, times and channels. `data.recording.JointGroup` implements it."""
 
     @property
     def names(self) -> tuple[str, ...]: ...

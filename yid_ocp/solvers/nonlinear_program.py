@@ -47,7 +47,7 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function of local variables with its derivatives: y(v; d, s) of variables v, data d and shared data s.
+    """Symbolic function of local variables, with its derivatives: y(v; d, s) of variables v, data d and shared data s.
 
     The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. Derivatives may be
     compiled; the value stays CasADi's own, so that whoever builds upon it can differentiate it.
@@ -177,7 +177,7 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Sparse Jacobian of the residuals by the program's unknowns w, shape (nr, nw)."""
+        """Sparse Jacobian of the residuals with respect to the program's unknowns w, shape (nr, nw)."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
         matrix = self._residual_jacobian_by_term_values(p)
@@ -408,12 +408,12 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def jac_r(self) -> ca.MX:
-        """Sparse Jacobian of all residuals r by the unknowns w."""
+        """Sparse Jacobian of all residuals r with respect to the unknowns w."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
     @_ThreadSafeCachedProperty
     def jac_g(self) -> ca.MX:
-        """Sparse Jacobian of the constraints g by the unknowns w."""
+        """Sparse Jacobian of the constraints g with respect to the unknowns w."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
             row, column = term._jacobian_nonzero_indices()
@@ -427,7 +427,7 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def grad_f(self) -> ca.MX:
-        """Gradient of the objective f by the unknowns w, shape (nw, 1)."""
+        """Gradient of the objective f with respect to the unknowns w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
         for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):

@@ -419,7 +419,7 @@ class InjectedEffect:
 
     @property
     def label(self) -> str:
-        """Label `kind@location` of the effect."""
+        """Label of the effect, `kind@location`."""
         return f"{self.kind}@{self.location}"
 
 

@@ -46,7 +46,7 @@ class InjectedSimulatorTerms(Protocol):
         """Edit the compiled `mujoco.MjModel`."""
 
     def start_motion(self, data: Any) -> None:
-        """Prepare for the motion. This is called once when it begins, at rest."""
+        """Prepare for a motion that begins at rest. This is called once per motion."""
 
     def add_forces(self, model: Any, data: Any) -> None:
         """Add generalized forces to `data.qfrc_passive`. This is called at every inner step."""

@@ -91,7 +91,7 @@ class CameraState:
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
     def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
-        """Jacobian of world points by pose and depth, shape (N, 3, 8)."""
+        """Jacobian of world points with respect to pose and depth, shape (N, 3, 8)."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))

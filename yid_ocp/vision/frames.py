@@ -149,7 +149,7 @@ XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58
 
 @cache
 def import_open3d() -> ModuleType:
-    """Import open3d. `DataError` where it is not installed or cannot be loaded."""
+    """Import the open3d package. `DataError` where it is not installed or cannot be loaded."""
     hint = "pip install 'yid-ocp[vision]'"
     with contextlib.suppress(ImportError, OSError):  # the system may have its own
         # the wheel of open3d wants the system's libusb, which a bare machine does not have

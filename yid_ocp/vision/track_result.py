@@ -25,7 +25,7 @@ _CAMERA_POINT_GROUP = "points_camera"
 
 @dataclass(frozen=True, eq=False)
 class FrameReport:
-    """Report of one frame. It holds the fitted shape or why the frame was dropped."""
+    """Fitted shape of one frame, or the reason why the frame was dropped."""
 
     index: int  # of the sequence
     name: str

@@ -66,7 +66,7 @@ model:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the three tubes. Nominal joint stiffnesses are those for four links, whatever `links` is."""
+        """Build the three tubes of the foam Y. Nominal joint stiffnesses are those for four links with any `links`."""
         n = link_division
         links = self.links * n
         return [
