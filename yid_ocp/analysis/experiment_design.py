@@ -74,12 +74,12 @@ class RecordedExperiment:
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group of the camera (None: defaults), with frame times since the start [s] and typical std [m]."""
+        """Point group, frame times [s] and typical std [m] of the camera. A missing group means defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group of the arms (None: defaults), with sample times [s] and typical std [m]."""
+        """Point group, sample times [s] and typical std [m] of the arms' points. A missing group means defaults."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
 

@@ -131,7 +131,7 @@ def results_by_parameter_at_optimum(
     names: Sequence[str],
     progress: Progress,
 ) -> dict[str, _Found]:
-    """Evaluate a function at the optimum near `x` for each name in parallel: `judged(name, unknowns, evaluation)`."""
+    """Evaluate `judged(name, unknowns, evaluation)` at the optimum near `x` for each name, in parallel."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 

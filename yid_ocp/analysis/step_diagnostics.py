@@ -145,7 +145,7 @@ def parameter_detectabilities(
     theta: Array,
     stages: StepEquationLinearizations,
 ) -> tuple[ParameterDetectability, ...]:
-    """Find the step equations that contain each parameter, and the sensors' response about a state (nx,).
+    """Find the step equations that contain each parameter, and the sensors' response to the parameter.
 
     A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
     tracking filter's first gain. The row is seen to first order where a reading answers within `_RESPONSE_STEPS` steps.

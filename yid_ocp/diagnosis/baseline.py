@@ -150,7 +150,7 @@ class EarlierRunsBaseline:
     def errors_with_effects_removed_and_added(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> ErrorsWithEffectsRemovedAndAdded | None:
-        """Predict reference recordings without the effects of `last`, and the diagnosed ones with these.
+        """Predict reference recordings without the effects of `last`, and the diagnosed recordings with them.
 
         None without effects or reference recordings. Without earlier runs, the parameters of the system without the
         effects are estimated on the reference recordings.

@@ -523,7 +523,7 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
 
 
 def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Judge what `evidence_to_json` returned again; return the part of `yid-diagnosis/2` that is scored.
+    """Judge a recorded case again, from what `evidence_to_json` returned. The result is the part that is scored.
 
     Thresholds are those of the diagnosis, as far as there still are such, with `changes`. The verdict is `not_judged`
     where they ask for a refit that was not made. What steers the search before the first screening (events, the time

@@ -145,7 +145,7 @@ class AllCandidatesProblem:
         return self.problem.free
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
-        """The problem with residuals whitened by sensor and torque noise; the filters are linearised at `values`."""
+        """Whiten residuals by sensor and torque noise. The filters are linearised at `values`."""
         # what is frozen is about the torques that are estimated there, for which they must be known beforehand
         x, errors = self.problem.vector(values), (episode.input_errors for episode in self.problem.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)

@@ -167,7 +167,7 @@ class RefitContext:
     def refit(
         self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str = ""
     ) -> RefitStatistics | None:
-        """Refit the model with some effects, under a name that says from where. None if no rollout succeeds."""
+        """Refit the model with some effects. `name` says from where; None if no rollout succeeds."""
         asked = (self.problem, effects, start, self.store, name, self.thresholds)
         return self._answer(self.record.refits, name or join_effect_labels(effects), lambda: refit_with_effects(*asked))
 
@@ -190,7 +190,7 @@ class RefitContext:
         return refit_with_effects(turned, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
-        """Screen all candidates beside some effects, under a name that says at which fit's values."""
+        """Screen all candidates beside some effects. `name` says at which fit's values."""
         return self._answer(
             self.record.screenings, name, lambda: screen_candidates(self.problem, base, values, self.thresholds)
         )

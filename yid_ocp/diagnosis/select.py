@@ -87,7 +87,7 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
 
 
 def penalized_chi2_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
-    """Return r'r of `fit` minus r'r of `other`, over fitted and held-out recordings, plus a parameter penalty.
+    """Difference of r'r between two fits over fitted and held-out recordings, plus a parameter penalty.
 
     It is that of Schwarz (1978, doi:10.1214/aos/1176344136), so that half the difference is the log odds of `other`.
     """

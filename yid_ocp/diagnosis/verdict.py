@@ -61,7 +61,7 @@ class EffectAmplitudeTransferCheck:
 
 @dataclass(frozen=True)
 class LocatedGap:
-    """Location of the nominal model's gap by the smoother."""
+    """Location of the nominal model's gap, as found by the smoother."""
 
     locations: tuple[GapLocation, ...]
     chi2_decrease: float  # by unknown forces, offsets and biases, beyond what chance takes
@@ -139,7 +139,7 @@ class Judgement:
         return closed
 
     def required_fraction(self, limits: Thresholds) -> float:
-        """Fraction of what the smoother explains that the effects are required to explain.
+        """Fraction of the smoother's explanation that the effects are required to explain.
 
         Each further assumption has to explain that part of what could be left.
         """

@@ -1,4 +1,4 @@
-"""Export a system's tree as URDF or SDF, and list what a format can express of it."""
+"""Export a system's tree as URDF or SDF, and list the parameters and effects that a format can express."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class FeatureExportSupport:
-    """Whether an export format can express a parameter or effect, with the element or the reason."""
+    """Ability of an export format to express a parameter or effect. It names the element or the obstacle."""
 
     status: _SupportStatus
     how: str

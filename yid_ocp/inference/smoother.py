@@ -447,7 +447,7 @@ class GapLocation:
 
 
 def main_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
-    """Return the locations to report: those with a share above `_MIN_NAMED_SHARE`, or the first, at most three."""
+    """Choose the locations to report, those with a share above `_MIN_NAMED_SHARE` or the first, at most three."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
 
@@ -458,7 +458,7 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 def gap_locations_by_smoother_evidence(
     smoothed: SmoothedUnknownsResult, location_z: float = 3.0
 ) -> tuple[GapLocation, ...]:
-    """Return all locations with their share of the log evidence, largest first; at equal shares observable ones first.
+    """Rank all locations by their share of the log evidence. At equal shares observable ones come first.
 
     A location's time windows are those in which an unknown is over `location_z` standard deviations from zero.
     """
@@ -497,7 +497,7 @@ def _windows(
 
 
 def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Merge overlapping or adjacent time intervals; return them in order of time."""
+    """Merge overlapping or adjacent time intervals. They are returned in order of time."""
     joined: list[tuple[float, float]] = []
     for begin, end in sorted(spans):
         if joined and begin <= joined[-1][1] + 1e-9:
@@ -513,7 +513,7 @@ def gap_locations_from_effect_closures(
     rest: Sequence[GapLocation],
     windows: tuple[tuple[float, float], ...],
 ) -> tuple[GapLocation, ...]:
-    """Return locations with gap shares by the closure of effects there; the smoother distributes the rest.
+    """Share the gap among locations by the closure of effects there. The smoother distributes the rest.
 
     `before` and `rest` are the locations of the nominal model and of the model with the effects, `closed` is the part
     that the effects at each close, `windows` serve locations without an unknown of the smoother (`world`, `clock`).
@@ -540,7 +540,7 @@ def z_scores_of_smoothed_unknowns(
     recording: int = 0,
     informed_fraction: float = 0.5,
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Return interval edges (J + 1,) [s], unknowns' names, and z scores (J, nd): posterior mean over posterior std.
+    """Interval edges (J + 1,) [s], unknowns' names and z scores (J, nd), which are posterior mean over std.
 
     Scores are NaN unless 1 - posterior/prior variance is above `informed_fraction`.
     """
@@ -553,13 +553,13 @@ def z_scores_of_smoothed_unknowns(
 
 
 def smoothed_unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
-    """Return the SI unit of every smoothed unknown in `trace`: force, torque, push, grasp offset or sensor bias."""
+    """SI unit of every smoothed unknown in `trace`, such as a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}
     return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
 
 
 def generalised_force_unit(system: System, coordinate: str) -> str:
-    """Return the SI unit of the generalised force at a coordinate: N for a prismatic joint, else N m."""
+    """SI unit of the generalised force at a coordinate, N for a prismatic joint, else N m."""
     kinds = {joint.name: joint.kind for joint in system.mechanism.joints}
     return "N" if kinds.get(coordinate) == "prismatic" else "N m"

@@ -141,8 +141,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Get the values of all tasks, or raise the first failure. It is a `WorkerError` or, if foreign, a
-    `RuntimeError`."""
+    """Get the values of all tasks, or raise an error. It is `WorkerError` or, for a foreign failure, `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]

@@ -168,7 +168,7 @@ class ParameterizedExperiment:
         return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.moved_joint_indices)))
 
     def planned_estimation_problem(self, w: Array) -> EstimationProblem:
-        """Configured estimation problem with the planned recording for coefficients w instead of its own."""
+        """Configured estimation problem on the planned recording of coefficients w, instead of its own recordings."""
         return self._problem(self.configured_problem.step, self._noise_free_recording(w), self._options())
 
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:

@@ -197,7 +197,7 @@ class Solution(ReprMixin):
         return tuple(sample for pair in known for sample in channel_predictions(*pair))
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """Convert the parameters to a pandas data frame with value, std, lower, upper, unit, verdict, free, initial.
+        """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
         `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known. Raises
         `ConfigError` where pandas is not installed.

@@ -47,7 +47,8 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function of local variables, with its derivatives: y(v; d, s) of variables v, data d and shared data s.
+    """Symbolic function of local variables, with its derivatives. It is y(v; d, s) of variables v, data d, shared data
+    s.
 
     The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. Derivatives may be
     compiled; the value stays CasADi's own, so that whoever builds upon it can differentiate it.
