@@ -311,9 +311,8 @@ _SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 _MAX_WHITENING_PASSES = 6
 # A search that comes this near to a known fit takes that fit [standard deviations]. Two searches may well end farther
-# apart in one minimum, by the weights of the last pass, and the better end counts; under the same weights they do so
-# only by the tolerance of a solver.
-_SAME_FIT_STDS, _SAME_MINIMUM_STDS = 0.01, 0.2
+# apart in one minimum, by the tolerance of a solver or the weights of the last pass, and the better end counts.
+_SAME_FIT_STDS = 0.01
 _STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
@@ -520,14 +519,8 @@ def _fit_from(
         # the second pass is the first about torque offsets that are not guessed
         if (number and len(result.history) < 2) or result.stopped_by_callback:
             break
-        # a search that has come to a known fit, after its first pass under the weights of that, is not weighted again
-        same = next((fit for fit in known if passes > 1 and _is_at(fit, x)), None)
-        if same is None and passes > 1 and known and not number:
-            best = min(known, key=lambda fit: fit.evaluation.cost)
-            again = _minimize_cost(solver, best.weighted, x, _noting(callback, f"{which}, weights of a known fit"))
-            evaluations, history = evaluations + again.n_evaluations, [*history, *again.history]
-            same = best if _is_at(best, again.x, _SAME_MINIMUM_STDS) else None
-        if same is not None:
+        # a search that has come to a known fit is not weighted again
+        if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
             return replace(same, n_evaluations=evaluations, history=history)
     finish = result.evaluation
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
@@ -537,10 +530,10 @@ def _fit_from(
     return _Fit(result, finish, weighted, evaluations, history)
 
 
-def _is_at(fit: _Fit, x: Array, most: float = _SAME_FIT_STDS) -> bool:
+def _is_at(fit: _Fit, x: Array) -> bool:
     """Whether a point differs from a fit by d with |J d| next to nothing; no |d_i| / std_i is larger than that."""
     slopes = fit.evaluation.jacobian if fit.evaluation.ok else None
-    return slopes is not None and float(np.linalg.norm(slopes @ (x - fit.result.x))) < most
+    return slopes is not None and float(np.linalg.norm(slopes @ (x - fit.result.x))) < _SAME_FIT_STDS
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:
