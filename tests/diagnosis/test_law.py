@@ -181,7 +181,7 @@ def test_a_configuration_has_a_law_by_its_table(tmp_path):
     assert [effect.label for effect in made.effects] == ["law@T1"]
     assert made.parameters["law@T1.angle3"].value == pytest.approx(tables()[0].torque[3])
     for wrong, text in (
-        ("{kind: law, location: T1}", "needs its table"),
+        ("{kind: law, location: T1}", "needs table and depends_on"),
         (f"{{kind: kelvin_voigt, location: T1, table: {file}}}", "kelvin_voigt has no table"),
     ):
         with pytest.raises(ConfigError, match=text):

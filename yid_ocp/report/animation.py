@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import YidError
+from yid_ocp.files import read_input_text
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
@@ -107,7 +108,7 @@ def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, Triang
     """Thinned meshes of a robot by the joint that carries them, the empty name for what does not move."""
     try:
         # the libraries that read meshes take a third of a second to import
-        if robot is None or b"<visual" not in resolve_urdf_path(robot).read_bytes():
+        if robot is None or "<visual" not in read_input_text(resolve_urdf_path(robot)):
             return {}
         found = load_robot_meshes_by_joint(robot, system.numeric_mechanism())
     except (OSError, YidError):
