@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from so101_twin import INNER_STEP, GearFriction
+from so101_twin import INNER_STEP
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ParameterSettings, RunSettings
@@ -30,7 +30,8 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.solvers import solve
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
@@ -60,31 +61,6 @@ LADDER = {
 }
 
 
-class LawFriction(GearFriction):
-    """Friction of one joint by a law's amplitudes, from the start of the motion on."""
-
-    def __init__(self, amplitudes: Mapping[str, float]) -> None:
-        super().__init__()
-        self._amplitudes, self._state = amplitudes, 0.0  # the state is that of Dahl's law
-
-    def add_forces(self, model: Any, data: Any) -> None:
-        """Set the size of the next inner step."""
-        if not self._moves:
-            return
-        said = {name.partition("@")[0]: value for name, value in self._amplitudes.items() if "v_stri" not in name}
-        speed = float(data.qvel[0])
-        weight = model.body_subtreemass[model.jnt_bodyid[0]] * model.opt.gravity
-        reach = data.subtree_com[model.jnt_bodyid[0]] - data.xanchor[0]
-        load = float(data.qfrc_actuator[0] - COUNTER_VOLTAGE * speed - data.xaxis[0] @ np.cross(reach, weight))
-        size = said.get("joint_coulomb", 0.0) + said.get("joint_load_friction", 0.0) * abs(load)
-        size += said.get("joint_stribeck", 0.0) * math.exp(-((speed / STRIBECK_SPEED) ** 2))
-        model.dof_frictionloss[:] = max(size, 1e-9)
-        if (held := self._amplitudes.get("joint_presliding@joint.tau_c", 0.0)) > 0:
-            part = math.exp(-abs(speed) * INNER_STEP / YIELD_ANGLE)
-            self._state = math.copysign(1 - part, speed) + self._state * part
-            data.qfrc_passive[0] -= held * self._state
-
-
 def settings(law: str, file: str | None, start: Mapping[str, float]) -> RunSettings:
     """The shipped configuration with one law of friction, the motor's gain and the joint's inertia unknown."""
     own = [] if file is None else [file]
@@ -110,16 +86,19 @@ def recorded(seed: int, amplitudes: Mapping[str, float]) -> Recording:
         motion=random_multisine_motion(system, values, seed=seed, initial_joint_angles=start, excitation=excitation),
         initial_joint_angles=start,
         simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),
-        arm_noise=ArmSensorNoise(position_std=ANGLE_STD),
-        injected_terms=LawFriction(amplitudes),
+        arm_noise=ArmSensorNoise(position_std=ANGLE_STD, position_resolution=COUNT),
         camera=None,
         seed=seed,
         recording_name=f"friction_{seed}",
     )
-    made = run_virtual_experiment(system, values, experiment)
+    sizes: dict[str, dict[str, float]] = {}
+    for name, value in amplitudes.items():
+        kind, _, quantity = name.partition("@joint.")
+        sizes.setdefault(kind, {})[quantity] = value
+    effects = [InjectedEffect(kind, "joint", size) for kind, size in sizes.items()]
+    made = run_experiment_with_effects(system, values, effects, experiment, ())
     assert made.joints is not None
-    counted = COUNT * np.rint(made.joints.position / COUNT)
-    joints = replace(made.joints, position=counted, position_resolution=COUNT, proportional_gain=400.0)
+    joints = replace(made.joints, proportional_gain=400.0)
     return replace(made, joints=replace(joints, velocity=None, velocity_std=None), true_parameters={})
 
 

@@ -19,7 +19,6 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,8 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
@@ -56,32 +56,6 @@ ANGLE_STD, COUNT = 5e-4, 2 * math.pi / 4096  # [rad]
 SEEDS = (1, 2, 3)  # the last one is held out
 
 
-class GearFriction:
-    """Friction of every joint that MuJoCo's solver holds and slides, from the start of the motion on."""
-
-    def __init__(self) -> None:
-        self._moves = False
-
-    def edit_model(self, model: Any) -> None:
-        """Give every joint a friction that holds as firmly as the inner step allows."""
-        model.dof_frictionloss[:] = 1e-9
-        model.dof_solref[:, 0], model.dof_solimp[:, :2] = 10 * INNER_STEP, 0.999
-
-    def start_motion(self, data: Any) -> None:
-        """Let it rub."""
-        self._moves = True
-
-    def add_forces(self, model: Any, data: Any) -> None:
-        """Set the size of the next inner step."""
-        if not self._moves:
-            return
-        reach = data.subtree_com[model.jnt_bodyid] - data.xanchor
-        weight = model.body_subtreemass[model.jnt_bodyid, None] * model.opt.gravity
-        outside = np.einsum("ij,ij->i", data.xaxis, np.cross(reach, weight))
-        motor = data.qfrc_actuator - DAMPING * data.qvel
-        model.dof_frictionloss[:] = COULOMB + LOAD_SHARE * np.abs(motor - outside)
-
-
 def recorded(system: System, seed: int) -> Recording:
     """One motion of the arm in MuJoCo: commands and counted angles; `system` has no friction of its own."""
     values = {name: value for name, value in TRUTH.items() if name in system.parameters}
@@ -93,16 +67,16 @@ def recorded(system: System, seed: int) -> Recording:
         motion=replace(motion, amplitude=motion.amplitude * moves),
         initial_joint_angles=POSTURE,
         simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),
-        arm_noise=ArmSensorNoise(position_std=ANGLE_STD),
-        injected_terms=GearFriction(),
+        arm_noise=ArmSensorNoise(position_std=ANGLE_STD, position_resolution=COUNT),
         camera=None,
         seed=seed,
         recording_name=f"so101_{seed}",
     )
-    made = run_virtual_experiment(system, values, experiment)
+    laws = {"joint_coulomb": {"tau_c": COULOMB}, "joint_load_friction": {"share": LOAD_SHARE}}
+    friction = [InjectedEffect(kind, joint, size) for joint in POSTURE for kind, size in laws.items()]
+    made = run_experiment_with_effects(system, values, [], experiment, friction)
     assert made.joints is not None
-    counted = COUNT * np.rint(made.joints.position / COUNT)
-    joints = replace(made.joints, position=counted, position_resolution=COUNT, proportional_gain=GAIN)
+    joints = replace(made.joints, proportional_gain=GAIN)
     return replace(made, joints=replace(joints, velocity=None, velocity_std=None), true_parameters=TRUTH)
 
 

@@ -79,6 +79,9 @@ def default(value: Any) -> str:
 
 
 EXAMPLES: Mapping[str, str] = {
+    "virtual_arm": """\
+virtual_arm: {friction: load, link_mass_deviation: 0.03, encoder_counts: 4096}
+""",
     **{section: text for kind in OBJECT_KINDS for section, text in OBJECT_KINDS[kind].settings_examples.items()},
     "The file": """\
 description: A cable of 1 m, swung by a UR5

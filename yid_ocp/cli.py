@@ -121,6 +121,10 @@ def _blind(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="folder of the proof; an existing one is completed")
     parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
+    text = "make and diagnose the K-th of N slices of the ensemble only, in a folder of its own"
+    parser.add_argument("--slice", metavar="K/N", default="1/1", help=text)
+    text = "score slices of one ensemble together: their files slice.json, or folders that hold one"
+    parser.add_argument("--join", metavar="FILE", nargs="+", help=text)
     text = "draw an ensemble for setting thresholds, with other cases than the reported one of the same seed"
     _switch(parser, "--calibration", text)
     text = "score the finished cases of a proof again with the thresholds of --set, without a refit"

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import math
 from dataclasses import MISSING
+from typing import Literal, get_args, get_origin
 
 import pytest
 from ruamel.yaml import YAML
@@ -255,6 +256,8 @@ def within(wrap, name, beside=None):
 
 def needed_value(hint):
     bare, _ = options.split_annotated(hint)
+    if get_origin(bare) is Literal:
+        return get_args(bare)[0]
     return 1.0 if bare is float else [*"abcde"] if options.variadic_tuple_entry_type(hint) is not None else "a"
 
 

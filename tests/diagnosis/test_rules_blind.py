@@ -24,8 +24,9 @@ from yid_ocp.diagnosis.blind import (
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect
-from yid_ocp.virtual.joint_motion import MultisineOptions
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 
 KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
 
@@ -48,6 +49,8 @@ def system(driven=("s0", "s1", "w0"), prescribed=()):
         parameters=SimpleNamespace(names=("T1.bend", "T2.bend", "T1.damping")),
         elastic_joints=tuple(SimpleNamespace(segment_name=name, deformation=way) for name, way in springs),
         grasps=(),
+        effects=(),
+        mechanism=SimpleNamespace(joints=(SimpleNamespace(effort_limit=20.0),), joint_index=lambda name: 0),
     )
 
 
@@ -61,7 +64,7 @@ def problem(of=None):
         theta=np.array([20.0, 5.0, 0.05]),
         episodes=(SimpleNamespace(recording=recording),),
         step="step",
-        options="options",
+        options=SimpleNamespace(prior_stds={}),
     )
 
 
@@ -70,8 +73,9 @@ def drawn(monkeypatch):
     """drawn(...): an ensemble whose recordings are made up; `made` remembers what was simulated."""
     made: list[dict] = []
 
-    def experiment(of, truth, injected, settings):
+    def experiment(of, truth, injected, settings, friction):
         made.append(vars(settings) | {"system": of, "truth": dict(truth), "injected": tuple(injected)})
+        made[-1]["friction"] = friction
         if len(made) <= build.failures:
             raise ModelError("it flies away")
         return Recording(points=(PointGroup("p", ("tip",), np.array([0.0]), np.zeros((1, 1, 3))),), description="told")
@@ -237,6 +241,45 @@ def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
     assert plan == plan_blind_cases(300, 3, WEIGHTS, WHOLE)
     assert plan != plan_blind_cases(300, 4, WEIGHTS, WHOLE)
     assert plan != plan_blind_cases(300, 3, WEIGHTS, WHOLE, "calibration")
+
+
+def test_one_clean_case_in_three_is_brisk():
+    plan = plan_blind_cases(300, 3, WEIGHTS, WHOLE)
+    assert counted([e for e in plan if e.is_brisk], lambda e: e.category) == {"null": 20}
+    assert len({e.experiment for e in plan if e.is_brisk}) == len(WEIGHTS)
+    assert [e.is_brisk for e in plan] == [e.is_brisk for e in plan_blind_cases(300, 3, WEIGHTS, WHOLE)]
+
+
+def test_a_brisk_motion_has_three_times_the_acceleration(drawn):
+    ensemble, ratios, arm = drawn(), [], baxter_foam_y_system(1)
+    for brisk in (False, True):
+        ensemble.draw_planned_case(PlannedBlindCase(7, "one", "null", None, brisk))
+    start = grasping_joint_angles(arm)
+    for seed in range(2):
+        sizes = []
+        for made in (drawn.made[0], drawn.made[-1]):
+            how = {"initial_joint_angles": start, "excitation": made["motion"]["excitation"]}
+            motion = random_multisine_motion(arm, seed=seed, **how)
+            sizes.append(np.std([motion.offset_and_derivatives(t)[2] for t in np.linspace(1.0, 5.0, 200)]))
+        ratios.append(sizes[1] / sizes[0])
+    assert 2.6 < np.mean(ratios) < 3.4
+
+
+def test_truth_has_ordinary_friction_and_parameters_as_uncertain_as_their_priors(drawn):
+    ensemble = drawn(conditions=SyntheticMeasurementConditions(ordinary_friction=()))
+    known = ensemble.problem
+    known.system.effects = (FRICTION,)
+    known.system.parameters.names += ("joint_coulomb@elbow.tau_c",)
+    known.theta = np.append(known.theta, 0.0)
+    ensemble.simulated_system = system()
+    known.options.prior_stds = {"T2.bend": 0.05}
+    for number in range(8):
+        case = PlannedBlindCase(number, "one", "null", None)
+        truth = ensemble.draw_planned_case(case)[1].truth
+        assert 0.03 <= abs(truth["T2.bend"] - 5.0) <= 0.05
+        [held] = drawn.made[-1]["friction"]
+        assert held == InjectedEffect("joint_coulomb", "elbow", {"tau_c": truth["joint_coulomb@elbow.tau_c"]})
+        assert 0.08 <= held.values["tau_c"] <= 0.32
 
 
 def test_an_object_without_links_has_single_effects_instead_of_finer_chains():

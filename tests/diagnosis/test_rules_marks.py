@@ -22,7 +22,8 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import LocatedGap
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
-from yid_ocp.workflow.blind import rescore_blind
+from yid_ocp.workflow import blind_slices
+from yid_ocp.workflow.blind_slices import join_slices, rescore_blind, write_slice
 
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
@@ -353,7 +354,7 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
         for i in range(2)
     ]
     text, digest = labels_json_and_sha256(sealed)
-    monkeypatch.setattr("yid_ocp.workflow.blind.draw_blind_results", lambda *_: None)
+    monkeypatch.setattr(blind_slices, "draw_blind_results", lambda *_: None)
     for part in ("sealed", "answers", "best"):
         (tmp_path / part).mkdir()
     (tmp_path / "sealed/labels.json").write_text(text)
@@ -378,3 +379,46 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
         "not_judged -",
     )
     assert "| of.it | 2 | 1 |" in (tmp_path / "other/table.md").read_text()
+
+
+# -- slices -----------------------------------------------------------------------------------------------------------
+
+
+def written_slice(tmp_path, part, cases, **changes):
+    """The folder of a slice whose cases are clean and were called so."""
+    labels = [CaseGroundTruth(f"case_{i:03d}", "null", (), None, {}) for i in cases]
+    known = dict.fromkeys(("code", "code_of_cases", "command"), "made up") | {"versions": {}, "candidates": {}}
+    answers = [{"seconds": 1.0, "result": said("no_gap")} for _ in cases]
+    found = {"slice": part, "cases": 4, "seed": 1, "purpose": "report", "configs": {}, "variations": {}, **known}
+    found |= {"labels": [label.to_dict() for label in labels], "answers": answers, "best": {}}
+    found["labels_sha256"] = labels_json_and_sha256(labels)[1]
+    folder = tmp_path / part.replace("/", "-") / str(len(list(tmp_path.iterdir())))
+    folder.mkdir(parents=True)
+    write_slice(found | changes, folder)
+    return folder
+
+
+def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path, monkeypatch):
+    for name in ("draw_blind_results", "write_report"):
+        monkeypatch.setattr(blind_slices, name, lambda *_: None)
+    parts = [written_slice(tmp_path, "1/2", (0, 2)), written_slice(tmp_path, "2/2", (1, 3)) / "slice.json"]
+    joined = join_slices(parts, tmp_path / "joined").result
+    assert [entry["case"] for entry in joined["marks"]] == [f"case_{i:03d}" for i in range(4)]
+    assert (joined["slices"], joined["cases"], joined["false_alarms"]) == (["1/2", "2/2"], 4, 0.0)
+    assert rescore_blind(tmp_path / "joined", tmp_path / "again").result["cases"] == 4
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seed": 2}, "another ensemble"),
+        ({"code": "newer"}, "another ensemble"),
+        ({"slice": "2/3"}, "another ensemble"),
+        ({"slice": "1/2"}, "given twice"),
+        ({"labels_sha256": "0"}, "committed"),
+    ],
+)
+def test_slices_count_together_only_with_one_hash(tmp_path, changes, words):
+    first, other = written_slice(tmp_path, "1/2", (0, 2)), written_slice(tmp_path, "2/2", (1, 3), **changes)
+    with pytest.raises(DataError, match=words):
+        join_slices([first, other], tmp_path / "joined")

@@ -23,7 +23,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 from yid_ocp.sensors import sensor_reading_function
-from yid_ocp.sensors.imu import _Accelerometer, _Gyroscope
+from yid_ocp.sensors.mounted import _Accelerometer, _Gyroscope
 from yid_ocp.sensors.wrist import _WristForceSensor, _WristTorqueSensor
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build_problem import load_problem

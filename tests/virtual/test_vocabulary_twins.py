@@ -14,7 +14,8 @@ from yid_ocp.diagnosis.diagnose import fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import screen_candidates
-from yid_ocp.effects import make_effect
+from yid_ocp.effects import EffectBase, make_effect
+from yid_ocp.effects.friction import with_sign_smoothing_speed
 from yid_ocp.errors import ModelError
 from yid_ocp.export.models import format_support_by_effect, format_support_by_parameter
 from yid_ocp.integrator.step import compile_step
@@ -45,18 +46,23 @@ def arm(mode: str = "driven") -> System:
     return System.build(Mechanism("arm", joints, frames), damping=0.1, point_frames=(), **{mode: [*POSTURE]})
 
 
-def recorded(effects: list[InjectedEffect], seed: int = 1, duration: float = 1.6) -> Recording:
+def recorded(
+    effects: list[InjectedEffect], seed: int = 1, duration: float = 1.6, friction: list[InjectedEffect] | None = None
+) -> Recording:
     noise = ArmSensorNoise(position_std=5e-5, velocity_std=1e-3, effort_std=0.0)
     simulation = SimulationOptions(duration, time_step=2.5e-4)
     experiment = VirtualExperimentSettings(None, POSTURE, simulation, noise, camera=None, seed=seed)
-    return run_experiment_with_effects(arm(), {}, effects, experiment)
+    return run_experiment_with_effects(arm(), {}, effects, experiment, friction)
 
 
-def fitted(kind: str, place: str, recording: Recording, mode: str) -> dict[str, tuple[float, float]]:
+def fitted(
+    kind: str, place: str, recording: Recording, mode: str, is_compiled: bool = False
+) -> dict[str, tuple[float, float]]:
     """Value and standard deviation of an effect's quantities, fitted beside the dampings."""
     system = arm(mode)
-    effect = make_effect(kind, place, system)
-    step = compile_step(system.with_effects([effect]), 0.01, use_compiler=False)
+    effect = with_sign_smoothing_speed(make_effect(kind, place, system), 0.005)
+    assert isinstance(effect, EffectBase)
+    step = compile_step(system.with_effects([effect]), 0.01, use_compiler=is_compiled)
     free = (*effect.parameters.names, "shoulder.damping", "elbow.damping")
     problem = EstimationProblem(step, [recording], free, ProblemOptions(path_cutoff=20.0))
     found = solve(problem, GaussNewton(max_iterations=25))
@@ -68,6 +74,35 @@ def fitted(kind: str, place: str, recording: Recording, mode: str) -> dict[str, 
 def agrees(found: tuple[float, float], true: float, rel: float = 0.0) -> bool:
     """Within three standard deviations, or a small part of the value that steps of different lengths make."""
     return abs(found[0] - true) <= max(3 * found[1], rel * abs(true))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("joint_coulomb", {"tau_c": 0.6}),
+        pytest.param("joint_stribeck", {"tau_s": 0.6}, marks=pytest.mark.slow),
+        pytest.param("joint_load_friction", {"share": 0.15}, marks=pytest.mark.slow),
+    ],
+)
+def test_friction_that_the_engines_solver_holds_is_found(kind, values) -> None:
+    held = [InjectedEffect(kind, "shoulder", {"v_stribeck": 0.1, **values} if "tau_s" in values else values)]
+    made = recorded([], friction=held)
+    assert made.joints is not None
+    # where it has not broken loose it does not creep
+    assert np.ptp(made.joints.position[made.joints.t < 0.1, 0]) < 4e-4
+    [amplitude] = values
+    assert agrees(fitted(kind, "shoulder", made, "driven", True)[amplitude], values[amplitude], 0.03)
+
+
+def test_what_is_injected_adds_to_ordinary_friction() -> None:
+    parts = [InjectedEffect("joint_coulomb", "shoulder", {"tau_c": size}) for size in (0.2, 0.4)]
+    both, whole = (
+        recorded(parts[1:], friction=parts[:1]),
+        recorded([], friction=[replace(parts[0], values={"tau_c": 0.6})]),
+    )
+    assert both.joints is not None
+    assert whole.joints is not None
+    assert np.array_equal(both.joints.position, whole.joints.position)
 
 
 @pytest.mark.parametrize(

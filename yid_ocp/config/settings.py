@@ -30,6 +30,7 @@ from yid_ocp.planning.joint_paths import PlanOptions
 from yid_ocp.problem.options import ExcessResidualCriteria, ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
+from yid_ocp.virtual.experiment import VirtualArmOptions
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.surface_meshes import ExtraMesh
 
@@ -127,6 +128,15 @@ class JointActuationSettings:
     exclude_links: Annotated[
         _Names, OptionInfo("links of the URDF to exclude with all links on them, such as a hand that is not mounted")
     ] = ()
+    link_mass_std: Annotated[
+        float,
+        Ge(0),
+        Lt(0.3),
+        OptionInfo(
+            "standard deviation of every link's mass and inertia, as a fraction of the URDF's: JOINT.mass_scale is "
+            "estimated beside what is sought; 0: the URDF is exact"
+        ),
+    ] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +151,15 @@ class FrictionLawSettings:
         ),
     ]
     joints: Annotated[_Names | None, OptionInfo("joints of the robot that have it; all that move when absent")] = None
+    sign_smoothing_speed: Annotated[
+        float | None,
+        Gt(0),
+        OptionInfo(
+            "below which Coulomb's and Stribeck's law round off the sign of the speed, so that a loaded joint creeps; "
+            "0.02 when absent, less for joints that stand still under a load",
+            "rad/s",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -466,6 +485,9 @@ class RunSettings:
     diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = DiagnosisSettings()
     track: Annotated[_TrackSettings, OptionInfo("tracking of a camera's frames")] = _TrackSettings()
     plan: Annotated[_PlanSettings, OptionInfo("which motion is planned")] = _PlanSettings()
+    virtual_arm: Annotated[VirtualArmOptions, OptionInfo("what the virtual arms of `blind` are like")] = field(
+        default_factory=VirtualArmOptions
+    )
     output: Annotated[OutputSettings, OptionInfo("where results go")] = OutputSettings()
     name: str = "run"  # stem of the configuration file
     config_file: str = field(default="", compare=False)  # its path, empty for none

@@ -30,6 +30,7 @@ from yid_ocp.virtual.injected import (
     INJECTABLE_EFFECT_KINDS,
     OUT_OF_LIBRARY_FORCE_BUILDERS,
     InjectedEffect,
+    ordinary_friction_range,
     run_experiment_with_effects,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
@@ -58,6 +59,7 @@ class PlannedBlindCase:
     experiment: str
     category: str  # of `BLIND_CASE_CATEGORY_SHARES`
     multiple: float | None  # of the detectable size; None where that has no meaning
+    is_brisk: bool = False  # whether it moves with thrice the acceleration
 
 
 def plan_blind_cases(
@@ -93,7 +95,9 @@ def plan_blind_cases(
         given[name] += 1
         cases.append((name, *(slot if able else ("single", _DETECTABLE_MULTIPLES[1]))))
     order = np.random.default_rng([seed, ALLOWED_ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
-    return [PlannedBlindCase(number, *cases[int(place)]) for number, place in enumerate(order)]
+    # every third clean case, so that each experiment has some
+    brisk = {place for i, place in enumerate(p for p, (_, kind, _) in enumerate(cases) if kind == "null") if i % 3 == 1}
+    return [PlannedBlindCase(number, *cases[int(place)], int(place) in brisk) for number, place in enumerate(order)]
 
 
 def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
@@ -109,6 +113,8 @@ def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
 MAX_CASE_DRAWS = 64
 """Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""
 _STIFFNESS_SPREAD_FACTOR = 1.5  # factor by which true stiffnesses lie above or below the problem's start, at most
+_PRIOR_DEVIATIONS = (0.6, 1.0)  # of a parameter with a prior from its start, over the prior's standard deviation
+_BRISK_FREQUENCY_FACTOR = 1.41  # beside the second harmonic, which together triple the accelerations
 _OUT_OF_LIBRARY_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "torque_ripple": ("joint", 0.5, 2.0, ""),
     "saturating_drive": ("joint", 0.75, 0.9, "torque"),
@@ -183,6 +189,9 @@ class SyntheticMeasurementConditions:
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     simulation: SimulationOptions = field(default_factory=SimulationOptions)  # duration of each, and the engine's step
     has_camera: bool = False  # whether a camera sees the object
+    # that the engine's solver holds at rest, and what is injected with it; None: smooth forces
+    ordinary_friction: Sequence[InjectedEffect] | None = None
+    is_brisk: bool = False
     purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0]  # of `ALLOWED_ENSEMBLE_PURPOSES`
 
 
@@ -236,9 +245,27 @@ class BlindCaseGenerator:
         return np.random.default_rng([self.seed, ALLOWED_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
     def _draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
-        """True values of the free parameters, log-uniform about their start."""
-        start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
-        return {name: float(start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1)) for name in self.problem.free}
+        """True values of the free parameters, log-uniform about their start, and of all ordinary friction.
+
+        Those with a prior lie about as far from their start as it says.
+        """
+        system, priors = self.problem.system, self.problem.options.prior_stds
+        start = dict(zip(system.parameters.names, map(float, self.problem.theta), strict=True))
+        drawn = {name: start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1) for name in self.problem.free}
+        for name in drawn.keys() & priors.keys():
+            drawn[name] = start[name] + priors[name] * rng.uniform(*_PRIOR_DEVIATIONS) * rng.choice([-1.0, 1.0])
+        for effect in self._ordinary_friction:
+            drawn |= {name: start[name] for name in effect.shape_parameter_names}
+            for name in effect.amplitude_names:
+                drawn[name] = rng.uniform(*ordinary_friction_range(effect, system))
+        return {name: float(value) for name, value in drawn.items()}
+
+    @property
+    def _ordinary_friction(self) -> tuple[EffectBase, ...]:
+        """Friction of the nominal model that the other engine has in its own terms."""
+        known = {(effect.kind, effect.location) for effect in self.simulated_system.effects}
+        own = (effect for effect in self.problem.system.effects if isinstance(effect, EffectBase))
+        return tuple(effect for effect in own if (effect.kind, effect.location) not in known)
 
     def simulate_synthetic_recording(
         self,
@@ -246,13 +273,22 @@ class BlindCaseGenerator:
         injected: Sequence[InjectedEffect],
         rng: np.random.Generator,
         name: str,
-        links: int = 1,
+        planned: PlannedBlindCase | None = None,
     ) -> Recording:
         """Simulate one recording with injected effects, without description and ground truth."""
         nominal, posture = self.simulated_system, self.initial_configuration
-        system = nominal if links == 1 or self._finer is None else self._finer(links)
-        values = truth if links == 1 else scale_parameters_to_more_links(nominal, system, truth)
-        made = simulate_random_motion(nominal, system, posture, truth, values, injected, rng, self.conditions)
+        is_finer = planned is not None and planned.category == "finer_chain" and self._finer is not None
+        system = self._finer(2) if is_finer and self._finer is not None else nominal
+        friction = [
+            InjectedEffect(own.kind, own.location, {q.name: truth[f"{own.label}.{q.name}"] for q in own.definitions})
+            for own in self._ordinary_friction
+        ]
+        own = {name: value for name, value in truth.items() if name in nominal.parameters.names}
+        values = scale_parameters_to_more_links(nominal, system, own) if is_finer else own
+        is_held = self.conditions.ordinary_friction is not None
+        conditions = replace(self.conditions, ordinary_friction=tuple(friction) if is_held else None)
+        conditions = replace(conditions, is_brisk=planned is not None and planned.is_brisk)
+        made = simulate_random_motion(nominal, system, posture, own, values, injected, rng, conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
     def _linearize_clean_recordings(self) -> AllCandidatesLinearization:
@@ -306,10 +342,9 @@ class BlindCaseGenerator:
             rng = self._rng(1, wanted.number, attempt)
             truth = self._draw_true_parameters(rng)
             injected, multiple = self._injected(wanted, rng)
-            links = 2 if wanted.category == "finer_chain" else 1
             try:
                 *estimate, held_out = (
-                    self.simulate_synthetic_recording(truth, injected, rng, f"{name}_{purpose}", links)
+                    self.simulate_synthetic_recording(truth, injected, rng, f"{name}_{purpose}", wanted)
                     for purpose in (*purposes, "held_out")
                 )
             except ModelError:
@@ -412,6 +447,10 @@ def simulate_random_motion(
     """Simulate `simulated` at `values` along a random motion planned with the nominal system at `truth`."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
+    if conditions.is_brisk:
+        low, high = (_BRISK_FREQUENCY_FACTOR * edge for edge in excitation.frequency_band)
+        faster = _BRISK_FREQUENCY_FACTOR * excitation.max_joint_speed
+        excitation = replace(excitation, frequency_band=(low, high), max_joint_speed=faster, has_second_harmonic=True)
     seed = int(rng.integers(2**31))
     motion = random_multisine_motion(nominal, truth, seed=seed, initial_joint_angles=posture, excitation=excitation)
     experiment = VirtualExperimentSettings(
@@ -422,7 +461,7 @@ def simulate_random_motion(
         camera=PointCamera() if conditions.has_camera else None,
         seed=int(rng.integers(2**31)),
     )
-    return run_experiment_with_effects(simulated, values, injected, experiment)
+    return run_experiment_with_effects(simulated, values, injected, experiment, conditions.ordinary_friction)
 
 
 def first_recorded_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:

@@ -14,6 +14,7 @@ from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, ReportedParameterValue
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Inertia, merge_bodies, symbolic_rotation_from_rpy
+from yid_ocp.model.parameters import Parameter
 from yid_ocp.model.system import ForceWithDerivativeFactors, MidpointState, StepTerms, System
 
 _MAX_PAYLOAD_DISTANCE = 0.5  # of a payload's mass from its frame [m]
@@ -88,6 +89,18 @@ class _LinkMass(_ScaledBodies):
 
     def _joints(self, system: System) -> tuple[str, ...]:
         return (self.location,)
+
+
+def with_link_mass_parameters(system: System, name: str) -> System:
+    """The system with a factor `JOINT.name` on mass and inertia of every arm link, beside the effect `link_mass`."""
+    tree, text = system.mechanism, "mass and inertia of the link on {} over those of the URDF"
+    factors = {j: Parameter(f"{j}.{name}", 1.0, "1", 0.2, 3.0, text.format(j)) for j in _joints_with_mass(system)}
+    joints = tuple(
+        replace(j, bodies=tuple(b.scaled_by(factors[j.name].symbol) for b in j.bodies)) if j.name in factors else j
+        for j in tree.joints
+    )
+    parameters = system.parameters.with_added(factors.values())
+    return replace(system, mechanism=replace(tree, joints=joints), parameters=parameters)
 
 
 def _moving_frames(system: System) -> tuple[str, ...]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import casadi as ca
 
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
-from yid_ocp.model.system import MidpointState, StepTerms, System
+from yid_ocp.model.system import Effect, MidpointState, StepTerms, System
 
 SIGN_SMOOTHING_SPEED = 0.02
 """v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
@@ -31,11 +32,17 @@ EFFECT_KINDS_BY_FRICTION_LAW: Mapping[FrictionLawName, tuple[str, ...]] = {
 """The ladder of friction laws, each with its effects at a joint in addition to the viscous `JOINT.damping`."""
 
 
+@dataclass(frozen=True)
 class _JointFriction(EffectBase):
     """Friction of an arm joint as a function of its speed."""
 
+    sign_smoothing_speed: float = SIGN_SMOOTHING_SPEED  # v_s [rad/s]
+
     required_excitation = "how fast it moves"
     possible_locations = base.arm_joint_names
+
+    def _sign(self, v: ca.SX) -> ca.SX:
+        return ca.tanh(v / self.sign_smoothing_speed)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         """The torque that works against the speed v."""
@@ -46,6 +53,13 @@ class _JointFriction(EffectBase):
         return StepTerms(
             dissipative_force=base.generalized_force_at_joint(state.system, self.location, -self._friction(v))
         )
+
+
+def with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
+    """A dry friction whose sign is rounded off below another speed [rad/s]; anything else, or None, as it is."""
+    if speed is None or not isinstance(effect, _JointFriction):
+        return effect
+    return replace(effect, sign_smoothing_speed=speed)
 
 
 @EFFECTS.register("joint_viscous")
@@ -71,7 +85,7 @@ class _JointCoulomb(_JointFriction):
     )
 
     def _friction(self, v: ca.SX) -> ca.SX:
-        return self["tau_c"] * ca.tanh(v / SIGN_SMOOTHING_SPEED)
+        return self["tau_c"] * self._sign(v)
 
 
 @EFFECTS.register("joint_stribeck")
@@ -87,7 +101,7 @@ class _JointStribeck(_JointFriction):
     )
 
     def _friction(self, v: ca.SX) -> ca.SX:
-        return self["tau_s"] * ca.exp(-((v / self["v_stribeck"]) ** 2)) * ca.tanh(v / SIGN_SMOOTHING_SPEED)
+        return self["tau_s"] * ca.exp(-((v / self["v_stribeck"]) ** 2)) * self._sign(v)
 
 
 @EFFECTS.register("joint_load_friction")

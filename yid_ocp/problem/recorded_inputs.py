@@ -8,6 +8,7 @@ import numpy as np
 import scipy.interpolate
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
+from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, nearest_name_hint
@@ -20,6 +21,7 @@ from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
+_MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
 
@@ -34,11 +36,12 @@ def mean_step_inputs(
 ) -> Array:
     """Mean input of driven joints in every step, torque [N m] or servo command [rad or m], (steps, nu).
 
-    An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
-    efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
-    their sums, which keeps every mean. Each acts later than recorded by its `delay` (nu,) [s]; with `servos`, those of
-    all driven joints, these follow commands. `where` is the recording's name. `DataError` where a joint is missing, no
-    effort is recorded, or no commands where servos move the arms.
+    An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; a lost sample
+    counts as lying between its neighbours. Through samples of efforts goes a cubic spline, and where means over the
+    recorded intervals are given, the derivative of one through their sums, which keeps every mean. Each acts later than
+    recorded by its `delay` (nu,) [s]; with `servos`, those of all driven joints, these follow commands. `where` is the
+    recording's name. `DataError` where a joint is missing, no effort is recorded, or no commands where servos move the
+    arms.
     """
     if not driven:
         return np.zeros((grid.steps, 0))
@@ -137,9 +140,20 @@ def _courses(
     if joints.effort_sampling_kind_or_default == "sample":
         return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
     if joints.effort_sampling_kind_or_default == "command":
-        return [_held(column, edges) for column in effort.T]
+        times, rows = _with_lost_samples(t, effort)
+        return [_held(column, np.append(times, edges[-1])) for column in rows.T]
     sums = np.vstack([np.zeros((1, len(driven))), np.cumsum(effort * np.diff(edges)[:, None], axis=0)])
     return [scipy.interpolate.CubicSpline(edges, column).derivative() for column in sums.T]
+
+
+def _with_lost_samples(t: Array, values: Array) -> tuple[Array, Array]:
+    """Times and rows of a channel (N, k) with the samples that an even clock left out, on straight lines."""
+    lost = np.rint(np.diff(t) / median_sample_period(t)).astype(int) - 1
+    between = [
+        t[i] + (t[i + 1] - t[i]) * np.arange(1, n + 1) / (n + 1) for i, n in enumerate(lost) if 0 < n <= _MAX_LOST
+    ]
+    times = np.sort(np.concatenate([t, *between]))
+    return times, np.stack([np.interp(times, t, column) for column in values.T], axis=1)
 
 
 def _held(values: Array, edges: Array) -> scipy.interpolate.PPoly:

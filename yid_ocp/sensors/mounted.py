@@ -1,4 +1,4 @@
-"""Common base of sensors mounted on a link's frame. They read vectors along that frame's axes."""
+"""Common base of sensors mounted on a link's frame, which read vectors along its axes, and inertial units."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
+    CHANNEL_KINDS,
     SENSOR_READERS,
+    ChannelSpecification,
     RecordedChannelGroup,
     Sensor,
     SensorData,
@@ -147,3 +149,38 @@ def _with_encoder_noise(
     covariance = spread @ spread.transpose(0, 2, 1) + np.diag(own**2)
     total = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return total, covariance / (total[:, :, None] * total[:, None, :])
+
+
+# -- inertial measurement units ----------------------------------------------------------------------------------------
+
+_XYZ = ("x", "y", "z")
+_ANGULAR_VELOCITY = CHANNEL_KINDS.register("imu.angular_velocity")(
+    ChannelSpecification("imu", "angular_velocity", "rad/s", _XYZ)
+)
+_SPECIFIC_FORCE = CHANNEL_KINDS.register("imu.specific_force")(
+    ChannelSpecification("imu", "specific_force", "m/s^2", _XYZ)
+)
+
+
+@register_mounted_sensor
+class _Gyroscope(MountedSensor):
+    """Angular velocity of a frame against the world."""
+
+    channel = _ANGULAR_VELOCITY
+
+    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+        kinematics = state.kinematics
+        return kinematics.frame_pose(frame).rotation.T @ (kinematics.angular_jacobian(frame) @ state.v)
+
+
+@register_mounted_sensor
+class _Accelerometer(MountedSensor):
+    """Acceleration of a frame's origin minus gravity: 9.81 m/s^2 upwards at rest."""
+
+    channel = _SPECIFIC_FORCE
+
+    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+        kinematics = state.kinematics
+        jacobian = kinematics.position_jacobian(frame)
+        acceleration = jacobian @ state.a + ca.jtimes(jacobian @ state.v, state.q, state.v)
+        return kinematics.frame_pose(frame).rotation.T @ (acceleration - state.system.gravity)

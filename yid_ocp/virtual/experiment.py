@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +19,7 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
+from yid_ocp.options import OptionInfo
 from yid_ocp.virtual.joint_motion import (
     BAXTER_JOINT_NAMES_WITHOUT_SIDE,
     MultisineMotion,
@@ -37,7 +39,9 @@ from yid_ocp.vision.frames import look_at_pose
 _Generators = Mapping[str, np.random.Generator]
 
 # every sensor draws from a stream of its own, so that leaving one out changes no other; the order is part of the seed
-_RANDOM_STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias")
+_RANDOM_STREAMS = (
+    *("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias", "clock"),
+)
 _CAMERA_DIRECTION = np.array([0.93, 0.0, 0.37])  # from the object
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
@@ -72,6 +76,34 @@ class ArmSensorNoise:
     effort_bias_std: float | tuple[float, ...] = 0.0
     point_std: float = 1e-3
     records_effort_std: bool = True
+    position_resolution: float = 0.0  # step of the encoders, which count after the noise; none at zero [rad]
+    lost_fraction: float = 0.0  # of the joints' samples that are not recorded, never the first or last two
+
+
+@dataclass(frozen=True, kw_only=True)
+class VirtualArmOptions:
+    """What the arms of the virtual experiments of `blind` have beyond their description.
+
+    The nominal model knows the law of friction, with free amplitudes, and that the links' masses are uncertain.
+    """
+
+    friction: Annotated[
+        Literal["none", "varied", "coulomb", "stribeck", "load", "load_stribeck"],
+        OptionInfo(
+            "law of the joints' dry friction, which MuJoCo's solver holds at rest; varied: another by experiment"
+        ),
+    ] = "varied"
+    link_mass_deviation: Annotated[
+        float,
+        Ge(0),
+        Le(0.2),
+        OptionInfo("most by which a link's mass is off, as a fraction; at least three fifths of it"),
+    ] = 0.05
+    encoder_counts: Annotated[int, Ge(0), OptionInfo("steps of an encoder per turn; 0: none")] = 16384
+    period_jitter_std: Annotated[
+        float, Ge(0), Le(2e-3), OptionInfo("of the controller's and recorder's ticks", "s")
+    ] = 5e-4
+    lost_fraction: Annotated[float, Ge(0), Le(0.2), OptionInfo("of the joints' samples that are not recorded")] = 0.01
 
 
 @dataclass(frozen=True)
@@ -128,7 +160,8 @@ def run_virtual_experiment(
     if chosen.camera is not None and _held_and_visible_points(system)[1]:
         times = _frame_times(_random_generators(chosen.seed)["frames"], duration, chosen.camera)
     options: dict[str, Any] = {"injected": chosen.injected_terms, "gear_play": chosen.gear_play, "frame_times": times}
-    run = simulate_in_mujoco(system, values, motion, chosen.simulation, initial_joint_angles=posture, **options)
+    simulation = replace(chosen.simulation, jitter_seed=chosen.seed)
+    run = simulate_in_mujoco(system, values, motion, simulation, initial_joint_angles=posture, **options)
     return record_simulation(system, values, chosen, run)
 
 
@@ -170,13 +203,19 @@ def _joints(
     offset = bias * streams["effort_bias"].standard_normal(len(driven))
     position = _noisy(run.q[:, driven], noise.position_std, streams["position"])
     velocity = _noisy(run.v[:, driven], noise.velocity_std, streams["velocity"])
-    joints = JointGroup(tuple(system.driven), run.t, position, velocity=velocity)
+    effort = _noisy(run.effort, 0.0 if system.servos else white, streams["effort"]) + offset
+    kept = np.ones(len(run.t), bool)
+    kept[2:-2] = streams["clock"].random(len(run.t) - 4) >= noise.lost_fraction
+    joints = JointGroup(tuple(system.driven), run.t[kept], position[kept], velocity=velocity[kept])
     joints = replace(joints, position_std=noise.position_std, velocity_std=noise.velocity_std)
+    if noise.position_resolution:
+        counted = noise.position_resolution * np.rint(joints.position / noise.position_resolution)
+        joints = replace(joints, position=counted, position_resolution=noise.position_resolution)
     if system.servos:
-        return replace(joints, position_command=run.effort)
+        return replace(joints, position_command=run.effort[kept])
     stds = (white, bias) if noise.records_effort_std else (None, None)
     joints = replace(joints, effort_std=stds[0], effort_bias_std=stds[1], effort_kind=experiment.simulation.effort_kind)
-    return replace(joints, effort=_noisy(run.effort, white, streams["effort"]) + offset)
+    return replace(joints, effort=effort[kept])
 
 
 def _by_joint(std: float | tuple[float, ...], joints: int, where: str) -> Array:
@@ -226,6 +265,11 @@ def _how_it_was_made(experiment: VirtualExperimentSettings, system: System, seen
         f"joint position {noise.position_std:g} rad, velocity {noise.velocity_std:g} rad/s, "
         f"{efforts}arm points {1e3 * noise.point_std:g} mm{offset}"
     )
+    if noise.position_resolution:
+        made += f"; encoders count in steps of {noise.position_resolution:.3g} rad"
+    if simulation.period_jitter_std or noise.lost_fraction:
+        made += f"; periods vary by {1e3 * simulation.period_jitter_std:g} ms, {noise.lost_fraction:.1%} of the samples"
+        made += " of joints are lost"
     if camera is None or not seen:
         return made + "; no camera."
     return made + f", camera {1e3 * camera.point_std:g} mm at about {camera.frame_rate:g} Hz."

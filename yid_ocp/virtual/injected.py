@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.effects.base import object_joint_names
+from yid_ocp.effects.base import EffectBase, object_joint_names
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error, run_virtual_experiment
@@ -31,6 +31,8 @@ _Values = Mapping[str, float]
 
 _AIR_DENSITY = 1.2  # [kg/m^3]
 _FRICTION_SMOOTHING_SPEED = 0.02  # v_s of dry friction [rad/s]
+_NO_FRICTION = 1e-9  # of a joint before the motion begins: MuJoCo's constraint of it exists from the start [N m]
+_FRICTION_TIME_STEPS = 10  # inner steps that are the time constant of the constraint that holds a joint
 _MAX_PAYLOAD_DISTANCE = 1.0  # of a payload's mass from its frame [m]
 _CREASED_LINK, _CREASE_ANGLE = 1, 0.03  # link before which a tube is creased; angle beyond which it softens [rad]
 _CORD_LENGTH = 0.3  # of a tether [m]
@@ -85,6 +87,26 @@ class _EffectContext:
         """Id of the body at the end of a segment, or of the body on an arm's joint."""
         named = {segment.name: segment.link_joints[-1][-1] for segment in self.system.segment_layouts}
         return int(model.jnt_bodyid[model.joint(named.get(place, place)).id])
+
+
+_ORDINARY_FRICTION: Mapping[str, tuple[float, float]] = {
+    "joint_coulomb": (0.004, 0.016),
+    "joint_stribeck": (0.0008, 0.0032),
+    # the torque through a gear counts what pulls from outside twice: a hundredth of it is 0.4 N m at a shoulder
+    "joint_load_friction": (0.01, 0.04),
+}
+"""Amplitudes of ordinary friction that MuJoCo's solver holds, by kind: over the effort limit, or of themselves."""
+_MAX_RATED_EFFORT = 100.0  # beyond which a limit is no motor's rating [N m]
+
+
+def ordinary_friction_range(effect: EffectBase, system: System) -> tuple[float, float]:
+    """Least and largest amplitude of an ordinary dry friction of a joint, in the amplitude's unit."""
+    low, high = _ORDINARY_FRICTION[effect.kind]
+    if effect.definitions[0].unit == "1":
+        return low, high
+    joint = system.mechanism.joints[system.mechanism.joint_index(effect.location)]
+    rated = min(joint.effort_limit, _MAX_RATED_EFFORT)
+    return low * rated, high * rated
 
 
 _ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]  # of a model, at a place, of a size
@@ -227,6 +249,63 @@ def _slid(size: _Values, s: float, q: float, v: float, step: float) -> float:
     """Friction's share of its largest value after a step."""
     way = math.copysign(1.0, v)
     return way + (s - way) * math.exp(-abs(v) * step / size["yield_angle"])
+
+
+def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[InjectedEffect]) -> _ForceCallback:
+    """Dry friction of joints as MuJoCo's own `frictionloss`, whose size is set anew at every inner step.
+
+    It begins with the motion, and is at most tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|, the load being the
+    motor's torque less that of weights and grasps.
+    """
+    names = list(dict.fromkeys(effect.location for effect in effects))
+    at = np.array([model.joint(name).id for name in names])
+    sizes = {key: np.zeros(len(names)) for key in ("tau_c", "tau_s", "share")}
+    speeds = np.ones(len(names))
+    for effect in effects:
+        for key, value in effect.values.items():
+            if key in sizes:
+                sizes[key][names.index(effect.location)] += value
+            elif key == "v_stribeck":
+                speeds[names.index(effect.location)] = value
+    # as firm as the inner step allows
+    model.dof_frictionloss[at] = _NO_FRICTION
+    model.dof_solref[at, 0], model.dof_solimp[at, :2] = _FRICTION_TIME_STEPS * model.opt.timestep, 0.999
+    load = _gear_load(scene, model, at) if np.any(sizes["share"]) else None
+    apart = int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
+
+    def hold(model: Any, data: Any) -> None:
+        # the controller's own model, whose grasps are off, knows of no friction
+        if model.opt.disableflags & apart or not scene.has_motion_begun:
+            return
+        size = sizes["tau_c"] + sizes["tau_s"] * np.exp(-((data.qvel[at] / speeds) ** 2))
+        if load is not None:
+            size += sizes["share"] * np.abs(load(data))
+        model.dof_frictionloss[at] = np.maximum(size, _NO_FRICTION)
+
+    return hold
+
+
+def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], Array]:
+    """Torque through the gears of some joints [N m]: that of the motor, less that of weights and grasps beyond it."""
+    value, servos, drag = scene.value, scene.system.servos, np.zeros(len(at))
+    for i, joint in enumerate(at):
+        servo = servos.get(model.joint(int(joint)).name)
+        if servo is not None and servo.motor_kind == "dc":  # its counter-voltage is a damper of the joint
+            drag[i] = float(value(servo.damping)[0])
+    body, others = model.jnt_bodyid[at], np.array([model.joint(name).id for name in object_joint_names(scene.system)])
+
+    def load(data: Any) -> Array:
+        reach = data.subtree_com[body] - data.xanchor[at]
+        weight = model.body_subtreemass[body, None] * model.opt.gravity
+        outside = np.einsum("ij,ij->i", data.xaxis[at], np.cross(reach, weight))
+        if data.ne and len(others):
+            # what grasps pull is known from the object's joints, which have no friction
+            rows = data.efc_J.reshape(-1, model.nv)[: data.ne]
+            pull = np.linalg.lstsq(rows[:, others].T, data.qfrc_constraint[others], rcond=None)[0]
+            outside += rows[:, at].T @ pull
+        return np.asarray(data.qfrc_actuator[at] + data.qfrc_applied[at] - drag * data.qvel[at] - outside)
+
+    return load
 
 
 def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
@@ -428,15 +507,19 @@ def run_experiment_with_effects(
     values: Mapping[str, float],
     effects: Sequence[InjectedEffect],
     experiment: VirtualExperimentSettings | None = None,
+    ordinary_friction: Sequence[InjectedEffect] | None = None,
 ) -> Recording:
     """Record a virtual experiment with effects that the system's description lacks.
 
     `system` is nominal, with driven joints; `true_parameters` of the recording are those `values`, and the experiment's
-    own `injected_terms` are replaced. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that
+    own `injected_terms` are replaced. Where there is `ordinary_friction` (effects of the ladder's laws, perhaps none),
+    MuJoCo's solver holds and slides it together with the joint friction among the effects; else these are smooth
+    forces. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that
     is too far off or takes away what is not there, else as `run_virtual_experiment`.
     """
     known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_FORCE_BUILDERS)
-    for effect in effects:
+    known = known if ordinary_friction is None else tuple(dict.fromkeys((*known, *_ORDINARY_FRICTION)))
+    for effect in (*effects, *(ordinary_friction or ())):
         if effect.kind not in known:
             what = f"{effect.kind} cannot be done in MuJoCo here"
             details = unknown_name_error_arguments(effect.kind, known)
@@ -446,7 +529,10 @@ def run_experiment_with_effects(
     # a servo acts on what its encoder reads: gears with play are part of the mechanics
     play = {e.location: e.values["width"] for e in effects if e.kind == "backlash" and e.location in system.servos}
     inner = [e for e in effects if e.kind not in _DESCRIPTION_KINDS and e.kind not in _SENSOR_ERROR_KINDS]
-    injected = _InjectedTerms(changed, values, inner) if inner else None
+    held = [] if ordinary_friction is None else [e for e in inner if e.kind in _ORDINARY_FRICTION]
+    inner = [e for e in inner if e not in held]
+    held += ordinary_friction or ()
+    injected = _InjectedTerms(changed, values, inner, held) if inner or held else None
     chosen = replace(experiment or VirtualExperimentSettings(), injected_terms=injected, gear_play=play)
     made = run_virtual_experiment(changed, values, chosen)
     for effect in effects:
@@ -456,13 +542,24 @@ def run_experiment_with_effects(
 
 
 class _InjectedTerms:
-    """Effects of `_MUJOCO_MODEL_KINDS`, `_FORCES` or `OUT_OF_LIBRARY_FORCE_BUILDERS` as `InjectedSimulatorTerms`."""
+    """Effects of `_MUJOCO_MODEL_KINDS`, `_FORCES` or `OUT_OF_LIBRARY_FORCE_BUILDERS` as `InjectedSimulatorTerms`.
 
-    def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
+    Of `held_frictions`, joint frictions that the engine's solver holds at rest, the amplitudes at a joint add up.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        values: Mapping[str, float],
+        effects: Sequence[InjectedEffect],
+        held_frictions: Sequence[InjectedEffect] = (),
+    ) -> None:
         self._effects, self._forces = tuple(effects), list[_ForceCallback]()
-        self._scene = _EffectContext(system, values)
+        self._scene, self._held_frictions = _EffectContext(system, values), tuple(held_frictions)
 
     def edit_model(self, model: Any) -> None:
+        if self._held_frictions:
+            self._forces.append(_held_friction(self._scene, model, self._held_frictions))
         for effect in self._effects:
             size, place, scene = effect.values, effect.location, self._scene
             if effect.kind == "kelvin_voigt":

@@ -25,6 +25,7 @@ _ELBOW_UP_ANGLES: Mapping[str, float] = {
     for side, sign in (("left", 1.0), ("right", -1.0))
     for joint, value in zip(BAXTER_JOINT_NAMES_WITHOUT_SIDE, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
 }  # of Baxter, where a search begins [rad]: elbow above the hand, the right arm mirrored
+_SECOND_HARMONIC = 0.35  # of the amplitude of the first
 _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
 
@@ -85,6 +86,7 @@ class MultisineOptions:
     shake_torque_rms: float = 0.0
     shake_frequency_band: tuple[float, float] = (4.0, 9.0)  # [Hz]
     max_shake_speed: float = 0.15  # of each of these sines, which light wrists reach first [rad/s]
+    has_second_harmonic: bool = False  # whether every sine has one at twice its frequency
 
 
 def random_multisine_motion(
@@ -105,6 +107,9 @@ def random_multisine_motion(
     shape = len(system.driven), chosen.sines_per_joint
     frequency, phase = _drawn_frequencies(chosen.frequency_band, shape, rng), rng.uniform(0.0, 2 * math.pi, shape)
     amplitude = rng.uniform(0.7, 1.3, shape) / frequency
+    if chosen.has_second_harmonic:
+        amplitude = np.hstack([amplitude, _SECOND_HARMONIC * amplitude])
+        frequency, phase = np.hstack([frequency, 2 * frequency]), np.hstack([phase, 2 * phase])
     motion = MultisineMotion(system.driven, amplitude, frequency, phase, chosen.ramp_time)
     times = np.linspace(0.0, chosen.duration, 251)
     start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles

@@ -62,6 +62,8 @@ class SimulationOptions:
     # at which torques are computed, held in between, a multiple of `sample_rate`, which it is where absent
     controller_rate: float | None = None
     effort_kind: EffortSamplingKind = "command"  # recorded; `command` needs a controller no faster than the recording
+    period_jitter_std: float = 0.0  # of the controller's ticks about an even clock, at most a third of a period [s]
+    jitter_seed: int = 0
 
     def __post_init__(self) -> None:
         controller, periods = self._controller_rate, self.controller_periods_per_sample
@@ -92,6 +94,15 @@ class SimulationOptions:
     @property
     def _steps_per_period(self) -> int:
         return round(1.0 / (self._controller_rate * self.time_step))
+
+    def _tick_steps(self) -> IntArray:
+        """Inner steps before every tick of the controller, shape (ticks + 1,); the first and last are on time."""
+        ticks = round(self.duration * self.sample_rate) * self.controller_periods_per_sample
+        inner = self._steps_per_period
+        late = np.random.default_rng(self.jitter_seed).normal(0.0, self.period_jitter_std / self.time_step, ticks - 1)
+        steps = inner * np.arange(ticks + 1)
+        steps[1:-1] += np.rint(np.clip(late, -inner / 3, inner / 3)).astype(int)
+        return np.asarray(steps)
 
 
 @dataclass(frozen=True)
@@ -351,29 +362,30 @@ def _play(
 ) -> SimulationResult:
     """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
-    steps, periods = round(simulation.duration * simulation.sample_rate), simulation.controller_periods_per_sample
-    inner = simulation._steps_per_period
+    periods, ticks = simulation.controller_periods_per_sample, simulation._tick_steps()
+    steps_per_second = simulation._steps_per_period * periods * simulation.sample_rate
     q, v, torques, points, seen = [], [], [], [], []
-    for tick in range(steps * periods + 1):
+    for tick, done in enumerate(ticks.tolist()):
+        end = done if tick == len(ticks) - 1 else int(ticks[tick + 1])
         mujoco.mj_kinematics(model, data)
-        torques.append(controller.apply_input(tick / (simulation.sample_rate * periods)))
+        torques.append(controller.apply_input(done / steps_per_second))
         if tick % periods == 0:
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])
             points.append(data.site_xpos[scene.point_site_ids])
-        done = tick * inner
-        for frame in frames[(frames >= done) & (frames < done + inner)]:
+        # what is seen at the last tick is seen then, too
+        for frame in frames[(frames >= done) & (frames < max(end, done + 1))]:
             if frame > done:
                 mujoco.mj_step(model, data, nstep=int(frame - done))
                 mujoco.mj_kinematics(model, data)
             seen.append(data.site_xpos[scene.point_site_ids])
             done = int(frame)
-        if tick < steps * periods:
-            mujoco.mj_step(model, data, nstep=(tick + 1) * inner - done)
-    effort = np.array(torques[::periods])
+        if end > done:
+            mujoco.mj_step(model, data, nstep=end - done)
+    effort, weights = np.array(torques[::periods]), np.diff(ticks).reshape(-1, periods, 1)
     if simulation.effort_kind == "mean":
-        effort[:-1] = np.array(torques[:-1]).reshape(steps, periods, -1).mean(1)
-    t = np.arange(steps + 1) / simulation.sample_rate
+        effort[:-1] = (weights * np.array(torques[:-1]).reshape(*weights.shape[:2], -1)).sum(1) / weights.sum(1)
+    t = ticks[::periods] / steps_per_second
     frame_times = simulation.time_step * frames[: len(seen)].astype(float)
     frame_points = np.array(seen).reshape(len(seen), len(scene.point_site_ids), 3)
     return SimulationResult(t, np.array(q), np.array(v), effort, np.array(points), frame_times, frame_points)

@@ -26,25 +26,23 @@ from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_decision_statistics
 from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
-from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
+from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
-from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
-from yid_ocp.report.html import write_report
-from yid_ocp.report.png_figures import draw_blind_results
-from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions, package_source_hash
-from yid_ocp.virtual.experiment import ArmSensorNoise
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmOptions
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
+from yid_ocp.workflow.blind_slices import join_slices, rescore_blind, score_slices, write_slice
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
-from yid_ocp.workflow.run_folder import local_time_text
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
 """Standard deviations of the torques' white noise and constant offsets where an experiment has any [N m]."""
+_SIGN_SMOOTHING_SPEED = 0.005  # of the nominal friction; with 0.02 arms creep by mm before they break loose [rad/s]
 _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": {"closure": None}}
 log = logging.getLogger(__name__)
 
@@ -55,6 +53,9 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         folder, target = arguments.rescore, arguments.out or Path(arguments.rescore) / "rescored"
         again = functools.partial(rescore_blind, folder, target, arguments.overrides)
         return run_command_and_print(arguments, again)
+    if arguments.join:
+        together = functools.partial(join_slices, arguments.join, arguments.out or "joined-slices")
+        return run_command_and_print(arguments, together)
     runs = [
         load_config(path, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
         for path in arguments.configs or [None]
@@ -64,8 +65,16 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     purpose = blind.ALLOWED_ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
-    asked = (runs, out, arguments.cases, arguments.seed)
-    return run_command_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose))
+    asked, part = (runs, out, arguments.cases, arguments.seed), _slice_numbers(arguments.slice)
+    return run_command_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose, part))
+
+
+def _slice_numbers(text: str) -> tuple[int, int]:
+    """K and N of `K/N`; `ConfigError` of anything else."""
+    own, _, of = text.partition("/")
+    if not (own.isdigit() and of.isdigit() and 1 <= int(own) <= int(of)):
+        raise ConfigError(f"'{text}' is no slice", where="--slice", allowed="K/N, K from 1 to N")
+    return int(own), int(of)
 
 
 def run_blind(
@@ -76,17 +85,20 @@ def run_blind(
     progress: Progress = NULL_PROGRESS,
     workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
     purpose: str = blind.ALLOWED_ENSEMBLE_PURPOSES[0],
+    part: tuple[int, int] = (1, 1),
 ) -> CommandOutcome[None]:
     """Run a blind validation of the diagnosis in several processes. Finished parts in the folder are reused.
 
     Models, postures and sensors are those of the runs' first recordings, varied (`EXPERIMENT_VARIATIONS`) as far as
     there are cases for it; the same seed draws other cases for each purpose, 'report' and 'calibration'.
+    Of `part` (K, N) every N-th case is made and diagnosed, in a folder `slice-K-of-N` of its own.
 
     The folder holds `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
     `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the sources
-    that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then `result.json`
-    (`yid-blind/1`), `table.md` and pictures; of an ensemble to calibrate by `thresholds.json` (`yid-calibration/1`).
-    `OutputError` where the folder holds another ensemble.
+    that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then `slice.json`
+    (`yid-blind-slice/1`: labels and answers with their hashes, for `join_slices`), `result.json` (`yid-blind/1`),
+    `table.md` and pictures; of an ensemble to calibrate by `thresholds.json` (`yid-calibration/1`). `OutputError` where
+    the folder holds another ensemble.
     """
     if count < 1:
         raise runs[0].config_error(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
@@ -99,10 +111,10 @@ def run_blind(
         if name in names[:i]:
             what, hint = f"two configurations are called {name}", "give each a name of its own"
             raise ConfigError(what, where="blind", hint=hint)
-    proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers)
+    proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers, part)
     try:
         commitment, cases = proof.commit()
-        progress.begin_stage(f"diagnosing {count} cases")
+        progress.begin_stage(f"diagnosing {len(cases)} cases")
         answers = proof.done(_diagnose_case_from_recordings_task, cases, "answers")
         sealed = read_input_text(proof.folder / "sealed/labels.json")
         labels = blind.open_sealed_labels(sealed, commitment["sha256"])
@@ -111,91 +123,22 @@ def run_blind(
     except KeyboardInterrupt:
         log.warning("finished cases are in %s; the same command resumes with the others", proof.folder)
         raise
-    marks = [
-        blind_scores.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
-        for label, found in zip(labels, answers, strict=True)
-    ]
-    flags = [
-        "--cases",
-        count,
-        "--seed",
-        seed,
-        *(["--calibration"] if purpose == blind.ALLOWED_ENSEMBLE_PURPOSES[1] else []),
-    ]
-    result = blind_scores.detection_and_false_alarm_rates(marks) | {
-        "seed": seed,
-        "purpose": purpose,
+    flags = ["--cases", count, "--seed", seed]
+    flags += ["--calibration"] if purpose == blind.ALLOWED_ENSEMBLE_PURPOSES[1] else []
+    found = {
+        **{key: commitment[key] for key in ("slice", "cases", "seed", "purpose", "configs")},
         "code": package_source_hash(),
         "code_of_cases": commitment["code"],
+        "labels_sha256": commitment["sha256"],
         "command": shlex.join(["yid-ocp", "blind", *map(str, map(proof.config_file, names)), *map(str, flags)]),
-        "date": local_time_text(),
         "versions": installed_versions(),
         "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
         "variations": {name: varied.description for name, varied in EXPERIMENT_VARIATIONS.items()},
+        "labels": json.loads(sealed),
+        "answers": answers,
+        "best": best,
     }
-    if purpose == blind.ALLOWED_ENSEMBLE_PURPOSES[1]:
-        found = blind_scores.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
-        result["calibration_of_thresholds"] = found
-        made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
-        write_strict_json(proof.folder / "thresholds.json", to_json_types(found | made))
-    folder = proof.folder
-    written = _write_result(folder, result)
-    if all(entry.output.write_report for entry in runs):
-        progress.begin_stage("writing the report")
-        said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
-        write_report(folder / "report.html", ReportData(folder.name, said, written))
-    return CommandOutcome(folder, written, None)
-
-
-def _write_result(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
-    """Write `result.json`, `table.md` and the pictures; return what was written."""
-    written: dict[str, Any] = to_json_types(result)
-    write_strict_json(folder / "result.json", written)
-    write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
-    draw_blind_results(folder, written)
-    return written
-
-
-def rescore_blind(
-    folder: str | Path, out: str | Path, overrides: Sequence[str] = (), progress: Progress = NULL_PROGRESS
-) -> CommandOutcome[None]:
-    """Judge finished cases of a blind validation again by present rules and other thresholds, without a refit.
-
-    `out` gets `result.json` (`yid-blind/1`), with `rescored`: the cases whose verdict or effects differ from what was
-    said, and how many are `not_judged`, because these thresholds ask for a refit that the diagnosis did not make.
-    """
-    made, target = Path(folder), make_folder(out)
-    commitment = read_input_json(made / "commitment.json")
-    labels = {}
-    for label in blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"]):
-        labels[label.case] = label
-    wanted = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
-    names = [text.partition("=")[0].removeprefix("diagnosis.") for text in overrides]
-    changes = {name: getattr(wanted, name) for name in names if hasattr(wanted, name)}
-    marks, changed = [], []
-    answers, best = _stored_values(made / "answers"), _stored_values(made / "best")
-    progress.begin_stage(f"judging {len(answers)} of {commitment['cases']} cases")
-    for case, found in sorted(answers.items()):
-        label, then, now = labels[case], found["result"], found["result"]
-        if found.get("evidence") is not None:
-            now = blind_scores.judge_recorded_case(found["evidence"], changes)
-        shares = (math.nan if best.get(case) is None else float(best[case]), float(found["seconds"]))
-        before, mark = (blind_scores.score_blind_case(label, told, *shares) for told in (then, now))
-        marks.append(mark)
-        if (before.verdict, before.answer, before.confusable) != (mark.verdict, mark.answer, mark.confusable):
-            told = {"case": case, "truth": mark.truth, "then": f"{before.verdict} {before.answer}"}
-            changed.append({**told, "now": f"{mark.verdict} {mark.answer}", "right": [before.right, mark.right]})
-    kept = {key: commitment[key] for key in ("seed", "purpose")}
-    rescored = {"settings": list(overrides), "changed": changed, "of": str(made)}
-    result = blind_scores.detection_and_false_alarm_rates(marks) | {**kept, "rescored": rescored}
-    return CommandOutcome(target, _write_result(target, result | {"code": package_source_hash()}), None)
-
-
-def _stored_values(folder: Path) -> dict[str, Any]:
-    """Results of a folder's tasks by their names, from any version of the package."""
-    files = sorted(folder.glob("*.json"), key=lambda file: file.stat().st_mtime)
-    entries = [read_input_json(file) for file in files if not file.name.endswith(".error.json")]
-    return {str(entry["name"]): entry["value"] for entry in entries}
+    return score_slices([write_slice(found, proof.folder)], proof.folder, runs, progress)
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------
@@ -205,13 +148,20 @@ def _stored_values(folder: Path) -> dict[str, Any]:
 class _Proof:
     """Settings of a blind validation, its folder and its workers."""
 
-    folder: Path
+    whole: Path  # folder of the ensemble, of all its slices
     runs: Sequence[RunSettings]
     count: int
     seed: int
     purpose: str
     progress: Progress
     workers: WorkerConfig | Executor
+    part: tuple[int, int]  # K and N of slice K/N
+
+    @property
+    def folder(self) -> Path:
+        """Folder of this slice."""
+        own, of = self.part
+        return self.whole if of == 1 else self.whole / f"slice-{own}-of-{of}"
 
     def config_file(self, name: str) -> Path:
         return self.folder / "configs" / f"{name}.yaml"
@@ -224,6 +174,7 @@ class _Proof:
             self._draw(file, configs)
         said = read_input_json(file)
         asked = {"cases": self.count, "seed": self.seed, "purpose": self.purpose, "configs": configs}
+        asked["slice"] = "/".join(map(str, self.part))
         if {key: said[key] for key in asked} != asked:
             holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
             hint = "choose another folder, or the same configurations, --cases, --seed and --calibration"
@@ -234,12 +185,12 @@ class _Proof:
             experiment = _BlindExperiment(self.config_file(config), variation, self.seed, self.purpose)
             recordings = [self.folder / "cases" / name for name in (*entry["estimate"], entry["held_out"])]
             own = {"name": str(entry["name"]), "recordings": recordings, "without": entry["without"]}
-            own |= {"experiment": vars(experiment), "first": self.folder / "prepared" / f"{entry['experiment']}.h5"}
+            own |= {"experiment": vars(experiment), "first": self.whole / "prepared" / f"{entry['experiment']}.h5"}
             tasks.append(Task(own["name"], own))
         return said, tasks
 
     def _draw(self, commitment: Path, configs: Mapping[str, str]) -> None:
-        cases, prepared = self.folder / "cases", self.folder / "prepared"
+        cases, prepared = self.folder / "cases", self.whole / "prepared"
         try:
             for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
                 part.mkdir(parents=True, exist_ok=True)
@@ -250,13 +201,18 @@ class _Proof:
         files = {name: self.config_file(name) for name in configs}
         experiments, chains = _blind_experiments_and_refinable_subset(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
-        plan = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
+        own, of = self.part
+        whole = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
+        plan = [entry for entry in whole if entry.number % of == own - 1]
+        if not plan:
+            what, allowed = f"slice {own}/{of} of {self.count} cases is empty", f"at most {self.count} slices"
+            raise ConfigError(what, where="--slice", allowed=allowed)
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
         self.progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
         told = {name: {"experiment": vars(experiments[name])} for name in used}
         tasks = [Task(name, {**told[name], "folder": str(prepared), "name": name}) for name in used]
-        self.done(_prepare_experiment, tasks, "prepared/tasks")
-        self.progress.begin_stage(f"making {self.count} cases")
+        self.done(_prepare_experiment, tasks, prepared / "tasks")
+        self.progress.begin_stage(f"making {len(plan)} cases")
         tasks = []
         for entry in plan:
             name = entry.experiment
@@ -267,6 +223,7 @@ class _Proof:
         write_text(self.folder / "sealed/labels.json", text)
         write_strict_json(cases / "cases.json", [entry["case"] for entry in made])
         said = {"sha256": digest, "cases": self.count, "seed": self.seed, "purpose": self.purpose}
+        said["slice"] = f"{own}/{of}"
         write_strict_json(commitment, said | {"configs": dict(configs), "code": package_source_hash()})
 
     def best_closures(
@@ -282,8 +239,8 @@ class _Proof:
         best = self.done(_true_effect_closure, tasks, "best")
         return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
-    def done(self, function: Callable[..., Any], tasks: Sequence[Task], results: str) -> list[Any]:
-        """Results of a function for each task; one experiment after the other, so that a worker builds each once."""
+    def done(self, function: Callable[..., Any], tasks: Sequence[Task], results: str | Path) -> list[Any]:
+        """What a function finds for each task; one experiment after the other, so that a worker builds each once."""
         order = sorted(range(len(tasks)), key=lambda i: str(tasks[i].arguments["experiment"]))
         folder, report = self.folder / results, self.progress.report_parts_done
         found = run_tasks(function, [tasks[i] for i in order], folder, self.workers, report)
@@ -385,29 +342,41 @@ class _ExperimentVariation:
     n_recordings: int = 1
     is_without_object: bool = False
     has_prescribed_arms: bool = False
+    friction: FrictionLawName = "coulomb"  # where the settings vary the law
 
-    def simulation_overrides(self) -> tuple[str, ...]:
+    def simulation_overrides(self, arm: VirtualArmOptions) -> tuple[str, ...]:
         # what is said of the object and of what sees it means nothing without it
         bare = ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
-        return bare if self.is_without_object else ()
+        own = (f"model.arms.link_mass_std={arm.link_mass_deviation}", *(bare if self.is_without_object else ()))
+        return own if arm.friction == "none" else (*own, "model.friction=null")
 
-    def diagnosis_overrides(self, driven: Sequence[str]) -> list[str]:
-        own = list(self.simulation_overrides())
+    def diagnosis_overrides(self, driven: Sequence[str], arm: VirtualArmOptions) -> list[str]:
+        own = [text for text in self.simulation_overrides(arm) if text != "model.friction=null"]
+        if arm.friction != "none":
+            law = self.friction if arm.friction == "varied" else arm.friction
+            # as these joints stand still at the start, and again at every turn
+            own.append(f"model.friction={{law: {law}, sign_smoothing_speed: {_SIGN_SMOOTHING_SPEED}}}")
+            own += ['parameters={"*.v_stribeck": {free: false}}'] if "stribeck" in law else []
         if self.is_without_object:
             free = {f"{name}.damping": {"free": True, "bounds": [0.0, 50.0]} for name in driven}
             own += [f"parameters={json.dumps(free)}", "diagnosis.candidates=all"]
         return own + (["model.arms.mode=prescribed"] if self.has_prescribed_arms else [])
 
 
-_BARE = {"has_torque_noise": True, "is_without_object": True}
 EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
     "as_configured": _ExperimentVariation(0.4, "as the configuration has it, torques exact"),
-    "torque_noise": _ExperimentVariation(0.2, "torques with noise and offsets", has_torque_noise=True),
-    "several_recordings": _ExperimentVariation(0.1, "three recordings to estimate on", n_recordings=3),
+    "torque_noise": _ExperimentVariation(
+        0.2, "torques with noise and offsets", has_torque_noise=True, friction="stribeck"
+    ),
+    "several_recordings": _ExperimentVariation(0.1, "three recordings to estimate on", n_recordings=3, friction="load"),
     "finer_integration": _ExperimentVariation(0.1, "the other engine's step halved", time_step_factor=0.5),
-    "bare_arm": _ExperimentVariation(0.1, "the arms alone, driven", **_BARE),
+    "bare_arm": _ExperimentVariation(0.1, "the arms alone, driven", has_torque_noise=True, is_without_object=True),
     "bare_arm_efforts": _ExperimentVariation(
-        0.1, "the arms alone, moved as measured", **_BARE, has_prescribed_arms=True
+        0.1,
+        "the arms alone, moved as measured",
+        has_torque_noise=True,
+        is_without_object=True,
+        has_prescribed_arms=True,
     ),
 }
 """By name; an experiment is `CONFIGURATION.VARIATION`."""
@@ -424,15 +393,29 @@ class _BlindExperiment:
 
     def simulation_settings(self) -> RunSettings:
         """Settings of the model that simulates the recordings."""
-        return load_config(self.config_file, EXPERIMENT_VARIATIONS[self.variation].simulation_overrides())
+        overrides = EXPERIMENT_VARIATIONS[self.variation].simulation_overrides(self._virtual_arm)
+        return load_config(self.config_file, overrides)
+
+    @property
+    def _virtual_arm(self) -> VirtualArmOptions:
+        return load_config(self.config_file).virtual_arm
 
     def _recording_conditions(self) -> blind.SyntheticMeasurementConditions:
         varied = EXPERIMENT_VARIATIONS[self.variation]
-        noise = ArmSensorNoise()
+        arm, step = self._virtual_arm, DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor
+        noise = ArmSensorNoise(
+            position_resolution=2 * math.pi / arm.encoder_counts if arm.encoder_counts else 0.0,
+            lost_fraction=arm.lost_fraction,
+        )
         if varied.has_torque_noise:
-            noise = ArmSensorNoise(effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)
-        simulation = SimulationOptions(time_step=DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor)
-        return blind.SyntheticMeasurementConditions(varied.n_recordings, noise, simulation, purpose=self.purpose)
+            noise = replace(noise, effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)
+        return blind.SyntheticMeasurementConditions(
+            varied.n_recordings,
+            noise,
+            SimulationOptions(time_step=step, period_jitter_std=arm.period_jitter_std),
+            purpose=self.purpose,
+            ordinary_friction=None if arm.friction == "none" else (),
+        )
 
     def _write_first_recording(self, file: Path) -> None:
         """Write the first recording, which fixes initial configuration and sensors."""
@@ -469,7 +452,8 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)
     begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]", "diagnosis.budget=null")
-    run = load_config(experiment.config_file, (*varied.diagnosis_overrides(simulated.driven), *begun))
+    overrides = varied.diagnosis_overrides(simulated.driven, simulated_run.virtual_arm)
+    run = load_config(experiment.config_file, (*overrides, *begun))
     ensemble = blind.BlindCaseGenerator(
         build_problem(run),
         experiment.seed,

@@ -17,7 +17,8 @@ from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
+from yid_ocp.effects.bodies import with_link_mass_parameters
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, with_sign_smoothing_speed
 from yid_ocp.effects.law import make_law, read_law_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
@@ -35,6 +36,7 @@ from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_rec
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
+_LINK_MASS_PARAMETER = "mass_scale"  # of a joint: factor on mass and inertia of the link that it moves
 _AXES = "xyz"
 _PRESET_RELATIVE_STD = 0.25  # of published motor constants, which move by 10 to 40 % from one friction law to another
 _OTHER_SIDE = {"left": "right", "right": "left"}
@@ -179,12 +181,15 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
-    """The system with the effects and the parameters' values of the settings."""
+    """The system with links of uncertain mass, the effects and the parameters' values of the settings."""
+    if run.model.arms.link_mass_std > 0:
+        system = with_link_mass_parameters(system, _LINK_MASS_PARAMETER)
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
     for joint in friction_joints(run, system):
         assert run.model.friction is not None
-        kinds = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law]
-        system = system.with_effects([make_effect(k, joint, system) for k in kinds if f"{k}@{joint}" not in named])
+        kinds, speed = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law], run.model.friction.sign_smoothing_speed
+        made = [make_effect(kind, joint, system) for kind in kinds if f"{kind}@{joint}" not in named]
+        system = system.with_effects([with_sign_smoothing_speed(effect, speed) for effect in made])
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
             system = system.with_effects([_stated_effect(said, system)])
@@ -247,8 +252,8 @@ def _matches(name: str, key: str) -> bool:
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """Settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
-    Before them go those of the sections `model.friction` and `model.arms.servo.motor`. `ConfigError` for a name or
-    pattern that matches nothing.
+    Before them go those of `model.friction`, `model.arms.servo.motor` and `model.arms.link_mass_std`. `ConfigError` for
+    a name or pattern that matches nothing.
     """
     sections = _section_parameter_settings(run, parameters)
     result = dict(sections)
@@ -281,6 +286,7 @@ def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[s
         return []
     wanted = run.model.friction.joints
     arms = {name.rpartition(".")[0] for name in parameters.names if name.endswith(".damping")}
+    arms = {name for name in arms if parameters[f"{name}.damping"].description.endswith(f"of {name}")}  # no segments
     joints = arms if wanted is None else arms & set(wanted)
     starts = tuple(
         f"{kind}@{joint}." for kind in EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law] for joint in joints
@@ -290,7 +296,7 @@ def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[s
 
 
 def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
-    """Settings of parameters that sections of the model imply: friction free, motors with values and priors."""
+    """Settings of parameters that sections of the model imply: friction free, motors and link masses with priors."""
     found: dict[str, ParameterSettings] = {}
     friction, motor = run.model.friction, run.model.arms.servo.motor
     values: dict[str, float] = {}
@@ -312,6 +318,9 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
                 }
     for name in friction_parameter_names(run, parameters):
         found[name] = ParameterSettings(free=True, initial=values.get(name))
+    if run.model.arms.link_mass_std > 0:
+        masses = [name for name in parameters.names if name.endswith(f".{_LINK_MASS_PARAMETER}")]
+        found |= dict.fromkeys(masses, ParameterSettings(free=True, prior_std=run.model.arms.link_mass_std))
     return found
 
 

@@ -1,0 +1,168 @@
+"""Slices of a blind validation: written with their hashes, joined where these agree, scored, judged again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.settings import RunSettings
+from yid_ocp.diagnosis import blind, blind_scores
+from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.errors import DataError
+from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
+from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
+from yid_ocp.report.html import write_report
+from yid_ocp.report.png_figures import draw_blind_results
+from yid_ocp.report.sections import ReportData
+from yid_ocp.version import package_source_hash
+from yid_ocp.workflow.command_runner import CommandOutcome
+from yid_ocp.workflow.run_folder import local_time_text
+
+_SLICE_FORMAT = "yid-blind-slice/1"
+
+
+def write_slice(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Write `slice.json`, labels and answers with the hash of their ensemble; return what was written."""
+    written: dict[str, Any] = to_json_types({"format": _SLICE_FORMAT, **found})
+    written["ensemble_sha256"] = _ensemble_sha256(written)
+    write_strict_json(folder / "slice.json", written)
+    return written
+
+
+def _ensemble_sha256(part: Mapping[str, Any]) -> str:
+    """Hash of what slices of one ensemble have in common: plan, settings, seed, sources and number of slices."""
+    common = [part[key] for key in ("cases", "seed", "purpose", "configs", "code", "code_of_cases")]
+    text = json.dumps([*common, str(part["slice"]).partition("/")[2]], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def join_slices(
+    files: Sequence[str | Path], out: str | Path, progress: Progress = NULL_PROGRESS
+) -> CommandOutcome[None]:
+    """Score slices of one ensemble together, from their files `slice.json` or folders that hold one.
+
+    `out` gets what the folder of a whole ensemble holds without recordings, so that it can be judged again.
+    `DataError` of a slice of another ensemble, of one that is given twice, and of labels that were changed.
+    """
+    found: list[dict[str, Any]] = []
+    for file in files:
+        path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
+        part = read_input_json(path)
+        if part.get("format") != _SLICE_FORMAT:
+            raise DataError("this is no slice of an ensemble", where=str(path), allowed=f"a file {_SLICE_FORMAT}")
+        _, digest = blind.labels_json_and_sha256(_labels(part))
+        if digest != part["labels_sha256"] or _ensemble_sha256(part) != part["ensemble_sha256"]:
+            raise DataError("labels or settings are not those that were committed to", where=str(path))
+        if found and part["ensemble_sha256"] != found[0]["ensemble_sha256"]:
+            what, hint = "the slice is of another ensemble", "slices count together that have one ensemble_sha256"
+            raise DataError(what, where=str(path), allowed=str(found[0]["ensemble_sha256"]), hint=hint)
+        if part["slice"] in [own["slice"] for own in found]:
+            raise DataError(f"slice {part['slice']} is given twice", where=str(path), hint="leave one of them out")
+        found.append(part)
+    folder, first = make_folder(out), found[0]
+    for name in ("configs", "sealed", "answers", "best"):
+        make_folder(folder / name)
+    for name, config in first["configs"].items():
+        write_text(folder / "configs" / f"{name}.yaml", config)
+    text, digest = blind.labels_json_and_sha256([label for part in found for label in _labels(part)])
+    write_text(folder / "sealed/labels.json", text)
+    told = {key: first[key] for key in ("cases", "seed", "purpose", "configs")} | {"code": first["code_of_cases"]}
+    write_strict_json(folder / "commitment.json", {**told, "sha256": digest, "slice": "joined"})
+    for part in found:
+        cases = [label["case"] for label in part["labels"]]
+        for name, values in (("answers", dict(zip(cases, part["answers"], strict=True))), ("best", part["best"])):
+            for case, value in values.items():
+                write_strict_json(folder / name / f"{case}.json", {"name": case, "value": value})
+    runs = [load_config(folder / "configs" / f"{name}.yaml") for name in first["configs"]]
+    return score_slices(found, folder, runs, progress)
+
+
+def _labels(part: Mapping[str, Any]) -> list[blind.CaseGroundTruth]:
+    return [blind.CaseGroundTruth.from_dict(own) for own in part["labels"]]
+
+
+def score_slices(
+    parts: Sequence[Mapping[str, Any]], folder: Path, runs: Sequence[RunSettings], progress: Progress
+) -> CommandOutcome[None]:
+    """Score the answers of slices of one ensemble against their labels and write the result."""
+    first, pairs = parts[0], [pair for part in parts for pair in zip(_labels(part), part["answers"], strict=True)]
+    best = {case: value for part in parts for case, value in part["best"].items()}
+    pairs.sort(key=lambda pair: pair[0].case)
+    labels, answers = [label for label, _ in pairs], [found for _, found in pairs]
+    marks = [
+        blind_scores.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
+        for label, found in pairs
+    ]
+    own = "seed", "purpose", "code", "code_of_cases", "command", "versions", "candidates", "variations"
+    result = blind_scores.detection_and_false_alarm_rates(marks) | {
+        **{key: first[key] for key in (*own, "ensemble_sha256")},
+        "slices": [part["slice"] for part in parts],
+        "date": local_time_text(),
+    }
+    if first["purpose"] == blind.ALLOWED_ENSEMBLE_PURPOSES[1]:
+        found = blind_scores.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
+        result["calibration_of_thresholds"] = found
+        made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
+        write_strict_json(folder / "thresholds.json", to_json_types(found | made))
+    written = _write_result(folder, result)
+    if all(entry.output.write_report for entry in runs):
+        progress.begin_stage("writing the report")
+        said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
+        write_report(folder / "report.html", ReportData(folder.name, said, written))
+    return CommandOutcome(folder, written, None)
+
+
+def _write_result(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
+    """Write `result.json`, `table.md` and the pictures; return what was written."""
+    written: dict[str, Any] = to_json_types(result)
+    write_strict_json(folder / "result.json", written)
+    write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
+    draw_blind_results(folder, written)
+    return written
+
+
+def rescore_blind(
+    folder: str | Path, out: str | Path, overrides: Sequence[str] = (), progress: Progress = NULL_PROGRESS
+) -> CommandOutcome[None]:
+    """Judge finished cases of a blind validation again by present rules and other thresholds, without a refit.
+
+    `out` gets `result.json` (`yid-blind/1`), with `rescored`: the cases whose verdict or effects differ from what was
+    said, and how many are `not_judged`, because these thresholds ask for a refit that the diagnosis did not make.
+    """
+    made, target = Path(folder), make_folder(out)
+    commitment = read_input_json(made / "commitment.json")
+    labels = {}
+    for label in blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"]):
+        labels[label.case] = label
+    wanted = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
+    names = [text.partition("=")[0].removeprefix("diagnosis.") for text in overrides]
+    changes = {name: getattr(wanted, name) for name in names if hasattr(wanted, name)}
+    marks, changed = [], []
+    answers, best = _stored_values(made / "answers"), _stored_values(made / "best")
+    progress.begin_stage(f"judging {len(answers)} of {commitment['cases']} cases")
+    for case, found in sorted(answers.items()):
+        label, then, now = labels[case], found["result"], found["result"]
+        if found.get("evidence") is not None:
+            now = blind_scores.judge_recorded_case(found["evidence"], changes)
+        shares = (math.nan if best.get(case) is None else float(best[case]), float(found["seconds"]))
+        before, mark = (blind_scores.score_blind_case(label, told, *shares) for told in (then, now))
+        marks.append(mark)
+        if (before.verdict, before.answer, before.confusable) != (mark.verdict, mark.answer, mark.confusable):
+            told = {"case": case, "truth": mark.truth, "then": f"{before.verdict} {before.answer}"}
+            changed.append({**told, "now": f"{mark.verdict} {mark.answer}", "right": [before.right, mark.right]})
+    kept = {key: commitment[key] for key in ("seed", "purpose")}
+    rescored = {"settings": list(overrides), "changed": changed, "of": str(made)}
+    result = blind_scores.detection_and_false_alarm_rates(marks) | {**kept, "rescored": rescored}
+    return CommandOutcome(target, _write_result(target, result | {"code": package_source_hash()}), None)
+
+
+def _stored_values(folder: Path) -> dict[str, Any]:
+    """Results of a folder's tasks by their names, from any version of the package."""
+    files = sorted(folder.glob("*.json"), key=lambda file: file.stat().st_mtime)
+    entries = [read_input_json(file) for file in files if not file.name.endswith(".error.json")]
+    return {str(entry["name"]): entry["value"] for entry in entries}
