@@ -151,7 +151,7 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
         (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "joint 'shoulder' has no value"),
         (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "noise level of the motor currents"),
         (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder'"),
-        (replace(KNOWN, use=False), {}, "no measurement that the model could be compared with"),
+        (replace(KNOWN, use=False), {}, "no measurement of the model"),
     ],
 )
 def test_currents_that_cannot_be_compared_are_refused(step, made, options, changes, message):
