@@ -18,11 +18,16 @@ from yid_ocp.errors import DataError
 DEFINITIONS = {
     "franka_msgs/msg/FrankaState": (
         "std_msgs/Header header\nfloat64[7] q\nfloat64[7] dq\nfloat64[7] q_d\nfloat64[7] tau_J\n"
-        "float64[7] tau_ext_hat_filtered\nfloat64[6] O_F_ext_hat_K"
+        "float64[7] tau_ext_hat_filtered\nfloat64[6] O_F_ext_hat_K\nfloat64[6] K_F_ext_hat_K"
     ),
     "franka_msgs/msg/FrankaRobotState": (
         "std_msgs/Header header\nsensor_msgs/JointState measured_joint_state\n"
-        "sensor_msgs/JointState desired_joint_state\nsensor_msgs/JointState tau_ext_hat_filtered"
+        "sensor_msgs/JointState desired_joint_state\nsensor_msgs/JointState tau_ext_hat_filtered\n"
+        "geometry_msgs/WrenchStamped k_f_ext_hat_k"
+    ),
+    "ur_msgs/msg/RobotStateRTMsg": (
+        "float64 time\nfloat64[] q_target\nfloat64[] m_target\nfloat64[] q_actual\nfloat64[] qd_actual\n"
+        "float64[] i_actual"
     ),
     "control_msgs/msg/InterfaceValue": "string[] interface_names\nfloat64[] values",
     "control_msgs/msg/DynamicJointState": (
@@ -49,11 +54,18 @@ def fields_of(bag: Bag, kind: str, k: int) -> dict[str, Any]:
     q, one, header = 0.01 * k + 0.1 * ANGLES, np.ones(7), bag.header(START + k * SECOND // 100)
     if kind == "franka_msgs/msg/FrankaState":
         own = {"q": q, "dq": 2 * one, "q_d": q + 0.5, "tau_J": 3 * one, "tau_ext_hat_filtered": 4 * one}
-        return {"header": header, **own, "O_F_ext_hat_K": np.zeros(6)}
+        return {"header": header, **own, "O_F_ext_hat_K": np.zeros(6), "K_F_ext_hat_K": np.arange(6.0) + k}
+    if kind == "ur_msgs/msg/RobotStateRTMsg":
+        own = {"q_target": q[:6] + 0.5, "m_target": one[:6], "q_actual": q[:6], "qd_actual": 2 * one[:6]}
+        return {"time": 0.01 * k, **own, "i_actual": one[:6]}
     if kind == "franka_msgs/msg/FrankaRobotState":
         measured, wanted = state(bag, JOINTS, q, 2 * one, 3 * one), state(bag, JOINTS, q + 0.5)
         external = state(bag, JOINTS, (), (), 4 * one)
+        vectors = (bag.of("geometry_msgs/msg/Vector3", *(np.arange(3.0) + 3 * i + k)) for i in range(2))
+        wrench = bag.of("geometry_msgs/msg/Wrench", *vectors)
+        stamped = bag.of("geometry_msgs/msg/WrenchStamped", bag.header(0, "panda_hand_tcp"), wrench)
         own = {"measured_joint_state": measured, "desired_joint_state": wanted, "tau_ext_hat_filtered": external}
+        own["k_f_ext_hat_k"] = stamped
         return {"header": header, **own}
     if kind == "control_msgs/msg/DynamicJointState":
         values = [
@@ -114,6 +126,32 @@ def test_joints_of_messages_of_real_labs(
         assert joints.position_command is not None
         assert np.allclose(joints.position_command, joints.position + command)
     assert preview_file(path).sources[0].imported_as == f"joints {', '.join(JOINTS)}"
+
+
+@pytest.mark.parametrize(
+    ("kind", "storage", "frame"),
+    [("franka_msgs/msg/FrankaState", "bag", "K"), ("franka_msgs/msg/FrankaRobotState", "mcap", "panda_hand_tcp")],
+)
+def test_the_wrench_that_a_driver_estimates_is_a_group_that_says_so(
+    kind: str, storage: str, frame: str, tmp_path: Path
+) -> None:
+    recording = read_any(write(tmp_path, kind, storage))
+    [group] = recording.channel_groups
+    assert (group.name, group.names) == ("wrist_estimated", (frame,))
+    wanted = np.arange(30.0)[:, None] + np.arange(3.0)
+    assert np.array_equal(group.values_by_quantity["force"][:, 0], wanted)
+    assert np.array_equal(group.values_by_quantity["torque"][:, 0], wanted + 3)
+    assert any("use it in place of efforts" in note for note in recording.notes)
+
+
+def test_the_state_of_a_ur_becomes_joints_of_its_usual_names(tmp_path: Path) -> None:
+    joints = joints_of(read_any(write(tmp_path, "ur_msgs/msg/RobotStateRTMsg", "bag")))
+    assert joints.names[0] == "shoulder_pan_joint"
+    assert len(joints.names) == 6
+    assert np.allclose(joints.position, 0.01 * np.arange(30)[:, None] + 0.1 * ANGLES[:6])
+    assert joints.position_command is not None
+    assert np.allclose(joints.position_command, joints.position + 0.5)
+    assert joints.effort is None
 
 
 def test_joint_states_go_before_them_unless_they_are_chosen(tmp_path: Path) -> None:

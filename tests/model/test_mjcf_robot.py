@@ -8,6 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import ModelError
@@ -47,7 +48,7 @@ MODELS = {
       <worldbody>{arm(7, FINGERS)}</worldbody>
       <equality><joint joint1="finger2" joint2="finger1" polycoef="0 1 0 0 0"/></equality>
       <actuator><position joint="joint1" kp="100" kv="10" forcerange="-87 87"/>
-      <motor joint="joint2" gear="2"/></actuator>
+      <motor joint="joint2" gear="2" ctrlrange="-20 20"/></actuator>
       </mujoco>""",
     # inertia of geoms, degrees, friction: a small servo arm
     "servo arm": """<mujoco><compiler angle="degree" autolimits="true"/>
@@ -134,10 +135,11 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     with caplog.at_level(logging.WARNING):
         mechanism = read_urdf(file)
         read_urdf(file)
-    assert caplog.text.count("actuators other than position servos: 1 not taken over") == 1
+    assert caplog.text.count("motors: 1 not taken over (but for their limits") == 1
+    assert "actuators other" not in caplog.text
     assert "equalities" not in caplog.text  # the second finger follows the first
     assert "finger2" not in mechanism.joint_names
-    assert mechanism.joints[0].effort_limit == 87
+    assert [joint.effort_limit for joint in mechanism.joints[:2]] == [87, 40]
     assert mechanism.joints[0].upper_limit == 2.5
     assert "tcp" in mechanism.frames
     locked = read_urdf(file, joints=["joint1", "joint2"])
@@ -146,6 +148,58 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
         file.write_text(MODELS["rail with references"])
         read_urdf(file)
     assert "springs of joints: 1 not taken over (model.springs)" in caplog.text
+
+
+GRIPPER = """<body name="gripper" {at}>{free}<site name="palm" pos="0 0.02 0.01"/>
+  <inertial mass="0.8" pos="0 0.01 0.05" diaginertia="0.001 0.002 0.003"/>
+  <body name="finger" pos="0 0 0.1"><joint name="slide" type="slide" axis="0 1 0"/>
+    <inertial mass="0.1" pos="0 0 0.02" diaginertia="1e-4 1e-4 1e-4"/></body></body>"""
+
+
+@pytest.mark.parametrize(
+    "weld",
+    [
+        '<weld body1="link2" body2="gripper" relpose="0.1 0 0.05 0.8 0.6 0 0"/>',
+        '<weld body1="gripper" body2="link2"/>',
+        '<weld site1="flange" site2="palm"/>',
+    ],
+    ids=["stated", "as drawn", "by sites"],
+)
+def test_a_free_gripper_that_is_welded_to_the_arm_is_a_part_of_it(weld: str, tmp_path: Path) -> None:
+    """As if it were drawn as the arm's own body, whose mass matrix and bias are MuJoCo's (above)."""
+    site = '<site name="flange" pos="0 0.01 0.1" quat="1 0 0.5 0"/>'
+    drawn = GRIPPER.format(at='pos="0.3 0.1 0.2" quat="1 0.2 0 0"', free="<freejoint/>")
+    file, made = tmp_path / "welded.xml", tmp_path / "one.xml"
+    file.write_text(f"<mujoco><worldbody>{drawn}{arm(2, site)}</worldbody><equality>{weld}</equality></mujoco>")
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    turn, place = data.body("link2").xmat.reshape(3, 3), data.body("link2").xpos
+    if "relpose" in weld:
+        at = 'pos="0.1 0 0.05" quat="0.8 0.6 0 0"'
+    else:
+        palm = data.site("palm").xmat.reshape(3, 3), data.site("palm").xpos
+        flange = data.site("flange").xmat.reshape(3, 3), data.site("flange").xpos
+        own, origin = data.body("gripper").xmat.reshape(3, 3), data.body("gripper").xpos
+        if "site1" in weld:  # the two sites meet
+            own, origin = flange[0] @ palm[0].T @ own, flange[1] + flange[0] @ palm[0].T @ (origin - palm[1])
+        quat = np.roll(Rotation.from_matrix(turn.T @ own).as_quat(), 1)
+        numbers = (" ".join(map(str, values.tolist())) for values in (turn.T @ (origin - place), quat))
+        at = 'pos="{}" quat="{}"'.format(*numbers)
+    whole = GRIPPER.format(at=at, free="")
+    made.write_text(f"<mujoco><worldbody>{arm(2, site + whole)}</worldbody></mujoco>")
+    one, other = (read_urdf(path).with_numeric_values() for path in (file, made))
+    assert sorted(one.joint_names) == sorted(other.joint_names) == ["joint1", "joint2", "slide"]
+    rng, gravity = np.random.default_rng(1), np.array([0.0, 0.0, -9.81])
+    values = {name: rng.normal(size=2) for name in other.joint_names}
+    found = []
+    for tree in (one, other):
+        q, v = np.array([values[name] for name in tree.joint_names]).T
+        mass, bias, *_ = map(np.array, dynamics(tree, gravity).call([q, v]))
+        order = np.argsort(tree.joint_names)
+        found.append((mass[np.ix_(order, order)], bias.ravel()[order]))
+    for first, second in zip(*found, strict=True):
+        np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-9)
 
 
 def test_constants_of_joints_come_into_the_model_unless_the_settings_have_others(tmp_path: Path) -> None:

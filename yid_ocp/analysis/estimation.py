@@ -354,7 +354,6 @@ def _expected_errors(
     able = [own for own in drawn if not isinstance(own, str)]
     for k, samples in enumerate(episode.measurements):
         square = np.where(np.isfinite(samples.value), samples.std, np.nan) ** 2
-        square = square + np.sum(samples.error_directions**2, axis=2)
         for own in able:
             square = square + (own.predicted_outputs[k] - outcome.predicted_outputs[k]) ** 2 / len(able)
         found |= _rms_by_channel(samples.sensor, square)[0]

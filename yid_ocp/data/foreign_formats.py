@@ -243,18 +243,30 @@ JOINT_MESSAGE_TYPES = (
     "franka_msgs/msg/FrankaRobotState",
     "control_msgs/msg/DynamicJointState",
     "control_msgs/msg/JointTrajectoryControllerState",
+    "ur_msgs/msg/RobotStateRTMsg",
 )
 """Types of messages, beside JointState, whose joint values are understood."""
 
 
+_UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+ESTIMATED_WRENCH_GROUP = "wrist_estimated"
+"""Group of a recording with the wrench that a driver computes from joint torques, at the frame where it acts."""
+
+
 def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
-    """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are left out."""
+    """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are left out.
+
+    If the driver states an external wrench, `wrench` has its frame and its `values` by quantity.
+    """
     if kind == JOINT_MESSAGE_TYPES[0]:
         return _franka_state(content)
     if kind == JOINT_MESSAGE_TYPES[1]:
         return _franka_robot_state(content)
     if kind == JOINT_MESSAGE_TYPES[2]:
         return _dynamic_joint_state(content)
+    if kind == JOINT_MESSAGE_TYPES[4]:
+        own = {"position": content.q_actual, "velocity": content.qd_actual, "position_command": content.q_target}
+        return _values([f"{name}_joint" for name in _UR_JOINTS], own)
     measured = getattr(content, "feedback", None) or content.actual
     wanted = getattr(content, "reference", None) or content.desired
     own = {"position": measured.positions, "velocity": measured.velocities, "effort": measured.effort}
@@ -292,7 +304,10 @@ def _franka_state(content: Any) -> SimpleNamespace:
     torque = content.tau_J if hasattr(content, "tau_J") else content.tau_j
     own = {"position": content.q, "velocity": content.dq, "effort": torque, "position_command": content.q_d}
     own["external_effort"] = content.tau_ext_hat_filtered
-    return _values([f"panda_joint{i + 1}" for i in range(len(content.q))], own)
+    known, wrench = getattr(content, "K_F_ext_hat_K", None), None
+    if known is not None:
+        wrench = SimpleNamespace(frame="K", values={"force": tuple(known[:3]), "torque": tuple(known[3:])})
+    return _values([f"panda_joint{i + 1}" for i in range(len(content.q))], own, wrench)
 
 
 def _franka_robot_state(content: Any) -> SimpleNamespace:
@@ -301,7 +316,12 @@ def _franka_robot_state(content: Any) -> SimpleNamespace:
     own = {"position": measured.position, "velocity": measured.velocity, "effort": measured.effort}
     own["external_effort"] = getattr(external, "effort", external)
     own["position_command"] = content.desired_joint_state.position
-    return _values(measured.name, own)
+    known, wrench = getattr(content, "k_f_ext_hat_k", None), None
+    if known is not None:
+        parts = {"force": known.wrench.force, "torque": known.wrench.torque}
+        values = {name: (float(part.x), float(part.y), float(part.z)) for name, part in parts.items()}
+        wrench = SimpleNamespace(frame=str(known.header.frame_id).strip("/") or "K", values=values)
+    return _values(measured.name, own, wrench)
 
 
 def _dynamic_joint_state(content: Any) -> SimpleNamespace:
@@ -315,6 +335,6 @@ def _dynamic_joint_state(content: Any) -> SimpleNamespace:
     return _values(kept, {c: [values[c] for values in kept.values()] for c in channels})
 
 
-def _values(names: Any, values: Mapping[str, Any]) -> SimpleNamespace:
+def _values(names: Any, values: Mapping[str, Any], wrench: SimpleNamespace | None = None) -> SimpleNamespace:
     own = {channel: np.asarray(array, float).ravel() for channel, array in values.items() if len(array)}
-    return SimpleNamespace(frame="", name=[str(name) for name in names], **own)
+    return SimpleNamespace(frame="", name=[str(name) for name in names], wrench=wrench, **own)

@@ -413,7 +413,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         largest, allowed = float(np.nanmax(np.abs(value), initial=0.0)), f"at most {_LARGEST[unit]:g} {unit}"
         hint = "convert it again from what was recorded: no machine does that"
         if unit == "rad":
-            hint = f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}"
+            hint = f"these look like degrees: convert them to radians, or import with --units {channel}=deg"
         what = f"channel '{channel}' reaches {largest:g} {unit}"
         require_data(largest <= _LARGEST[unit], what, place, allowed, hint)
     enabled = joints.torque_enable
@@ -440,7 +440,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
         what = f"point '{group.names[column]}' is {group.position[row, column]} at t = {group.t[row]:g} s"
         allowed = "three finite coordinates, or three NaN where the point was not seen"
         raise DataError(what, where=f"{where}/position", allowed=allowed)
-    _check_distances(group.position[~unseen], f"{where}/position", ", or read a CSV with units={'points': 'mm'}")
+    _check_distances(group.position[~unseen], f"{where}/position", ", or import with --units points=mm")
     if group.std is not None:
         _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
         seen = group.std[~unseen]

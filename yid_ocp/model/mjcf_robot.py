@@ -20,23 +20,24 @@ from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_axis_si
 
 log = logging.getLogger(__name__)
 _JOINT_TYPES = {2: "prismatic", 3: "revolute"}
-_JOINT_EQUALITY, _WORLD = 2, "world"
+_JOINT_EQUALITY, _WELD_EQUALITY, _SITE_OBJECT, _FREE_JOINT, _WORLD = 2, 1, 6, 0, "world"
 
 
 def parsed_mjcf(file: Path) -> SimpleNamespace:
     """Read name, links and joints of an MJCF file in the form that `read_urdf` uses. What is left out is logged.
 
     A body is a link with its inertial, or with what MuJoCo computes from its geoms; sites are frames. Coordinates are
-    MuJoCo's, `ref` included. A joint that an equality ties to another one linearly follows it, as `mimic` does.
+    MuJoCo's, `ref` included. A joint that an equality ties to another one linearly follows it, as `mimic` does. A free
+    body that an equality welds to another one, as some grippers are, is fixed there.
 
     `ModelError` where `mujoco` is not installed or refuses the file, or a joint is free or a ball.
     """
     model = _compiled_file(file)
     links = [SimpleNamespace(name=_WORLD, inertial=None)]
     joints: list[SimpleNamespace] = []
-    follows = _followed_joints(model)
+    follows, welds = _followed_joints(model), _welded_free_bodies(model)
     for i in range(1, model.nbody):
-        own_links, own_joints = _body(model, i, follows, str(file))
+        own_links, own_joints = _body(model, i, follows, welds, str(file))
         links += own_links
         joints += own_joints
     for i in range(model.nsite):
@@ -78,6 +79,12 @@ def _is_position_actuator(model: Any, i: int) -> bool:
     return alike and int(model.actuator_trntype[i]) == 0 and float(model.actuator_gear[i, 0]) == 1.0
 
 
+def _is_motor(model: Any, i: int) -> bool:
+    """Whether an actuator's command is a torque of a joint, or a force, but for a factor."""
+    constant = int(model.actuator_gaintype[i]) == int(model.actuator_biastype[i]) == int(model.actuator_dyntype[i]) == 0
+    return constant and int(model.actuator_trntype[i]) == 0
+
+
 def _compiled_file(file: Path) -> Any:
     return _compiled(file, file.stat().st_mtime_ns)
 
@@ -96,13 +103,13 @@ def _compiled(file: Path, changed: int) -> Any:
         what = f"MuJoCo cannot read the file: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
         hint = "open it in MuJoCo's viewer; meshes have to lie where the file says"
         raise ModelError(what, where=str(file), allowed="MJCF that MuJoCo compiles", hint=hint) from error
-    for sentence in _left_out(model, _followed_joints(model)):
+    for sentence in _left_out(model):
         log.warning("%s: %s", file.name, sentence)
     return model
 
 
 def _body(
-    model: Any, i: int, follows: dict[str, SimpleNamespace], where: str
+    model: Any, i: int, follows: dict[str, SimpleNamespace], welds: dict[int, tuple[int, Array]], where: str
 ) -> tuple[list[SimpleNamespace], list[SimpleNamespace]]:
     """Links and joints of one body: a link for each joint but the last, and one of the body itself."""
     name, parent = _body_name(model, i), _body_name(model, model.body_parentid[i])
@@ -112,6 +119,9 @@ def _body(
         tensor = np.diag(model.body_inertia[i])
         inertial = SimpleNamespace(mass=mass, inertia=tensor, origin=turn)
     links, joints = [SimpleNamespace(name=name, inertial=inertial)], []
+    if i in welds:
+        carrier, at = welds[i]
+        return links, [_fixed(f"{name}_weld", _body_name(model, carrier), name, at)]
     # where the next joint's frame lies in the link before it
     at, last = _pose(model.body_pos[i], model.body_quat[i]), np.zeros(3)
     first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
@@ -149,8 +159,13 @@ def _limits(model: Any, j: int) -> SimpleNamespace:
     lower, upper = model.jnt_range[j] if model.jnt_limited[j] else (None, None)
     efforts = [float(np.abs(model.jnt_actfrcrange[j]).max())] if model.jnt_actfrclimited[j] else []
     for i in range(model.nu):
-        if model.actuator_trntype[i] == 0 and model.actuator_trnid[i, 0] == j and model.actuator_forcelimited[i]:
+        if model.actuator_trntype[i] != 0 or model.actuator_trnid[i, 0] != j:
+            continue
+        if model.actuator_forcelimited[i]:
             efforts.append(float(np.abs(model.actuator_forcerange[i] * model.actuator_gear[i, 0]).max()))
+        if _is_motor(model, i) and model.actuator_ctrllimited[i]:
+            gain = model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]
+            efforts.append(float(np.abs(model.actuator_ctrlrange[i] * gain).max()))
     return SimpleNamespace(lower=lower, upper=upper, effort=min(efforts, default=None), velocity=None)
 
 
@@ -168,13 +183,36 @@ def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
     return found
 
 
-def _left_out(model: Any, follows: dict[str, SimpleNamespace]) -> Iterator[str]:
-    """Sentences on what the file holds and the mechanism does not."""
+def _welded_free_bodies(model: Any) -> dict[int, tuple[int, Array]]:
+    """Bodies that an active weld holds and nothing else, with the body that each is welded to and its pose there."""
+    found: dict[int, tuple[int, Array]] = {}
+    for i in range(model.neq):
+        if int(model.eq_type[i]) != _WELD_EQUALITY or not model.eq_active0[i]:
+            continue
+        first, second, data = int(model.eq_obj1id[i]), int(model.eq_obj2id[i]), model.eq_data[i]
+        if int(model.eq_objtype[i]) == _SITE_OBJECT:
+            sites = (_pose(model.site_pos[site], model.site_quat[site]) for site in (first, second))
+            pose = next(sites) @ np.linalg.inv(next(sites))
+            first, second = int(model.site_bodyid[first]), int(model.site_bodyid[second])
+        else:
+            pose = _pose(data[3:6], data[6:10]) @ _shift(-data[:3])
+        for carrier, carried, at in ((first, second, pose), (second, first, np.linalg.inv(pose))):
+            joint = int(model.body_jntadr[carried])
+            if joint >= 0 and int(model.jnt_type[joint]) == _FREE_JOINT and carried not in found:
+                found[carried] = carrier, at
+                break
+    return found
 
-    motors = sum(not _is_position_actuator(model, i) for i in range(model.nu))
+
+def _left_out(model: Any) -> Iterator[str]:
+    """Sentences on what the file holds and the mechanism does not."""
+    taken = len(_followed_joints(model)) + len(_welded_free_bodies(model))
+    others_than_servos = [i for i in range(model.nu) if not _is_position_actuator(model, i)]
+    motors = sum(_is_motor(model, i) for i in others_than_servos)
     others = {
-        "actuators other than position servos": (motors, "recorded or driving efforts are torques at the joint"),
-        "equalities": (model.neq - len(follows), "welds and connects: model.grasp"),
+        "motors": (motors, "but for their limits: recorded or driving efforts are torques at the joint"),
+        "actuators other than motors and position servos": (len(others_than_servos) - motors, ""),
+        "equalities": (model.neq - taken, "welds and connects that close loops: model.grasp"),
         "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "model.springs"),
         "tendons": (model.ntendon, ""),
         "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), ""),

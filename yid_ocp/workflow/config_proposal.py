@@ -12,6 +12,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import white_noise_std
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, nearest_name_hint
@@ -35,7 +36,9 @@ _MIN_FRICTION_TRAVEL = 0.02  # A joint that turns less than this says nothing of
 _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
 _TORQUE_BIAS_FRACTION = 0.01  # of a joint's effort limit, as the constant error of its torque where none is stated
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
-_POSITION_STEP_PERCENT = 5  # resolution of places along a segment [%]
+_POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays bent [%]
+_MAX_STRAIGHT_DEVIATION = 0.01  # of the length, within which the end of a straight segment is so far from its holder
+_STRAIGHTEST_FRACTION = 0.1  # of the samples, where the end is farthest from the holder
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
 _LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
 """Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
@@ -253,6 +256,7 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
 
 def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bool) -> tuple[str, str]:
     wrists = [group.name for group in recording.channel_groups if group.name.startswith("wrist")]
+    wrists = [name for name in wrists if name != ESTIMATED_WRENCH_GROUP]
     seen = ", ".join([*(group.name for group in recording.points), *wrists])
     is_servo = joints.effort is None and _commanded(joints)
     if not has_object and not is_servo and joints.effort is None and not wrists:
@@ -344,7 +348,7 @@ def _places(
     frames = {f"w_{name}" for name in names} | set(tree.frames)
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for group in recording.points:
-        placed = []
+        placed, parts = [], None if standing else _parts_when_straight(tree, recording, group, branches, holder)
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
             frame, reason = "", "its place is not known"
@@ -353,16 +357,40 @@ def _places(
             elif point in names:
                 frame, reason = f"w_{point}", "the end of the segment of its name"
             elif not standing:
-                frame, reason = _near(tree, recording, group.t, group.position[:, i], branches, holder)
+                seen = group.t, group.position[:, i], math.nan if parts is None else float(parts[i])
+                frame, reason = _near(tree, recording, *seen, branches, holder)
             placed.append(_PointPlacement(point, frame, reason))
         found[group.name] = tuple(placed)
     return found
 
 
+def _parts_when_straight(
+    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[Segment], holder: str
+) -> Array | None:
+    """Parts of a single segment's length at which points sit (np,); None where it never was straight, or has no end."""
+    apart = np.linalg.norm(group.position - _poses(tree, recording, holder, group.t)[:, None, :3, 3], axis=2)
+    farthest = np.max(apart, axis=0, initial=0.0, where=np.isfinite(apart))
+    end = apart[:, int(np.argmax(farthest))]
+    if len(branches) != 1 or abs(farthest.max() / branches[0].length - 1) > _MAX_STRAIGHT_DEVIATION:
+        return None
+    straight = end >= np.nanquantile(end, 1 - _STRAIGHTEST_FRACTION)
+    ratio = apart[straight] / end[straight, None]
+    return np.array([np.mean(own[np.isfinite(own)]) if np.isfinite(own).any() else math.nan for own in ratio.T])
+
+
 def _near(
-    tree: Mechanism, recording: Recording, t: Array, position: Array, branches: Sequence[Segment], holder: str
+    tree: Mechanism,
+    recording: Recording,
+    t: Array,
+    position: Array,
+    part_when_straight: float,
+    branches: Sequence[Segment],
+    holder: str,
 ) -> tuple[str, str]:
-    """Frame at which a point probably sits, by where it was seen from what holds the object, and why."""
+    """Frame at which a point probably sits, by where it was seen from what holds the object, and why.
+
+    `part_when_straight` of the length of a single segment is NaN where that was never straight.
+    """
     seen = np.isfinite(position).all(axis=1)
     if not seen.any():
         return "", "it was never seen"
@@ -374,8 +402,10 @@ def _near(
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
             return "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
-        percent = min(100, _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT))
-        return _along(branch.name, percent), f"up to {part:.0%} of the length away from {holder}"
+        percent: float = _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT)
+        if math.isfinite(part_when_straight):
+            percent = round(100 * part_when_straight, 2)
+        return _along(branch.name, min(100, percent)), f"up to {part:.1%} of the length away from {holder}"
     local = poses[0, :3, :3].T @ from_holder[0]
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
     name = min(apart, key=apart.__getitem__)
@@ -384,8 +414,8 @@ def _near(
     return name, f"{1e3 * apart[name]:.0f} mm from there when the object is straight"
 
 
-def _along(name: str, percent: int) -> str:
-    return f"w_{name}" if percent == 100 else f"{name}:{percent}%"
+def _along(name: str, percent: float) -> str:
+    return f"w_{name}" if percent == 100 else f"{name}:{percent:g}%"
 
 
 def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[str, tuple[_PointPlacement, ...]]:

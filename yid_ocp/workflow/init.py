@@ -14,6 +14,7 @@ from typing import Any, cast
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
@@ -453,6 +454,9 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
             why = "torques with noise move the arms: set mode: prescribed to use it"
             entries = ["use: false", *entries]
             said = why if proposal.arm_mode == "driven" else "its frame is not known"
+        elif group.startswith(ESTIMATED_WRENCH_GROUP):
+            entries = ["use: false", *entries]
+            said = "an estimate from joint torques, less the loads that the driver knows: in place of efforts only"
         # without a setting of its own, a comment
         yield _line("  ", group, f"{{{', '.join(entries)}}}", said) if entries else f"  # {group}: {said}"
         for place in places:

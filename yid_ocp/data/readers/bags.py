@@ -15,7 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.foreign_formats import JOINT_MESSAGE_TYPES, joint_values_of_fields, joint_values_of_message
+from yid_ocp.data.foreign_formats import (
+    ESTIMATED_WRENCH_GROUP,
+    JOINT_MESSAGE_TYPES,
+    joint_values_of_fields,
+    joint_values_of_message,
+)
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -169,9 +174,10 @@ def read_bag(
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
     `sensor_msgs/JointState` becomes the joints, of several topics on one clock; where there is none of it, Franka's
-    `FrankaState` and `FrankaRobotState` do, and `DynamicJointState` and `JointTrajectoryControllerState` of
-    `control_msgs`; `joint_topics` chooses them beside it, `fields` takes messages of any type. Stamped points,
-    poses and transforms of `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference;
+    `FrankaState` and `FrankaRobotState` do (with the wrench that they estimate as `wrist_estimated`),
+    `DynamicJointState` and `JointTrajectoryControllerState` of `control_msgs`, and `RobotStateRTMsg` of `ur_msgs`;
+    `joint_topics` chooses them beside it, `fields` takes messages of any type. Stamped points, poses and transforms of
+    `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference;
     `WrenchStamped` and `Imu` become a group `wrist` or `imu` per topic, on the frame of their header. Times are the
     headers' stamps (the times of recording if a message has none), from the first message on. A joint channel that is
     empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
@@ -202,7 +208,10 @@ def read_bag(
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
         points.append(PointGroup(name, *position, None, options.point_sensor_name, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
-    channels = _mounted_sensors(bag, seconds)
+    channels = (*_mounted_sensors(bag, seconds), *_estimated_wrenches(groups, seconds))
+    if channels and channels[-1].name == ESTIMATED_WRENCH_GROUP:
+        said = "the driver's estimate from joint torques, less the loads that it knows"
+        more = (*more, f"{ESTIMATED_WRENCH_GROUP} is {said}: use it in place of efforts, not beside them")
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and distance is None:
@@ -368,6 +377,20 @@ def _mounted_sensors(bag: _Contents, seconds: Callable[[BagMessage], float]) -> 
             t = np.array([seconds(message) for message in messages])
             made.append(SensorChannelGroup(own_name, (frame,), t, values, stds))
     return tuple(made)
+
+
+def _estimated_wrenches(
+    groups: Sequence[_States], seconds: Callable[[BagMessage], float]
+) -> tuple[SensorChannelGroup, ...]:
+    """What the driver of the first arm that states it says of the wrench from outside."""
+    for entry in groups:
+        messages = sorted((m for m in entry.messages if getattr(m.content, "wrench", None)), key=seconds)
+        if messages:
+            first = messages[0].content.wrench
+            values = {key: np.array([[m.content.wrench.values[key]] for m in messages]) for key in first.values}
+            t = np.array([seconds(message) for message in messages])
+            return (SensorChannelGroup(ESTIMATED_WRENCH_GROUP, (first.frame,), t, values),)
+    return ()
 
 
 # -- joints -----------------------------------------------------------------------------------------------------------
