@@ -321,6 +321,15 @@ def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
     assert {"w_up", "w_side", "up:40%"} == set(build_system(run).point_frames)
 
 
+def test_on_a_rod_that_was_straight_a_marker_is_placed_within_a_fraction_of_a_millimetre(bench: Path) -> None:
+    frames = proposed(moved(SHORT, parts=(1 / 3, 1.0))).sensors["points"].frames
+    owner, _, percent = frames["m1"].partition(":")
+    assert (owner, frames["m2"]) == ("cable", "w_cable")
+    assert float(percent.removesuffix("%")) == pytest.approx(100 / 3, abs=0.05)
+    # without a marker at its end nobody knows whether it was straight
+    assert proposed(moved(SHORT, parts=(1 / 3, 0.8))).sensors["points"].frames["m1"] == "cable:35%"
+
+
 def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
     recording = moved(SHORT)
     assert recording.joints is not None

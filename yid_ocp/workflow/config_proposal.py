@@ -37,6 +37,7 @@ _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this
 _TORQUE_BIAS_FRACTION = 0.01  # of a joint's effort limit, as the constant error of its torque where none is stated
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 _POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays bent [%]
+_MAX_ROUNDED_PERCENT = 0.2  # by which a place on a straight segment is moved to a round one [%]
 _MAX_STRAIGHT_DEVIATION = 0.01  # of the length, within which the end of a straight segment is so far from its holder
 _STRAIGHTEST_FRACTION = 0.1  # of the samples, where the end is farthest from the holder
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
@@ -403,8 +404,10 @@ def _near(
         if part > 1.2:
             return "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
         percent: float = _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT)
-        if math.isfinite(part_when_straight):
-            percent = round(100 * part_when_straight, 2)
+        exact = 100 * part_when_straight
+        if math.isfinite(exact):
+            percent = _POSITION_STEP_PERCENT * round(exact / _POSITION_STEP_PERCENT)
+            percent = percent if abs(exact - percent) <= _MAX_ROUNDED_PERCENT else round(exact, 2)
         return _along(branch.name, min(100, percent)), f"up to {part:.1%} of the length away from {holder}"
     local = poses[0, :3, :3].T @ from_holder[0]
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}

@@ -145,13 +145,12 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
 
 def recording_doubt_lines(recording: Recording) -> list[str]:
     """Describe doubts about a recording itself, such as units, clocks, few samples, no motion, channels."""
-    found = recording_quality_issues(recording, lambda group: SensorOptions())
-    said = [f"in doubt ({issue.certainty_word}): {issue.what}; {issue.advice}" for issue in found]
-    known = {issue.cause for issue in found}
     units, reasons = guess_units(recording)
+    found = recording_quality_issues(recording, lambda group: SensorOptions())
+    found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
+    said = [f"in doubt ({issue.certainty_word}): {issue.what}; {issue.advice}" for issue in found]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
-        if not (quantity == "t" and "time_unit" in known):
-            said.append(f"in doubt (likely): {reason}; import again with --units {quantity}={unit}")
+        said.append(f"in doubt (likely): {reason}; import again with --units {quantity}={unit}")
     return ["", *said] if said else []
 
 

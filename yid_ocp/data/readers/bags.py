@@ -208,7 +208,7 @@ def read_bag(
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
         points.append(PointGroup(name, *position, None, options.point_sensor_name, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
-    channels = (*_mounted_sensors(bag, seconds), *_estimated_wrenches(groups, seconds))
+    channels = tuple(_mounted_sensors(bag, groups, seconds))
     if channels and channels[-1].name == ESTIMATED_WRENCH_GROUP:
         said = "the driver's estimate from joint torques, less the loads that it knows"
         more = (*more, f"{ESTIMATED_WRENCH_GROUP} is {said}: use it in place of efforts, not beside them")
@@ -361,36 +361,30 @@ def _numbers(content: Any, names: str) -> tuple[float, ...]:
 # -- wrist sensors and inertial units ---------------------------------------------------------------------------------
 
 
-def _mounted_sensors(bag: _Contents, seconds: Callable[[BagMessage], float]) -> tuple[SensorChannelGroup, ...]:
-    """A group for each topic of wrenches or inertial readings, with the frame of its headers as the sensor's name."""
-    made = []
+def _mounted_sensors(
+    bag: _Contents, groups: Sequence[_States], seconds: Callable[[BagMessage], float]
+) -> Iterator[SensorChannelGroup]:
+    """A group for each topic of wrenches or inertial readings, and for the wrench that an arm's driver estimates."""
     for kind, group in _MOUNTED.items():
         topics = _names_of(bag, kind)
         for topic, name in topics.items():
-            messages = sorted((m for m in bag.mounted if m.source == topic), key=seconds)
-            if not messages:
-                continue
-            first = messages[0].content
-            values = {key: np.array([[m.content.values[key]] for m in messages]) for key in first.values}
-            stds = {f"{key}_std": math.sqrt(own.mean()) for key, own in getattr(first, "variances", {}).items()}
-            frame, own_name = first.frame.strip("/") or name, group if len(topics) == 1 else f"{group}_{name}"
-            t = np.array([seconds(message) for message in messages])
-            made.append(SensorChannelGroup(own_name, (frame,), t, values, stds))
-    return tuple(made)
+            messages = [message for message in bag.mounted if message.source == topic]
+            own_name = group if len(topics) == 1 else f"{group}_{name}"
+            yield from _sensor_group(own_name, name, messages, seconds)
+    told = ([replace(m, content=w) for m in e.messages if (w := getattr(m.content, "wrench", None))] for e in groups)
+    yield from _sensor_group(ESTIMATED_WRENCH_GROUP, "", next(filter(None, told), []), seconds)
 
 
-def _estimated_wrenches(
-    groups: Sequence[_States], seconds: Callable[[BagMessage], float]
-) -> tuple[SensorChannelGroup, ...]:
-    """What the driver of the first arm that states it says of the wrench from outside."""
-    for entry in groups:
-        messages = sorted((m for m in entry.messages if getattr(m.content, "wrench", None)), key=seconds)
-        if messages:
-            first = messages[0].content.wrench
-            values = {key: np.array([[m.content.wrench.values[key]] for m in messages]) for key in first.values}
-            t = np.array([seconds(message) for message in messages])
-            return (SensorChannelGroup(ESTIMATED_WRENCH_GROUP, (first.frame,), t, values),)
-    return ()
+def _sensor_group(
+    group: str, name: str, messages: Sequence[BagMessage], seconds: Callable[[BagMessage], float]
+) -> Iterator[SensorChannelGroup]:
+    """The group of one sensor, called like the frame of its headers, or by `name`; none without messages."""
+    if messages := sorted(messages, key=seconds):
+        first = messages[0].content
+        values = {key: np.array([[m.content.values[key]] for m in messages]) for key in first.values}
+        stds = {f"{key}_std": math.sqrt(own.mean()) for key, own in getattr(first, "variances", {}).items()}
+        t = np.array([seconds(message) for message in messages])
+        yield SensorChannelGroup(group, (first.frame.strip("/") or name,), t, values, stds)
 
 
 # -- joints -----------------------------------------------------------------------------------------------------------
