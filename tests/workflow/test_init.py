@@ -330,6 +330,32 @@ def test_on_a_rod_that_was_straight_a_marker_is_placed_within_a_fraction_of_a_mi
     assert proposed(moved(SHORT, parts=(1 / 3, 0.8))).sensors["points"].frames["m1"] == "cable:35%"
 
 
+SWING = """<robot name="swing"><link name="base"/><link name="upper"><inertial><mass value="1"/>
+  <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="tool"/>
+  <joint name="lift" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="9" velocity="9"/></joint>
+  <joint name="end" type="fixed"><parent link="upper"/><child link="tool"/><origin xyz="0.4 0 0"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("late", [0.0, 0.06])
+def test_late_markers_are_placed_by_where_they_are_while_the_arm_rests(late: float, bench: Path) -> None:
+    Path("swing.urdf").write_text(SWING)
+    t = np.arange(0, 3, 1 / RATE)
+
+    def angle(time: np.ndarray) -> np.ndarray:
+        return 0.8 * np.sin(5 * time) * np.clip(time - 0.6, 0, 1)
+
+    joints = JointGroup(("lift",), t, angle(t)[:, None])
+    c, s, part = np.cos(angle(t - late))[:, None], np.sin(angle(t - late))[:, None], LENGTH * np.array([1 / 3, 1.0])
+    place = np.stack([0.4 * c + part * s, 0 * c * part, part * c - 0.4 * s], axis=2)
+    place += 2e-4 * np.random.default_rng(0).standard_normal(place.shape)
+    write_recording(Recording(joints, (PointGroup("points", ("a", "b"), t, place),), name="swing"), "swing.h5")
+    assert main(["init", "swing.urdf", "swing.h5", "--out", "swing.yaml", *CABLE]) == 0
+    frames = load_config("swing.yaml").sensors["points"].frames
+    assert frames["b"] == "w_cable"
+    assert float(frames["a"].partition(":")[2].removesuffix("%")) == pytest.approx(100 / 3, abs=0.1)
+
+
 def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
     recording = moved(SHORT)
     assert recording.joints is not None

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import white_noise_std
@@ -38,6 +39,8 @@ _TORQUE_BIAS_FRACTION = 0.01  # of a joint's effort limit, as the constant error
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 _POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays bent [%]
 _MAX_ROUNDED_PERCENT = 0.2  # by which a place on a straight segment is moved to a round one [%]
+_MAX_BEYOND_LENGTH = 0.02  # of the length of an object, by which no point of it can be farther from its holder
+_MAX_LATENESS = 0.25  # of points' clock, within which the holder has to rest for a place to be trusted [s]
 _MAX_STRAIGHT_DEVIATION = 0.01  # of the length, within which the end of a straight segment is so far from its holder
 _STRAIGHTEST_FRACTION = 0.1  # of the samples, where the end is farthest from the holder
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
@@ -349,7 +352,9 @@ def _places(
     frames = {f"w_{name}" for name in names} | set(tree.frames)
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for group in recording.points:
-        placed, parts = [], None if standing else _parts_when_straight(tree, recording, group, branches, holder)
+        placed, name = [], group.name
+        group = group if standing else _samples_to_place_by(tree, recording, group, branches, holder)
+        parts = None if standing else _parts_when_straight(tree, recording, group, branches, holder)
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
             frame, reason = "", "its place is not known"
@@ -361,8 +366,26 @@ def _places(
                 seen = group.t, group.position[:, i], math.nan if parts is None else float(parts[i])
                 frame, reason = _near(tree, recording, *seen, branches, holder)
             placed.append(_PointPlacement(point, frame, reason))
-        found[group.name] = tuple(placed)
+        found[name] = tuple(placed)
     return found
+
+
+def _samples_to_place_by(
+    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[Segment], holder: str
+) -> PointGroup:
+    """Samples of a group, only those at rest if points in motion are farther away than a single segment is long.
+
+    A late clock makes that of points that move.
+    """
+    at = _poses(tree, recording, holder, group.t)[:, :3, 3]
+    apart = np.linalg.norm(group.position - at[:, None], axis=2)
+    farthest = float(np.max(apart, initial=0.0, where=np.isfinite(apart)))
+    if len(branches) != 1 or farthest < (1 + _MAX_BEYOND_LENGTH) * branches[0].length or len(group.t) < 2:
+        return group
+    speed = np.linalg.norm(np.gradient(at, group.t, axis=0), axis=1)
+    width = 2 * math.ceil(_MAX_LATENESS / float(np.median(np.diff(group.t)))) + 1
+    still = maximum_filter1d(speed, width) < _POINT_REST_SPEED
+    return group if not still.any() else replace(group, t=group.t[still], position=group.position[still], std=None)
 
 
 def _parts_when_straight(
