@@ -63,7 +63,7 @@ class _SpringChange(_SegmentEffect):
 
 
 @EFFECTS.register("kelvin_voigt")
-class KelvinVoigt(_SegmentEffect):
+class _KelvinVoigt(_SegmentEffect):
     """Kelvin-Voigt damping on all joints of a segment. F = -tau kappa v with stiffness kappa."""
 
     equation = "F = -tau kappa v"
@@ -78,7 +78,7 @@ class KelvinVoigt(_SegmentEffect):
 
 
 @EFFECTS.register("standard_linear_solid")
-class StandardLinearSolid(_SegmentMemory):
+class _StandardLinearSolid(_SegmentMemory):
     """Standard linear solid of a segment. A spring and a damper in series are parallel to every bend and twist spring.
 
     V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt.
@@ -104,7 +104,7 @@ class StandardLinearSolid(_SegmentMemory):
 
 
 @EFFECTS.register("hysteresis")
-class Hysteresis(_SegmentMemory):
+class _Hysteresis(_SegmentMemory):
     """Hysteresis of a segment. A Dahl friction element is parallel to every bend and twist spring.
 
     F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start
@@ -140,7 +140,7 @@ class Hysteresis(_SegmentMemory):
 
 
 @EFFECTS.register("cubic_stiffness")
-class CubicStiffness(_SegmentEffect):
+class _CubicStiffness(_SegmentEffect):
     """Springs of a segment that stiffen or soften with angle, by the sign of k3. Each joint adds V += 1/4 k3 q^4.
 
     k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
@@ -156,7 +156,7 @@ class CubicStiffness(_SegmentEffect):
         ),
     )
 
-    def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> CubicStiffness:
+    def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> _CubicStiffness:
         """Scale the prior range of k3 to the segment's largest joint angle in the data."""
         if self.location not in largest:
             return self
@@ -170,7 +170,7 @@ class CubicStiffness(_SegmentEffect):
 
 
 @EFFECTS.register("rest_curvature")
-class RestCurvature(_SpringChange):
+class _RestCurvature(_SpringChange):
     """Rest curvature of a segment, with equal rest angles at all joints. V = 1/2 kappa (q - q_rest)^2."""
 
     equation = "V = 1/2 kappa (q - q_rest)^2"
@@ -198,7 +198,7 @@ def _doubly_bending_segments(system: System) -> tuple[str, ...]:
 
 
 @EFFECTS.register("bend_anisotropy")
-class BendAnisotropy(_SpringChange):
+class _BendAnisotropy(_SpringChange):
     """Anisotropic bending of a segment. The stiffnesses about y and x differ: kappa_y = kappa_x (1 + ratio)."""
 
     equation = "kappa_y = kappa_x (1 + ratio)"

@@ -74,7 +74,7 @@ class _JointInsertion(EffectBase):
 
 
 @EFFECTS.register("mount_compliance")
-class MountCompliance(_JointInsertion):
+class _MountCompliance(_JointInsertion):
     """Massless rotational spring under the object's foot or clamp, about x and y of the first link."""
 
     equation = "two joints with V = 1/2 stiffness q^2 before the first link"
@@ -87,7 +87,7 @@ class MountCompliance(_JointInsertion):
 
 
 @EFFECTS.register("junction_compliance")
-class JunctionCompliance(_JointInsertion):
+class _JunctionCompliance(_JointInsertion):
     """Massless two-axis rotational spring between a segment and the branches that leave it at a junction.
 
     At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
@@ -117,7 +117,7 @@ class _GraspChange(EffectBase):
 
 
 @EFFECTS.register("grasp_offset")
-class GraspOffset(_GraspChange):
+class _GraspOffset(_GraspChange):
     """Displacement of the grasped point from its nominal position. It is (dx, dy, dz) in the gripper's frame."""
 
     equation = "phi = (holder + R (dx, dy, dz)) - held"
@@ -131,7 +131,7 @@ class GraspOffset(_GraspChange):
 
 
 @EFFECTS.register("grasp_compliance")
-class GraspCompliance(_GraspChange):
+class _GraspCompliance(_GraspChange):
     """Spring-damper in place of a rigid grasp. f = phi/C + damping dphi/dt with phi = gripper - object.
 
     In a step: phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, regular at C = 0, where it is the rigid
@@ -152,7 +152,7 @@ class GraspCompliance(_GraspChange):
 
 
 @EFFECTS.register("grasp_slip")
-class GraspSlip(_GraspChange):
+class _GraspSlip(_GraspChange):
     """Slip of a grasp along a tube. The grasped point creeps in the direction in which the gripper pulls.
 
     d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.axial_slip` counts the other way.
