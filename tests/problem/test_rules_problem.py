@@ -416,7 +416,7 @@ def test_there_must_be_something_to_estimate_on(free_step):
         EstimationProblem(free_step, [], FREE)
     t = H * np.arange(10)
     hidden = recording(None, seen(["tip"], t, np.full((10, 1, 3), np.nan), std=np.ones((10, 1, 3))))
-    with pytest.raises(DataError, match="no measurement that the model could be compared with"):
+    with pytest.raises(DataError, match="no measurement of the model"):
         EstimationProblem(free_step, [hidden], FREE)
     unused = ProblemOptions(sensors={"points": SensorOptions(use=False)})
     with pytest.raises(DataError, match="no measurement"):
