@@ -17,7 +17,6 @@ from typing import Any, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -464,6 +463,8 @@ class _Path:
     """Recorded angles, smoothed over some samples, as a motion from the first of them."""
 
     def __init__(self, joints: tuple[str, ...], t: Array, position: Array, smoothed: float) -> None:
+        from scipy.ndimage import gaussian_filter1d  # slow to import
+
         self.joints, self._start, self._last = joints, position[:_START].mean(axis=0), float(t[-1])
         spline = CubicSpline(t, gaussian_filter1d(position, smoothed, axis=0) if smoothed else position)
         self._values = [spline, spline.derivative(1), spline.derivative(2)]
