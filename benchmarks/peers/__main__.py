@@ -1,0 +1,112 @@
+"""The same recordings through this package and other tools.
+
+    python benchmarks/peers [--cases NAME ...] [--tools NAME ...] [--seeds N] [--out FILE]
+    python benchmarks/peers --table [--out FILE]
+
+The first writes figures to FILE (`results.json` beside this script) and keeps those of cases and tools that are not
+run. The second writes table and chart of the documentation from it. `pip install -e '.[peers]'` has what is needed but
+for opty, which needs an installed IPOPT (`pip install opty`). What is not installed is left out and named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import platform
+import resource
+import sys
+import tempfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+TOOLS = {
+    "yid_ocp": ("with_yid_ocp", "yid-ocp", "yid_ocp"),
+    "mujoco.sysid": ("with_sysid", "mujoco", "mujoco.sysid"),
+    "least_squares": ("with_least_squares", "scipy", "scipy"),
+    "friction ladder": ("with_friction_ladder", "scipy", "scipy"),
+    "opty": ("with_opty", "opty", "opty"),
+}  # module of the scripts, distribution, import
+
+
+def cpu_seconds() -> float:
+    """User and system time of this process and of what it has started [s]."""
+    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(entry.ru_utime + entry.ru_stime for entry in used)
+
+
+def run_case(name: str, tools: list[str], seeds: int | None) -> dict[str, Any]:
+    """Figures of every tool and seed of one case; a tool that fails has its message in their place."""
+    from cases import CASES
+    from mujoco_models import SETTERS
+    from score import score, user_lines, yaml_lines
+
+    case, found = CASES[name], {}
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in case.seeds[:seeds]:
+            trial = case.trial(seed, Path(folder) / str(seed))
+            for tool in tools:
+                by_case = importlib.import_module(TOOLS[tool][0]).BY_CASE
+                if name not in by_case:
+                    continue
+                before = cpu_seconds()
+                try:
+                    answers = by_case[name](trial)
+                except Exception as error:  # what a tool raises is its answer
+                    answers = {}
+                    found.setdefault(tool, {"runs": []})["runs"].append({"seed": seed, "failed": str(error)})
+                spent = cpu_seconds() - before
+                lines = user_lines(TOOLS[tool][0], by_case[name].__name__)
+                lines += yaml_lines(trial.config) if tool == "yid_ocp" else 0
+                if tool in ("mujoco.sysid", "least_squares") and name in SETTERS:
+                    lines += user_lines("mujoco_models", SETTERS[name].__name__)
+                rows = answers if isinstance(answers, dict) else {"": answers}
+                for part, answer in rows.items():
+                    own = found.setdefault(f"{tool} {part}".strip(), {"runs": []})
+                    own["lines"] = lines
+                    own["runs"].append({"seed": seed, "cpu": spent, **score(trial, answer)})
+                print(f"{name}, seed {seed}: {tool}, {spent:.1f} s of CPU time", file=sys.stderr, flush=True)
+    return {"title": case.title, "made_by": case.made_by, "truth": dict(trial.truth), "tools": found}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="+", help="all when absent")
+    parser.add_argument("--tools", nargs="+", choices=list(TOOLS), default=list(TOOLS))
+    parser.add_argument("--seeds", type=int, help="at most so many of each case")
+    parser.add_argument("--out", type=Path, default=HERE / "results.json")
+    parser.add_argument("--table", action="store_true", help="write table and chart of the documentation, and stop")
+    chosen = parser.parse_args()
+    known = json.loads(chosen.out.read_text(encoding="utf-8")) if chosen.out.exists() else {"versions": {}, "cases": {}}
+    if chosen.table:
+        from table import write_documentation
+
+        write_documentation(known)
+        return 0
+    from cases import CASES, SERVO_FOLDER
+
+    tools = []
+    for tool in chosen.tools:
+        try:
+            importlib.import_module(TOOLS[tool][2])
+            importlib.import_module(TOOLS[tool][0])
+            known["versions"][TOOLS[tool][1]] = version(TOOLS[tool][1])
+            tools.append(tool)
+        except (ImportError, PackageNotFoundError) as error:
+            print(f"left out: {tool} is not installed ({error})", file=sys.stderr)
+    known["versions"]["python"] = platform.python_version()
+    for name in chosen.cases or CASES:
+        if CASES[name].needs_shared_recordings and not SERVO_FOLDER.is_dir():
+            print(f"left out: {name}, its recordings are not in {SERVO_FOLDER}", file=sys.stderr)
+            continue
+        made = run_case(name, tools, chosen.seeds)
+        before = known["cases"].get(name, {"tools": {}})["tools"]
+        known["cases"][name] = made | {"tools": before | made["tools"]}
+        chosen.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

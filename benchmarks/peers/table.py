@@ -1,0 +1,131 @@
+"""The documentation's table and chart of `results.json`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PAGE = REPOSITORY / "docs" / "explain" / "comparison.md"
+CHART = REPOSITORY / "docs" / "pictures" / "peers.png"
+BEGIN, END = "<!-- peers: begin -->", "<!-- peers: end -->"
+HELD_OUT = {"springs": (1e3, "mm"), "servo": (1.0, "rad")}  # scale and unit; torques elsewhere
+HEADER = (
+    "tool", "called known", "largest error of these", "called known, but wrong", "intervals that hold the truth",
+    "held out", "CPU [s]", "lines",
+)  # fmt: skip
+MADE_BY = {
+    "MuJoCo": "recordings by MuJoCo, the engine of `mujoco.sysid` and `least_squares`: an advantage for these two",
+    "real": "real recordings; the true values are not known",
+    "closed form": "recordings from a formula, no engine",
+}
+
+
+def figures(runs: list[dict[str, Any]], truth: Mapping[str, float]) -> dict[str, float | None]:
+    """Figures of one tool over the seeds of a case, none where they do not exist."""
+    done = [run for run in runs if "failed" not in run]
+    if not done:
+        return {}
+    found: dict[str, float | None] = {
+        "held_out": median(run["held_out"] for run in done),
+        "cpu": median(run["cpu"] for run in done),
+        "failed": len(runs) - len(done),
+    }
+    if not truth:
+        return found
+    errors = [max(run["errors"][name] for name in run["known"]) for run in done if run["known"]]
+    all_errors = median(max(run["errors"].values()) for run in done)
+    found |= {
+        "known": sum(len(run["known"]) for run in done),
+        "of": len(truth) * len(done),
+        "error": median(errors) if errors else None,
+        "error_of_all": all_errors,
+    }
+    if "stated" in done[0]:
+        found["wrong"] = sum(len(run["known_but_outside"]) for run in done)
+        found["holding"], found["stated"] = (sum(run[key] for run in done) for key in ("holding", "stated"))
+    return found
+
+
+def rows(case: str, entry: Mapping[str, Any]) -> list[list[str]]:
+    scale, unit = HELD_OUT.get(case, (1.0, "N m"))
+    lines = []
+    for tool, own in entry["tools"].items():
+        found = figures(own["runs"], entry["truth"])
+        if not found:
+            lines.append([f"`{tool}`", *["failed"] * 5, "", str(own.get("lines", ""))])
+            continue
+        cells = ["-"] * 4
+        if entry["truth"]:
+            error = found["error"]
+            shown = f"none; {100 * found['error_of_all']:.2g} % of all" if error is None else f"{100 * error:.2g} %"
+            cells[:2] = [f"{found['known']} of {found['of']}", shown]
+            cells[2:] = ["no intervals"] * 2
+            if "wrong" in found:
+                cells[2:] = [str(found["wrong"]), f"{found['holding']} of {found['stated']}"]
+        last = [f"{scale * found['held_out']:.2g} {unit}", f"{found['cpu']:.2g}", str(own["lines"])]
+        lines.append([f"`{tool}`", *cells, *last])
+    return lines
+
+
+def markdown(known: Mapping[str, Any]) -> str:
+    """One table for each case."""
+    versions = ", ".join(f"{name} {number}" for name, number in sorted(known["versions"].items()))
+    parts = [f"Versions: {versions}."]
+    for case, entry in known["cases"].items():
+        seeds = max(len(own["runs"]) for own in entry["tools"].values())
+        what = "folds" if entry["made_by"] == "real" else "draws of noise"
+        parts.append(f"**{entry['title'].capitalize()}** ({seeds} {what}; {MADE_BY[entry['made_by']]})")
+        table = [HEADER, ["---"] * len(HEADER), *rows(case, entry)]
+        parts.append("\n".join(f"| {' | '.join(row)} |" for row in table))
+    return "\n\n".join(parts)
+
+
+def write_documentation(known: Mapping[str, Any]) -> None:
+    """Renew the table between its marks in the page, and the chart."""
+    page = PAGE.read_text(encoding="utf-8")
+    text = f"{BEGIN}\n\n{markdown(known)}\n\n{END}"
+    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: text, page, flags=re.DOTALL), encoding="utf-8")
+    draw(known, CHART)
+
+
+def draw(known: Mapping[str, Any], path: Path) -> None:
+    """Wrong claims, held-out errors over the least of each case, and CPU time, by case and tool."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    cases = known["cases"]
+    tools = list(dict.fromkeys(tool for entry in cases.values() for tool in entry["tools"]))
+    figure, axes = plt.subplots(1, 3, figsize=(12, 0.55 * len(cases) + 1.6), sharey=True, layout="constrained")
+    for k, (entry, place) in enumerate(zip(cases.values(), range(len(cases)), strict=True)):
+        found = {tool: figures(own["runs"], entry["truth"]) for tool, own in entry["tools"].items()}
+        found = {tool: own for tool, own in found.items() if own}
+        least = min(own["held_out"] for own in found.values())
+        for tool, own in found.items():
+            at = tools.index(tool)
+            style = {"color": f"C{at}", "marker": "osD^vPX*"[at], "ls": "", "ms": 7, "alpha": 0.85}
+            style |= {
+                "label": tool if k == next(i for i, e in enumerate(cases.values()) if tool in e["tools"]) else None
+            }
+            y = place + 0.09 * (at - (len(tools) - 1) / 2)
+            share = 100 * own["wrong"] / own["known"] if own.get("known") and "wrong" in own else None
+            for axis, x in zip(axes, (share, own["held_out"] / least, own["cpu"]), strict=True):
+                if x is not None:
+                    axis.plot(x, y, **style)
+    axes[0].set_yticks(range(len(cases)), [entry["title"] for entry in cases.values()])
+    axes[0].invert_yaxis()
+    titles = ("called known, but wrong [%]", "held-out error over the least of the case", "CPU time [s]")
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set_xlabel(title)
+        axis.grid(alpha=0.3)
+    axes[1].set_xscale("log")
+    axes[2].set_xscale("log")
+    handles = {text: line for axis in axes for line, text in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(tools), frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
