@@ -3,9 +3,10 @@
     python benchmarks/peers [--cases NAME ...] [--tools NAME ...] [--seeds N] [--out FILE]
     python benchmarks/peers --table [--out FILE]
 
-The first writes figures to FILE (`results.json` beside this script) and keeps those of cases and tools that are not
-run. The second writes table and chart of the documentation from it. `pip install -e '.[peers]'` has what is needed but
-for opty, which needs an installed IPOPT (`pip install opty`). What is not installed is left out and named.
+The first adds to FILE (`results.json` beside this script) the figures of cases, tools and seeds that it lacks; delete
+it to begin anew. The second writes table and chart of the documentation from it. `pip install -e '.[peers]'` has what
+is needed but for opty, which needs an installed IPOPT (`pip install opty`). What is not installed is left out and
+named.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import platform
 import resource
 import sys
 import tempfile
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -37,38 +39,43 @@ def cpu_seconds() -> float:
     return sum(entry.ru_utime + entry.ru_stime for entry in used)
 
 
-def run_case(name: str, tools: list[str], seeds: int | None) -> dict[str, Any]:
-    """Figures of every tool and seed of one case; a tool that fails has its message in their place."""
+def run_case(name: str, tools: list[str], seeds: int | None, entry: dict[str, Any]) -> Iterator[None]:
+    """Add figures of every tool and seed that `entry` lacks, one at a time, or what a tool raises."""
     from cases import CASES
     from mujoco_models import SETTERS
     from score import score, user_lines, yaml_lines
 
-    case, found = CASES[name], {}
+    case = CASES[name]
     with tempfile.TemporaryDirectory() as folder:
         for seed in case.seeds[:seeds]:
-            trial = case.trial(seed, Path(folder) / str(seed))
+            trial = None
             for tool in tools:
                 by_case = importlib.import_module(TOOLS[tool][0]).BY_CASE
-                if name not in by_case:
+                done = [
+                    run["seed"] for key, own in entry["tools"].items() if key.startswith(tool) for run in own["runs"]
+                ]
+                if name not in by_case or seed in done:
                     continue
+                trial = trial or case.trial(seed, Path(folder) / str(seed))
+                entry["truth"] = dict(trial.truth)
                 before = cpu_seconds()
                 try:
                     answers = by_case[name](trial)
                 except Exception as error:  # what a tool raises is its answer
-                    answers = {}
-                    found.setdefault(tool, {"runs": []})["runs"].append({"seed": seed, "failed": str(error)})
+                    answers = f"{type(error).__name__}: {error}"
                 spent = cpu_seconds() - before
                 lines = user_lines(TOOLS[tool][0], by_case[name].__name__)
                 lines += yaml_lines(trial.config) if tool == "yid_ocp" else 0
                 if tool in ("mujoco.sysid", "least_squares") and name in SETTERS:
                     lines += user_lines("mujoco_models", SETTERS[name].__name__)
-                rows = answers if isinstance(answers, dict) else {"": answers}
-                for part, answer in rows.items():
-                    own = found.setdefault(f"{tool} {part}".strip(), {"runs": []})
+                for part, answer in (answers if isinstance(answers, dict) else {"": answers}).items():
+                    own = entry["tools"].setdefault(f"{tool} {part}".strip(), {"runs": []})
                     own["lines"] = lines
-                    own["runs"].append({"seed": seed, "cpu": spent, **score(trial, answer)})
+                    failed = isinstance(answer, str)
+                    figures = {"failed": answer} if failed else {"cpu": round(spent, 2), **score(trial, answer)}
+                    own["runs"].append({"seed": seed, **figures})
                 print(f"{name}, seed {seed}: {tool}, {spent:.1f} s of CPU time", file=sys.stderr, flush=True)
-    return {"title": case.title, "made_by": case.made_by, "truth": dict(trial.truth), "tools": found}
+                yield
 
 
 def main() -> int:
@@ -101,10 +108,12 @@ def main() -> int:
         if CASES[name].needs_shared_recordings and not SERVO_FOLDER.is_dir():
             print(f"left out: {name}, its recordings are not in {SERVO_FOLDER}", file=sys.stderr)
             continue
-        made = run_case(name, tools, chosen.seeds)
-        before = known["cases"].get(name, {"tools": {}})["tools"]
-        known["cases"][name] = made | {"tools": before | made["tools"]}
-        chosen.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        case = CASES[name]
+        entry = known["cases"].setdefault(
+            name, {"title": case.title, "made_by": case.made_by, "truth": {}, "tools": {}}
+        )
+        for _ in run_case(name, tools, chosen.seeds, entry):
+            chosen.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

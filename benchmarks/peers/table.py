@@ -31,7 +31,7 @@ def figures(runs: list[dict[str, Any]], truth: Mapping[str, float]) -> dict[str,
         return {}
     found: dict[str, float | None] = {
         "held_out": median(run["held_out"] for run in done),
-        "cpu": median(run["cpu"] for run in done),
+        "cpu": min(run["cpu"] for run in done),
         "failed": len(runs) - len(done),
     }
     if not truth:
@@ -62,7 +62,8 @@ def rows(case: str, entry: Mapping[str, Any]) -> list[list[str]]:
         if entry["truth"]:
             error = found["error"]
             shown = f"none; {100 * found['error_of_all']:.2g} % of all" if error is None else f"{100 * error:.2g} %"
-            cells[:2] = [f"{found['known']} of {found['of']}", shown]
+            failed = f"; {found['failed']} runs failed" if found["failed"] else ""
+            cells[:2] = [f"{found['known']} of {found['of']}{failed}", shown]
             cells[2:] = ["no intervals"] * 2
             if "wrong" in found:
                 cells[2:] = [str(found["wrong"]), f"{found['holding']} of {found['stated']}"]
