@@ -285,7 +285,7 @@ CASES: Mapping[str, Case] = MappingProxyType(
         "foam_noise": Case(
             "two-arm foam Y, torque noise", "MuJoCo", (1,), functools.partial(_two_arm_foam, foam.ROUGH)
         ),
-        "payload": Case("arm with payload, torque noise", "MuJoCo", tuple(range(1, 7)), _payload),
+        "payload": Case("arm with payload, torque noise", "MuJoCo", tuple(range(1, 6)), _payload),
         "servo": Case(
             "servo pendulum",
             "real",

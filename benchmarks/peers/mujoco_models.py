@@ -18,7 +18,7 @@ from scipy.signal import butter, filtfilt
 from yid_ocp.data.recording import JointGroup
 
 BANDWIDTH = 100.0  # of the actuators [rad/s]
-CUTOFF = 5.0  # of the smoothing of encoders [Hz]
+CUTOFF = 10.0  # of the smoothing of encoders [Hz]
 AT_ENDS = 0.3  # of a recording where the smoothing is wrong [s]
 KEPT = 3.0  # of torques, beyond which arms shake and encoders tell little [Hz]
 PRE_ROLL = 1.0  # in which what the arm holds comes to rest [s]
@@ -85,7 +85,12 @@ class Following:
         moving = (times >= 0)[:, None]
         position, velocity, acceleration = (path(np.clip(times, 0, t[-1]), k) for k in range(3))
         force = self.stiffness * position
-        return times, force + moving * (self.damping * velocity + self.inertia * acceleration)
+        if joints.effort is None:
+            return times, force + moving * (self.damping * velocity + self.inertia * acceleration)
+        # with the recorded torque the actuators have little left to do, and the arm does not sag
+        effort = joints.effort[:, [joints.names.index(name) for name in names]]
+        carried = CubicSpline(t, filtfilt(numerator, denominator, effort, axis=0))(np.clip(times, 0, t[-1]))
+        return times, force + moving * self.damping * velocity + carried
 
     def torques(self, controls: Any, states: Any, nq: int) -> Any:
         """Torques that acted in each step, shape (K, nj), of states *after* each step; damping acts implicitly."""

@@ -35,7 +35,7 @@ def fit(start: sysid.ParameterDict, residual: Any) -> tuple[Answer, sysid.Parame
     absl.logging.get_absl_logger().addHandler(handler)
     with contextlib.redirect_stdout(io.StringIO()):
         found, result = sysid.optimize(
-            start, residual, verbose=False, check_conditioning=True, x_scale="jac", eps=1e-5, max_iters=50
+            start, residual, verbose=False, check_conditioning=True, x_scale="jac", eps=1e-5, max_iters=30
         )
     absl.logging.get_absl_logger().removeHandler(handler)
     left, _, _ = residual(result.x, found)
