@@ -112,6 +112,7 @@ def main() -> int:
         entry = known["cases"].setdefault(
             name, {"title": case.title, "made_by": case.made_by, "truth": {}, "tools": {}}
         )
+        known["cases"] = {key: known["cases"][key] for key in CASES if key in known["cases"]}
         for _ in run_case(name, tools, chosen.seeds, entry):
             chosen.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
     return 0

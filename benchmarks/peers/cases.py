@@ -281,11 +281,13 @@ def _files(folder: Path, estimate: tuple | list, held_out: tuple | list) -> tupl
 
 CASES: Mapping[str, Case] = MappingProxyType(
     {
-        "foam": Case("two-arm foam Y, exact torques", "MuJoCo", (1,), functools.partial(_two_arm_foam, foam.CLEAN)),
-        "foam_noise": Case(
-            "two-arm foam Y, torque noise", "MuJoCo", (1,), functools.partial(_two_arm_foam, foam.ROUGH)
+        "foam": Case(
+            "two-arm foam Y, exact torques", "MuJoCo", (1, 2, 3), functools.partial(_two_arm_foam, foam.CLEAN)
         ),
-        "payload": Case("arm with payload, torque noise", "MuJoCo", tuple(range(1, 6)), _payload),
+        "foam_noise": Case(
+            "two-arm foam Y, torque noise", "MuJoCo", (1, 2, 3), functools.partial(_two_arm_foam, foam.ROUGH)
+        ),
+        "payload": Case("arm with payload, torque noise", "MuJoCo", tuple(range(1, 11)), _payload),
         "servo": Case(
             "servo pendulum",
             "real",
@@ -293,7 +295,7 @@ CASES: Mapping[str, Case] = MappingProxyType(
             lambda seed, folder: servo_trial(SERVO_KINDS[seed]),
             True,
         ),
-        "springs": Case("two springs in series, only the end seen", "closed form", (1, 2), _springs),
-        "scaled_torque": Case("torques recorded 15 % too large", "MuJoCo", (1, 2), _scaled_torque),
+        "springs": Case("two springs in series, only the end seen", "closed form", (1, 2, 3, 4, 5), _springs),
+        "scaled_torque": Case("torques recorded 15 % too large", "MuJoCo", (1, 2, 3, 4, 5), _scaled_torque),
     }
 )

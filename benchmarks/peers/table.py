@@ -13,6 +13,7 @@ PAGE = REPOSITORY / "docs" / "explain" / "comparison.md"
 CHART = REPOSITORY / "docs" / "pictures" / "peers.png"
 BEGIN, END = "<!-- peers: begin -->", "<!-- peers: end -->"
 HELD_OUT = {"springs": (1e3, "mm"), "servo": (1.0, "rad")}  # scale and unit; torques elsewhere
+MARKERS = "osD^v<>PX*"
 HEADER = (
     "tool", "called known", "largest error of these", "called known, but wrong", "intervals that hold the truth",
     "held out", "CPU [s]", "lines",
@@ -66,7 +67,10 @@ def rows(case: str, entry: Mapping[str, Any]) -> list[list[str]]:
             cells[:2] = [f"{found['known']} of {found['of']}{failed}", shown]
             cells[2:] = ["no intervals"] * 2
             if "wrong" in found:
-                cells[2:] = [str(found["wrong"]), f"{found['holding']} of {found['stated']}"]
+                cells[2:] = [
+                    str(found["wrong"]),
+                    f"{found['holding']} of {found['stated']}" if found["stated"] else "none stated",
+                ]
         last = [f"{scale * found['held_out']:.2g} {unit}", f"{found['cpu']:.2g}", str(own["lines"])]
         lines.append([f"`{tool}`", *cells, *last])
     return lines
@@ -78,8 +82,10 @@ def markdown(known: Mapping[str, Any]) -> str:
     parts = [f"Versions: {versions}."]
     for case, entry in known["cases"].items():
         seeds = max(len(own["runs"]) for own in entry["tools"].values())
-        what = "folds" if entry["made_by"] == "real" else "draws of noise"
-        parts.append(f"**{entry['title'].capitalize()}** ({seeds} {what}; {MADE_BY[entry['made_by']]})")
+        what = "kinds of motion, each held out once" if entry["made_by"] == "real" else "draws of noise"
+        parts.append(
+            f"**{entry['title'][0].upper()}{entry['title'][1:]}** ({seeds} {what}; {MADE_BY[entry['made_by']]})"
+        )
         table = [HEADER, ["---"] * len(HEADER), *rows(case, entry)]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in table))
     return "\n\n".join(parts)
@@ -102,24 +108,21 @@ def draw(known: Mapping[str, Any], path: Path) -> None:
 
     cases = known["cases"]
     tools = list(dict.fromkeys(tool for entry in cases.values() for tool in entry["tools"]))
-    figure, axes = plt.subplots(1, 3, figsize=(12, 0.55 * len(cases) + 1.6), sharey=True, layout="constrained")
-    for k, (entry, place) in enumerate(zip(cases.values(), range(len(cases)), strict=True)):
+    figure, axes = plt.subplots(1, 3, figsize=(12, 0.6 * len(cases) + 1.9), sharey=True, layout="constrained")
+    for place, entry in enumerate(cases.values()):
         found = {tool: figures(own["runs"], entry["truth"]) for tool, own in entry["tools"].items()}
         found = {tool: own for tool, own in found.items() if own}
         least = min(own["held_out"] for own in found.values())
         for tool, own in found.items():
             at = tools.index(tool)
-            style = {"color": f"C{at}", "marker": "osD^vPX*"[at], "ls": "", "ms": 7, "alpha": 0.85}
-            style |= {
-                "label": tool if k == next(i for i, e in enumerate(cases.values()) if tool in e["tools"]) else None
-            }
+            style = {"color": f"C{at}", "marker": MARKERS[at % len(MARKERS)], "ls": "", "ms": 7, "label": tool}
             y = place + 0.09 * (at - (len(tools) - 1) / 2)
             share = 100 * own["wrong"] / own["known"] if own.get("known") and "wrong" in own else None
             for axis, x in zip(axes, (share, own["held_out"] / least, own["cpu"]), strict=True):
                 if x is not None:
                     axis.plot(x, y, **style)
     axes[0].set_yticks(range(len(cases)), [entry["title"] for entry in cases.values()])
-    axes[0].invert_yaxis()
+    axes[0].set_ylim(len(cases) - 0.5, -0.5)
     titles = ("called known, but wrong [%]", "held-out error over the least of the case", "CPU time [s]")
     for axis, title in zip(axes, titles, strict=True):
         axis.set_xlabel(title)
@@ -127,6 +130,7 @@ def draw(known: Mapping[str, Any], path: Path) -> None:
     axes[1].set_xscale("log")
     axes[2].set_xscale("log")
     handles = {text: line for axis in axes for line, text in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(tools), frameon=False)
+    shown = {tool: handles[tool] for tool in tools if tool in handles}
+    figure.legend(shown.values(), shown.keys(), loc="outside upper center", ncols=5, frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
