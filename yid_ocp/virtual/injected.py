@@ -270,7 +270,7 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
     # as firm as the inner step allows
     model.dof_frictionloss[at] = _NO_FRICTION
     model.dof_solref[at, 0], model.dof_solimp[at, :2] = _FRICTION_TIME_STEPS * model.opt.timestep, 0.999
-    load = _gear_load(scene, model, at) if np.any(sizes["share"]) else None
+    gear_load = _gear_load(scene, model, at) if np.any(sizes["share"]) else None
     apart = int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
 
     def hold(model: Any, data: Any) -> None:
@@ -278,8 +278,8 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
         if model.opt.disableflags & apart or not scene.has_motion_begun:
             return
         size = sizes["tau_c"] + sizes["tau_s"] * np.exp(-((data.qvel[at] / speeds) ** 2))
-        if load is not None:
-            size += sizes["share"] * np.abs(load(data))
+        if gear_load is not None:
+            size += sizes["share"] * np.abs(gear_load(data))
         model.dof_frictionloss[at] = np.maximum(size, _NO_FRICTION)
 
     return hold
@@ -294,7 +294,7 @@ def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], 
             drag[i] = float(value(servo.damping)[0])
     body, others = model.jnt_bodyid[at], np.array([model.joint(name).id for name in object_joint_names(scene.system)])
 
-    def load(data: Any) -> Array:
+    def gear_load(data: Any) -> Array:
         reach = data.subtree_com[body] - data.xanchor[at]
         weight = model.body_subtreemass[body, None] * model.opt.gravity
         outside = np.einsum("ij,ij->i", data.xaxis[at], np.cross(reach, weight))
@@ -305,7 +305,7 @@ def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], 
             outside += rows[:, at].T @ pull
         return np.asarray(data.qfrc_actuator[at] + data.qfrc_applied[at] - drag * data.qvel[at] - outside)
 
-    return load
+    return gear_load
 
 
 def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
