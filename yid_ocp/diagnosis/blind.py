@@ -277,14 +277,14 @@ class BlindCaseGenerator:
     ) -> Recording:
         """Simulate one recording with injected effects, without description and ground truth."""
         nominal, posture = self.simulated_system, self.initial_configuration
-        is_finer = planned is not None and planned.category == "finer_chain" and self._finer is not None
-        system = self._finer(2) if is_finer and self._finer is not None else nominal
+        finer = self._finer if planned is not None and planned.category == "finer_chain" else None
+        system = nominal if finer is None else finer(2)
         friction = [
             InjectedEffect(own.kind, own.location, {q.name: truth[f"{own.label}.{q.name}"] for q in own.definitions})
             for own in self._ordinary_friction
         ]
         own = {name: value for name, value in truth.items() if name in nominal.parameters.names}
-        values = scale_parameters_to_more_links(nominal, system, own) if is_finer else own
+        values = own if finer is None else scale_parameters_to_more_links(nominal, system, own)
         is_held = self.conditions.ordinary_friction is not None
         conditions = replace(self.conditions, ordinary_friction=tuple(friction) if is_held else None)
         conditions = replace(conditions, is_brisk=planned is not None and planned.is_brisk)

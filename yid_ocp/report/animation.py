@@ -135,12 +135,12 @@ def _with_merged_vertices(mesh: TriangleMesh, cell: float) -> TriangleMesh:
 
 def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -> list[list[int]]:
     """Place and quaternion (x, y, z, w) of joints at configurations (F, n), as integers, a row for each moment."""
+    if not names:
+        return []
     symbols, index = ca.SX.sym("q", system.n_coordinates), system.mechanism.joint_index
     moved = forward_kinematics(system.mechanism, symbols)
     parts = [ca.horzcat(moved.joint_rotations[index(name)], moved.joint_origins[index(name)]) for name in names]
-    function = ca.Function("poses", [symbols, system.parameters.symbols], [ca.densify(ca.horzcat(ca.SX(3, 0), *parts))])
-    if not names:
-        return []
+    function = ca.Function("poses", [symbols, system.parameters.symbols], [ca.densify(ca.horzcat(*parts))])
     found = np.array(function.map(len(q))(q.T, np.tile(theta[:, None], (1, len(q)))))
     poses = found.reshape(3, len(q), len(names), 4).transpose(1, 2, 0, 3)
     turned = Rotation.from_matrix(poses[..., :3].reshape(-1, 3, 3)).as_quat().reshape(*poses.shape[:2], 4)

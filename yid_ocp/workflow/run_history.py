@@ -340,18 +340,22 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     ]
     found = [result.get("model", result)["parameters"] for result in results]
     runs = dict(zip(labels, map(str, folders), strict=True))
-    told: dict[str, Any] = {"format": "yid-overlay/1", "runs": runs, "parameters": _overlaid_parameters(labels, found)}
+    parameters = _overlaid_parameters(labels, found)
+    told = {"format": "yid-overlay/1", "runs": runs, "parameters": parameters, "channels": channels}
+    first = _settings(folders[0])
     settings = RunSettings(name="overlay", description="Two runs of the same recordings, one over the other.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in folders}
         folder.log_command_start(["report", *map(str, folders)])
-        more: dict[str, Any] = {
-            "animations": _overlaid_motions(folders, labels, found),
-            "section_data": {"overlay": pairs},
-        }
-        more["robot"] = None if (first := _settings(folders[0])) is None else first.model.robot
-        told |= {"channels": channels}
-        written = folder.write_result_and_report(settings, progress, told, "overlay.json", **more)
+        written = folder.write_result_and_report(
+            settings,
+            progress,
+            told,
+            "overlay.json",
+            animations=_overlaid_motions(folders, labels, found),
+            section_data={"overlay": pairs},
+            robot=None if first is None else first.model.robot,
+        )
     return CommandOutcome(folder.path, written, None)
 
 
