@@ -142,8 +142,7 @@ def test_dask_is_optional(monkeypatch):
 
 def test_a_scheduler_file_will_do(scheduler, tmp_path):
     file = tmp_path / "scheduler.json"
-    with distributed.Client(scheduler.address, set_as_default=False) as client:
-        client.write_scheduler_file(str(file))
+    file.write_text(json.dumps({"type": "Scheduler", "address": scheduler.address}))
     [found] = run_tasks(deadly, [Task("", {"number": 5})], tmp_path / "results", WorkerConfig(None, str(file)))
     assert found.value == 5
 
