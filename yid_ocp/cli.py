@@ -41,9 +41,6 @@ class _CliCommand:
     add_arguments: Callable[[argparse.ArgumentParser], None]
 
 
-# -- arguments --------------------------------------------------------------------------------------------------------
-
-
 def _switch(parser: argparse.ArgumentParser, flag: str, text: str) -> None:
     parser.add_argument(flag, action="store_true", help=text)
 
@@ -260,8 +257,6 @@ def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
 
-# -- completion -------------------------------------------------------------------------------------------------------
-
 _EXPORT_FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
 
 
@@ -319,8 +314,6 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
         return settable_keys_with_prefix(prefix)
 
 
-# -- commands ---------------------------------------------------------------------------------------------------------
-
 _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and experiments that would determine more"
 _SAID_BLIND = "test the diagnosis on synthetic recordings with sealed effects; resumes an interrupted test"
 _SAID_REPORT = "compare runs of one model: changed parameters, deviating runs; overlay two of the same recordings"
@@ -349,9 +342,6 @@ COMMANDS = tuple(
         ("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
     )
 )
-
-
-# -- running ----------------------------------------------------------------------------------------------------------
 
 
 class _Parser(argparse.ArgumentParser):

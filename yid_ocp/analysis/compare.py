@@ -226,7 +226,6 @@ def _resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
-# -- estimates of Caldwell et al. (2014) ------------------------------------------------------------------------------
 # Their recordings are not public. Statements rest on synthetic recordings of the experiments in MuJoCo with a chosen
 # truth: what they inform, where steepest descent with the published cost and step lengths is after 200 iterations,
 # and where constant errors of the torques lead it (`benchmarks/torque_ensemble.py`).

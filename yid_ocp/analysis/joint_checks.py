@@ -278,7 +278,6 @@ def check_joint_excitation(
             yield Issue("weak_excitation", words, "warning", depth, advice, *where, setting=line)
 
 
-# -- efforts ----------------------------------------------------------------------------------------------------------
 # With measured effort e_j of joint j and the effort w_j that bodies and gravity need (Newton and Euler),
 #
 #     e_j / g_j = w_j + c_j + d_j v_j + s_j sign(v_j) + k_j q_j + (J' f)_j,

@@ -237,8 +237,6 @@ def _answers(
     return largest
 
 
-# -- sparsity ---------------------------------------------------------------------------------------------------------
-
 _ZERO_RTOL = 1e-14  # of the largest entry: rounding
 
 

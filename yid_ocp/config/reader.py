@@ -66,9 +66,6 @@ def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> li
     return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
 
 
-# -- reading ----------------------------------------------------------------------------------------------------------
-
-
 def _read(path: Path) -> str:
     try:
         return read_input_text(path, _MAX_BYTES)
@@ -235,9 +232,6 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
         name, rest, below = ".".join(parts[:cut]), parts[cut:], values
     path, found = _key_path(below, rest, origin, raw.get(name) if isinstance(raw, dict) else None)
     return (name, *path), found
-
-
-# -- values -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

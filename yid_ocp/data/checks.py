@@ -129,9 +129,6 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
     return [replace(doubt, recording=recording.name) for doubt in chain(_few_samples(recording), found)]
 
 
-# -- clocks -----------------------------------------------------------------------------------------------------------
-
-
 def _units_of_time(recording: Recording) -> Iterator[Issue]:
     for group in recording.all_groups:
         step, limits = median_sample_period(group.t), QUALITY_LIMITS
@@ -198,9 +195,6 @@ def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
         advice = "find the cause; torques are interpolated between the remaining samples"
         ratio = missing / QUALITY_LIMITS.max_missing_fraction
         yield Issue("dropped_samples", what, "warning", ratio, advice, "", "joints", "t")
-
-
-# -- motion -----------------------------------------------------------------------------------------------------------
 
 
 def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array]:
@@ -281,9 +275,6 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         what = f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise"
         advice = "record a motion; at rest only static parameters can be found"
         yield Issue("standstill", what, "warning", 1 / max(*moved, 1e-3), advice, "")
-
-
-# -- several recordings -----------------------------------------------------------------------------------------------
 
 
 def _transitions(one: JointGroup | PointGroup, other: JointGroup | PointGroup) -> tuple[IntArray, IntArray]:

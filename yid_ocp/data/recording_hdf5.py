@@ -213,8 +213,6 @@ def _json(text: str, where: str) -> Any:
         raise DataError(what, where=where, allowed="a list in JSON", hint=hint) from error
 
 
-# -- safe access -------------------------------------------------------------------------------------------------------
-
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]
 _MAX_GROUP_DEPTH = 10
 

@@ -204,9 +204,6 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
     return cls(kind, location, Parameters(entries), internal, definitions, joints)
 
 
-# -- where effects can sit --------------------------------------------------------------------------------------------
-
-
 def segment_names(system: System) -> tuple[str, ...]:
     """Names of the flexible object's segments."""
     return tuple(segment.name for segment in system.segment_layouts)

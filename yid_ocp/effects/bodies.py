@@ -283,9 +283,6 @@ class RotorInertia(EffectBase):
         return StepTerms(lagrangian=self["armature"] / 2 * v**2)
 
 
-# -- gravity and air --------------------------------------------------------------------------------------------------
-
-
 @EFFECTS.register("aerodynamic_drag")
 class AerodynamicDrag(EffectBase):
     """Quadratic air drag on a segment's links. The force is F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.

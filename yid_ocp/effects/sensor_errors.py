@@ -136,8 +136,6 @@ class _ClockScale(EffectBase):
         return replace(system, recorded_time_scale=system.recorded_time_scale / self["scale"])
 
 
-# -- wrist force/torque sensors and inertial units --------------------------------------------------------------------
-
 _MOUNTED_COMPONENTS = {
     "wrist": (("force", "N", 200.0, 5.0), ("torque", "N m", 20.0, 0.5)),
     "imu": (("angular_velocity", "rad/s", 1.0, 0.05), ("specific_force", "m/s^2", 10.0, 0.5)),

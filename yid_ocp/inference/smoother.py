@@ -429,8 +429,6 @@ def _alternatives(
     return drop, found
 
 
-# -- places -----------------------------------------------------------------------------------------------------------
-
 _MIN_NAMED_SHARE = 0.1  # share of the gap from which a place is named
 _MAX_NAMED_LOCATIONS = 3  # places that are named at most
 

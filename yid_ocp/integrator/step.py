@@ -233,9 +233,6 @@ def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[in
     return array
 
 
-# -- rollouts ----------------------------------------------------------------------------------------------------------
-
-
 def simulate(
     step: Step,
     theta: ArrayLike,

@@ -304,9 +304,6 @@ def _arrived(job: _Job, elsewhere: bool) -> TaskResult | None:
     return found
 
 
-# -- processes --------------------------------------------------------------------------------------------------------
-
-
 def _in_own_processes(jobs: Sequence[_Job], finished: _TaskFinishedCallback, count: int) -> None:
     """Run jobs in processes, and repeat those that were lost when a process crashed."""
     rest = list(jobs)
@@ -332,9 +329,6 @@ def _with_pool(workers: int, jobs: Sequence[_Job], finished: _TaskFinishedCallba
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-# -- a cluster ---------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

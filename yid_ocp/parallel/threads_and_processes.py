@@ -80,9 +80,6 @@ class CasadiLockedCache(Generic[_Key, _Value]):
         return self._known[key]
 
 
-# -- batched evaluation -----------------------------------------------------------------------------------------------
-
-
 class _Abandoned(BaseException):
     """Raised in an item that waits for an answer that will not come."""
 
@@ -218,9 +215,6 @@ def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[
     if errors:
         raise errors[min(errors)]
     return [results[index] for index in range(len(entries))]
-
-
-# -- processes --------------------------------------------------------------------------------------------------------
 
 
 class InlineExecutor(Executor):

@@ -267,9 +267,6 @@ class TargetMotionSearch:
         return (np.full(len(value), _FAILED_ROLLOUT_RESIDUAL), np.zeros_like(slope))[part]
 
 
-# -- motions that tell most -------------------------------------------------------------------------------------------
-
-
 def _prior(columns: int, bounded: Sequence[int]) -> Array:
     """Information beforehand: of parameters `MAX_WEAK_RELATIVE_STD`, of all else next to none (it is in the rows)."""
     prior = np.full(columns, 1e-6)

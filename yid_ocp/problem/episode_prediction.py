@@ -72,8 +72,6 @@ class EpisodePredictor:
         """System whose motion the step computes."""
         return self.model_functions.step.system
 
-    # -- the start ----------------------------------------------------------------------------------------------------
-
     @property
     def estimated_initial_state_indices(self) -> tuple[int, ...]:
         """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
@@ -162,8 +160,6 @@ class EpisodePredictor:
         """Whether a filter keeps the driven joints on their measured motion by their momenta too."""
         return bool(self.system.driven) and not self.system.servos and self.options.arm_tracking_feedback == "lqr"
 
-    # -- what drives the rollout --------------------------------------------------------------------------------------
-
     def inputs_with_effect_momentum_shift(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
@@ -217,8 +213,6 @@ class EpisodePredictor:
             )
             arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
         return CorrectedInputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
-
-    # -- the rollout and its readings ---------------------------------------------------------------------------------
 
     def predict_episode(
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
@@ -407,8 +401,6 @@ class EpisodePredictor:
         total[:, :, : len(wanted)] += read.by_theta
         return read.output, total
 
-    # -- the adjoint --------------------------------------------------------------------------------------------------
-
     def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
@@ -493,9 +485,6 @@ class _Trajectory:
     by_effort: Array | None
     by_torque: Array | None
     by_multipliers: Array | None
-
-
-# -- what a recording shows of its start and of its loads --------------------------------------------------------------
 
 
 def with_seen_equilibrium_and_denoised_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:

@@ -169,8 +169,6 @@ class EstimationProblem(ReprMixin):
             f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows
         )
 
-    # -- what it is made of -------------------------------------------------------------------------------------------
-
     @property
     def initial_unknowns(self) -> Array:
         """Initial unknown vector of initial parameter values and zero state offsets, shape (nx,)."""
@@ -221,8 +219,6 @@ class EstimationProblem(ReprMixin):
         """Whether all effects that correct recorded inputs, times or tracked references are neutral and fixed."""
         return all(self.predictor.has_no_input_corrections(episode, self.theta) for episode in self.episodes)
 
-    # -- the unknown vector -------------------------------------------------------------------------------------------
-
     def theta_and_initial_state_deviation(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Extract theta and the initial state offset of episode number `episode` from the unknown vector."""
         return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
@@ -235,8 +231,6 @@ class EstimationProblem(ReprMixin):
     def named_values(self, x: Array) -> dict[str, float]:
         """Values of the unknown vector `x` by unknown name."""
         return dict(zip(self.unknown_names, map(float, x), strict=True))
-
-    # -- evaluation ---------------------------------------------------------------------------------------------------
 
     def evaluate(
         self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
@@ -323,8 +317,6 @@ class EstimationProblem(ReprMixin):
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
         return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameters, guess)
 
-    # -- held-out recordings ------------------------------------------------------------------------------------------
-
     def predict_held_out(
         self, x: ArrayLike, derivatives: bool = False
     ) -> list[tuple[Episode, EpisodePrediction | str]]:
@@ -359,8 +351,6 @@ class EstimationProblem(ReprMixin):
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return theta
 
-    # -- without data -------------------------------------------------------------------------------------------------
-
     def simulate_synthetic_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
     ) -> Recording:
@@ -382,8 +372,6 @@ class EstimationProblem(ReprMixin):
         """
         theta = self.with_parameter_values(values or {}).theta
         return synthesize_recording(self.predictor, self.episodes[recording], theta, seed)
-
-    # -- problems like this one ---------------------------------------------------------------------------------------
 
     def with_free_parameters_without_recompiling(self, names: Sequence[str]) -> EstimationProblem:
         """Choose other free parameters from `free` and `may_free`. Compiled functions are shared."""

@@ -26,8 +26,6 @@ from yid_ocp.sensors.joints import (
     joint_torque_noise_std,
 )
 
-# -- baselines without a model -----------------------------------------------------------------------------------------
-
 
 def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGroup:
     """Point group of a recording that contains all given points; raises `DataError` where there is none."""
@@ -133,9 +131,6 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
     return result
 
 
-# -- channels beside their measurements --------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelPrediction(ReprMixin):
     """Measured and predicted samples (M, w) of one channel. w is 3 for a point, 1 for a joint."""
@@ -200,9 +195,6 @@ def rmse_unit_and_count_by_channel(
                 units[channel] = samples.sensor.unit
     seen = ((channel, values) for channel, values in squares.items() if values)
     return {name: {"rmse": float(np.sqrt(np.mean(x))), "unit": units[name], "n": len(x)} for name, x in seen}
-
-
-# -- synthetic recordings: a rollout at given parameters as sensors would record it ------------------------------------
 
 
 def recording_from_prediction(

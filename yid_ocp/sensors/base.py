@@ -81,9 +81,6 @@ class SensorOptions:
     ] = field(default_factory=dict)
 
 
-# -- what a recording holds -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ChannelSpecification:
     """One kind of recorded quantity, with its group, dataset, unit, components and sensor constants.
@@ -205,9 +202,6 @@ def expand_to_joint_values(
         return np.array([float(given[name]) for name in names])
     wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
     return wide[[list(recorded).index(name) for name in names]]
-
-
-# -- what a sensor reads ----------------------------------------------------------------------------------------------
 
 
 class Sensor(ABC):

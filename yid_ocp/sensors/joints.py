@@ -184,9 +184,6 @@ def nodes_and_decorrelated_values(
     return kept, measured[kept]
 
 
-# -- noise levels -----------------------------------------------------------------------------------------------------
-
-
 def is_noise_std_stated(joints: RecordedJointGroup, group: str, choice: SensorOptions) -> bool:
     """Whether the recording or the settings specify the noise of `group`, `joints.effort` or `joints.position`.
 

@@ -151,8 +151,6 @@ def _with_encoder_noise(
     return total, covariance / (total[:, :, None] * total[:, None, :])
 
 
-# -- inertial measurement units ----------------------------------------------------------------------------------------
-
 _XYZ = ("x", "y", "z")
 _ANGULAR_VELOCITY = CHANNEL_KINDS.register("imu.angular_velocity")(
     ChannelSpecification("imu", "angular_velocity", "rad/s", _XYZ)

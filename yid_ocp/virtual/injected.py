@@ -212,9 +212,6 @@ def _memory_law(
     return _in_motion(made)
 
 
-# -- effects of the library -------------------------------------------------------------------------------------------
-
-
 def _aerodynamic_drag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
     mujoco, segment = import_mujoco(), scene.system.segment_layout(place)
     radius = float(scene.value(segment.radius)[0])
@@ -378,9 +375,6 @@ _FORCES: Mapping[str, _ForceBuilder] = {  # of the library's effects
     "effort_lag": _in_motion(_effort_lag),
 }
 INJECTABLE_EFFECT_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCES, *_SENSOR_ERROR_KINDS)
-
-
-# -- effects outside the library --------------------------------------------------------------------------------------
 
 
 def _gusts(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:

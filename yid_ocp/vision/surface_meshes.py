@@ -406,8 +406,6 @@ def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = N
     return meshes
 
 
-# -- the virtual camera -----------------------------------------------------------------------------------------------
-
 # edges and middles of thin boxes [m]
 _FLOOR_AND_WALL = (([8.0, 8.0, 0.02], [1.0, 0.0, -0.94]), ([0.02, 8.0, 3.0], [-0.61, 0.0, 0.5]))
 _PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way

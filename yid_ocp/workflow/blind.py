@@ -141,9 +141,6 @@ def run_blind(
     return score_slices([write_slice(found, proof.folder)], proof.folder, runs, progress)
 
 
-# -- the ensemble -----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Proof:
     """Settings of a blind validation, its folder and its workers."""
@@ -248,9 +245,6 @@ class _Proof:
         return [values[i] for i in range(len(tasks))]
 
 
-# -- tasks ------------------------------------------------------------------------------------------------------------
-
-
 def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -> dict[str, int]:
     """Task: write an experiment's first recording and the detectable size of every candidate."""
     first = Path(folder) / f"{name}.h5"
@@ -326,9 +320,6 @@ def _true_effect_closure(
 def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> blind.BlindCase:
     *estimate, held_out = map(read_recording, recordings)
     return blind.BlindCase(name, tuple(estimate), held_out, tuple(without))
-
-
-# -- experiments ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

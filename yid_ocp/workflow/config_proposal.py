@@ -222,9 +222,6 @@ def _torque_bias_std(tree: Mechanism, recorded: JointGroup, joints: Sequence[str
     return {name: _TORQUE_BIAS_FRACTION * limit for name, limit in limits.items() if 0 < limit < math.inf}
 
 
-# -- arms -------------------------------------------------------------------------------------------------------------
-
-
 def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
     for j in range(len(tree.joints)):
         if j not in tree.parent_joint_indices:
@@ -338,9 +335,6 @@ def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | 
             if later.joints is not None and _travel(later, joints) > _MIN_ARM_TRAVEL:
                 return time
     return None
-
-
-# -- points -----------------------------------------------------------------------------------------------------------
 
 
 def _places(
@@ -489,9 +483,6 @@ def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array
     columns = [group.names.index(name) for name in tree.joint_names]
     angles = np.stack([np.interp(t, group.t, group.position[:, j]) for j in columns])
     return np.array(ca.Function("pose", [q], [pose]).map(len(t))(angles)).reshape(4, len(t), 4).transpose(1, 0, 2)
-
-
-# -- noise and rates --------------------------------------------------------------------------------------------------
 
 
 def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) -> dict[str, _GroupNoise]:

@@ -93,9 +93,6 @@ def _shift_notes(begin: str, shift: float) -> list[str]:
     return [f"{begin}{shift:g} s were added to all times, as stamps cannot be negative"] if shift else []
 
 
-# -- models -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _CalibratedModel:
     """Final model of a run: settings with found effects, parameter values and stds."""
@@ -289,9 +286,6 @@ def _fall(pairs: Sequence[tuple[ReplayErrorAgainstRecording, ReplayErrorAgainstR
     """Mean part by which errors beyond the noise fall, of pairs before and after; None if there was none before."""
     parts = [1 - a.rmse_beyond_noise / b.rmse_beyond_noise for b, a in pairs if b.rmse_beyond_noise > 0]
     return sum(parts) / len(parts) if parts else None
-
-
-# -- signals ----------------------------------------------------------------------------------------------------------
 
 
 def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:

@@ -81,9 +81,6 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-# -- arguments --------------------------------------------------------------------------------------------------------
-
-
 def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject | None:
     """The described object, if any; `ConfigError` for a number that is missing or impossible, and names its option."""
     templates, word = init_command_object_factories(), arguments.object
@@ -125,9 +122,6 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
             raise ConfigError(f"'{text}' is no grasp", where="--grasp", allowed="FRAME=POINT, such as tool0=w_cable")
         grasps[frame] = point
     return grasps
-
-
-# -- files ------------------------------------------------------------------------------------------------------------
 
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
@@ -225,8 +219,6 @@ def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -
     data = ReportData(f"{out.stem}: what init guessed", run.description, result, **known)
     return str(page) if write_report(page, data) else None
 
-
-# -- text of the configuration ----------------------------------------------------------------------------------------
 
 _PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")  # text that YAML reads as it stands
 _YAML_KEYWORDS = ("true", "false", "null", "yes", "no", "on", "off")

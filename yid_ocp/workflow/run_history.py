@@ -293,9 +293,6 @@ def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
     }
 
 
-# -- two runs of the same recordings ----------------------------------------------------------------------------------
-
-
 def _have_same_recordings(folders: Sequence[Path]) -> bool:
     """Whether two runs are of the same recordings; `ConfigError` where they share some but not all."""
     inputs = [read_result_file(folder / "result.json").get("inputs", {}) for folder in folders]

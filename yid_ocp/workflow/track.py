@@ -130,9 +130,6 @@ def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
     return [frames[k] for k in sorted(chosen)]
 
 
-# -- result -----------------------------------------------------------------------------------------------------------
-
-
 def _track_result(
     frames: Sequence[FrameReport],
     common: SequenceCalibration,
@@ -224,9 +221,6 @@ def _truth_errors(
     }
 
 
-# -- frames -----------------------------------------------------------------------------------------------------------
-
-
 def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFramesWithTruth]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
     from yid_ocp.virtual.experiment import VirtualExperimentSettings, record_simulation
@@ -282,9 +276,6 @@ def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Reco
     sequence, scene = _read_frames(run, "frames_path"), _camera_scene(run, system)
     background = None if run.track.background_frames_path is None else _read_frames(run, "background_frames_path")
     return FrameTracker(scene, recording, sequence, run.track.options, background), recording
-
-
-# -- tasks ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

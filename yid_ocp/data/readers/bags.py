@@ -42,9 +42,6 @@ _KNOWN = (*_JOINT_TYPES, *_PLACES, *_MOUNTED)
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu", "data", "data_raw")
 
 
-# -- an open bag ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class BagMessage:
     """One message of a bag with topic, time of recording and header stamp [ns], and decoded content."""
@@ -129,9 +126,6 @@ def relative_message_time_function(
         return ((message.stamp if stamped else message.logged) - origin) * 1e-9
 
     return seconds
-
-
-# -- joints and points of a bag ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -358,9 +352,6 @@ def _numbers(content: Any, names: str) -> tuple[float, ...]:
     return tuple(float(getattr(content, name)) for name in names)
 
 
-# -- wrist sensors and inertial units ---------------------------------------------------------------------------------
-
-
 def _mounted_sensors(
     bag: _Contents, groups: Sequence[_States], seconds: Callable[[BagMessage], float]
 ) -> Iterator[SensorChannelGroup]:
@@ -385,9 +376,6 @@ def _sensor_group(
         stds = {f"{key}_std": math.sqrt(own.mean()) for key, own in getattr(first, "variances", {}).items()}
         t = np.array([seconds(message) for message in messages])
         yield SensorChannelGroup(group, (first.frame.strip("/") or name,), t, values, stds)
-
-
-# -- joints -----------------------------------------------------------------------------------------------------------
 
 
 class _States(NamedTuple):
@@ -496,9 +484,6 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
     return JointGroup(entry.wanted, t, **channels)
 
 
-# -- points -----------------------------------------------------------------------------------------------------------
-
-
 _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 
@@ -562,9 +547,6 @@ def _positions(
     for (time, point), coordinates in seen.items():
         array[rows[time], columns[point]] = coordinates
     return tuple(names), np.array(times), array
-
-
-# -- preview ----------------------------------------------------------------------------------------------------------
 
 
 def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> base.TopicOrColumnSummary:

@@ -29,9 +29,6 @@ SIZE_DESCRIPTIONS = {"length": "its length [m]", "mass": "its mass [kg]", "radiu
 _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 
-# -- what holds an object ---------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
     """Mount of an object, with the parent frame and the pose of the object's root in it."""
@@ -124,9 +121,6 @@ class CableTopology:
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
         return np.array([self.undeformed_positions[vertex] for vertex in chain], float)
-
-
-# -- what `init` asks for and writes ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

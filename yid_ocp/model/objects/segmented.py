@@ -87,9 +87,6 @@ class FlexibleSegmentSettings:
         )
 
 
-# -- the command line of `init` ---------------------------------------------------------------------------------------
-
-
 def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> FlexibleSegmentSettings:
     """A segment as `init` writes it; a flat one bends across its thinner side alone, about the other axis."""
     section = more.get("cross_section_size")
