@@ -33,8 +33,6 @@ _ERROR_FORMAT = "yid-error/1"
 
 @dataclass(frozen=True)
 class _CliCommand:
-    """A command; `run` gives the exit code: a function, or a module of `workflow` with `run_from_arguments`."""
-
     name: str
     help: str
     run: str | Callable[[argparse.Namespace], int]
@@ -429,7 +427,6 @@ def _wrong(error: YidError, as_json: bool) -> int:
 
 
 def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
-    """Print an error as JSON on standard output, where `--json` is set."""
     if as_json:
         print(json.dumps({"format": _ERROR_FORMAT, "kind": kind, "what": what, **parts, "exit_code": code}, indent=1))
 

@@ -30,7 +30,6 @@ class ReprMixin:
         return f"<{type(self).__name__}: {self._summary().one_line}>"
 
     def _repr_html_(self) -> str:
-        """HTML for notebooks."""
         said = self._summary()
         text = f"<p><b>{type(self).__name__}</b>: {html.escape(said.one_line)}</p>"
         if len(said.table_rows) < 2:

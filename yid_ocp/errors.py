@@ -111,7 +111,6 @@ def unknown_name_error_arguments(name: str, known: Iterable[str]) -> dict[str, s
 
 
 def _close(name: str, names: Sequence[str], count: int) -> list[str]:
-    """Known names similar to a name, most similar first, without regard to case."""
     plain = {entry.lower(): entry for entry in reversed(names)}
     return [plain[entry] for entry in difflib.get_close_matches(name.lower(), plain, n=count, cutoff=0.5)]
 
@@ -122,7 +121,6 @@ def _meant(name: str, names: Sequence[str]) -> str:
 
 
 def _listed(name: str, names: Sequence[str]) -> str:
-    """All names, or the most similar ones of many."""
     close = _close(name, names, _N_NEAREST_NAMES)
     if len(names) <= _N_NEAREST_NAMES or (not close and len(names) <= _MAX_LISTED_NAMES):
         return ", ".join(names)

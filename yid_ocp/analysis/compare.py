@@ -130,7 +130,6 @@ def compare_methods(
 
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
-    """Sentences on found parameters in which a method differs from the best one."""
     sentences = []
     for name, reference in best.solution.parameters.items():
         if judged[name].verdict != "identifiable":
@@ -155,7 +154,6 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
 def _explanations(
     runs: Sequence[_MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> list[str]:
-    """Sentences on parameters that are not found, and on those in which steepest descent as published is wrong."""
     sentences = []
     for name, reference in judged.items():
         if not reference.free or reference.verdict == "identifiable":
@@ -216,7 +214,6 @@ class _Memory:
 
 
 def _resident() -> float:
-    """Resident memory [MiB]; the peak so far where the system does not tell the present one."""
     status = Path("/proc/self/status")
     lines = status.read_text(encoding="ascii", errors="replace").splitlines() if status.is_file() else []
     for line in (line for line in lines if line.startswith("VmRSS:")):

@@ -67,7 +67,6 @@ class _FinerDiscretisationProblem:
         return np.clip(made, *self.problem.bounds)
 
     def _guess(self, coarse: System, q: Array) -> Array:
-        """Guess of an equilibrium from that of the coarse model."""
         tree = self.problem.system.mechanism
         fine = np.zeros(len(tree.joints))
         for name, angle in zip(coarse.mechanism.joint_names, q, strict=True):

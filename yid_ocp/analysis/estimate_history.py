@@ -49,7 +49,6 @@ class RunEstimates(ReprMixin):
         return np.sqrt(np.diag(self.covariance))
 
     def _only(self, names: Sequence[str]) -> RunEstimates:
-        """The estimates of the named parameters, in that order."""
         at = [self.parameter_names.index(name) for name in names]
         covariance = self.covariance[np.ix_(at, at)]
         return replace(self, parameter_names=tuple(names), values=self.values[at], covariance=covariance)
@@ -171,7 +170,6 @@ def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierT
 
 
 def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, int, str]:
-    """chi2 of the difference of a run from others, its degrees of freedom, and what differs most."""
     mean, _, _ = pool_estimates(others)
     shared = [name for name in run.parameter_names if name in mean.parameter_names]
     if not shared:

@@ -236,7 +236,6 @@ def _memory_parameters(problem: EstimationProblem) -> list[str]:
 
 
 def _moving(problem: EstimationProblem) -> list[int]:
-    """Recordings that start in motion."""
     starts = [episode.fixed_initial_state for episode in problem.episodes]
     speeds = [0.0 if s is None else s.fitted_parameters.get(START_SPEED_PARAMETER_NAME, 0.0) for s in starts]
     return [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]

@@ -114,7 +114,6 @@ class RecordedExperiment:
 
 
 def _used_point_groups(problem: EstimationProblem, episode: Episode) -> list[PointGroup]:
-    """Point groups of a recording that the problem uses."""
     sensors = problem.options.sensors
     return [g for g in episode.recording.points if sensors.get(g.name, SensorOptions()).use is not False]
 
@@ -373,7 +372,6 @@ class CandidateExperimentSensitivityBuilder:
         return recording.time_slice(-math.inf, float(episode.grid.node_times[-1]) + 1e-6)
 
     def _welded(self, system: System, others: frozenset[str]) -> System:
-        """Grasps as welds that keep the orientation in which the ends lie at the start."""
         layout = self.build_sensitivities(others)
         if isinstance(layout, str):
             raise SolverError(layout)
@@ -457,7 +455,6 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
 
 
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
-    """Largest distance of a gripper from its start [m]."""
     whole = np.zeros((len(episode.measured_driven_angles), system.n_coordinates))
     whole[:, list(system.driven_coordinate_indices)] = episode.measured_driven_angles
     paths = _frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
@@ -465,7 +462,6 @@ def _travel(system: System, values: Mapping[str, float], episode: Episode) -> fl
 
 
 def _frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
-    """Positions of frames at configurations (N, n), shape (N, len(frames), 3) [m]."""
     symbol = ca.SX.sym("q", system.n_coordinates)
     tree = system.numeric_mechanism(values)
     kinematics = forward_kinematics(tree, symbol)

@@ -375,7 +375,6 @@ def _direction(view: _Sensitivities, vector: Array, words: str) -> _ParameterDir
 
 
 def _sparse_basis(vectors: Array) -> list[Array]:
-    """Sparse basis of unit vectors of the space spanned by row vectors (d, p): row echelon form, complete pivoting."""
     rows, open_columns = vectors.copy(), list(range(vectors.shape[1]))
     for i in range(len(rows)):
         block = np.abs(rows[i:][:, open_columns])
@@ -410,14 +409,12 @@ _COMBINATIONS: tuple[_Combination, ...] = (
 
 
 def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
-    """The parameters that make up a direction."""
     units = map(view.unit, view.names)
     parts = zip(view.names, vector.tolist(), view.x[view.chosen].tolist(), units, strict=True)
     return [_Component(*part) for part in parts if abs(part[1]) > 0.05 * np.max(np.abs(vector))]
 
 
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
-    """Why a direction is not seen."""
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * MAX_WEAK_RELATIVE_STD >= 1.0:
         what = parts[0].name if len(parts) == 1 else "this: " + _combination_words(parts)
@@ -430,7 +427,6 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 
 
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
-    """Which nuisances hide a direction."""
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
     for words, prefix in (("the unknown start", "start."), ("where the grasp sits", _GRASP_OFFSET_PREFIX)):
@@ -455,7 +451,6 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
 
 
 def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) -> str:
-    """How well a direction is seen; of one parameter alone as its own standard deviation says."""
     parts = sorted(_components(view, vector), key=lambda part: -abs(part.coefficient))
     own = float(std[view.names.index(parts[0].name)])
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
@@ -478,7 +473,6 @@ def _combination_words(parts: Sequence[_Component]) -> str:
 
 
 def _joined(names: Sequence[str]) -> str:
-    """Names joined to a text; beyond the first four, only the number of further names is given."""
     if len(names) > _MAX_LISTED_NAMES:
         return f"{', '.join(names[:_MAX_LISTED_NAMES])} and {len(names) - _MAX_LISTED_NAMES} more"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

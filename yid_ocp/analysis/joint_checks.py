@@ -364,7 +364,6 @@ def check_efforts_by_inverse_dynamics(arm: RecordedJointsModel, recording: Recor
 
 
 def _issue(cause: str, words: str, depth: float, advice: str, joint: str = "", setting: str = "") -> Issue:
-    """An issue of one joint's effort, or of all."""
     channel = f"effort.{joint}" if joint else "effort"
     return Issue(cause, words, "not_trusted", depth, advice, "", "joints", channel, setting=setting)
 
@@ -459,7 +458,6 @@ def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
 
 
 def _late(data: _Data) -> Iterator[Issue]:
-    """Efforts that follow the motion late or early, all alike."""
     motion, trials = data.motion, _LAG_SEARCH_STEP * np.arange(-5, 6)
     if motion.t[-1] - motion.t[0] < 4 * trials[-1] or np.max(_fitted(data).left) < _WELL_EXPLAINED_RMS:
         return

@@ -102,7 +102,6 @@ def compare_urdf_with_pinocchio(
 
 
 def _without(path: Path, links: Sequence[str]) -> str:
-    """Text of a URDF file without some links and all that hangs on them."""
     root = ElementTree.parse(check_input_file(path, MAX_TEXT_BYTES)).getroot()
     dropped, joints = set(links), root.findall("joint")
     for _ in joints:

@@ -52,7 +52,6 @@ class _Change(NamedTuple):
 
 
 def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> dict[str, str]:
-    """Model frame that each used point of a group marks."""
     wanted = group.names if choice.points is None else choice.points
     frames = {name: choice.frames.get(name, name) for name in wanted if name in group.names}
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
@@ -115,13 +114,11 @@ def _explained(changes: Sequence[_Change], error: float, allowed: float, recordi
 
 
 def _noise(group: PointGroup) -> float:
-    """Typical standard deviation that the recording gives to its points [m]."""
     known = np.zeros(0) if group.std is None else group.std[np.isfinite(group.std)]
     return float(np.median(known)) if len(known) else 0.0
 
 
 def _rms(difference: Array) -> float:
-    """Root mean square distance of points, of those that were seen; NaN for none."""
     square = np.sum(difference**2, axis=-1)
     return float(np.sqrt(np.nanmean(square))) if np.any(np.isfinite(square)) else math.nan
 

@@ -282,7 +282,6 @@ class _Walk:
         return self._value(s)
 
     def _refit(self, near: _Point, s: float) -> _Point | None:
-        """Best fit of the others at coordinate `s` of the profiled one, None where no rollout succeeds."""
         now, others = near.x.copy(), self.others
         slope = near.jacobian[:, self.index] * (s - now[self.index])
         now[others] += self._others_step(now, near.jacobian[:, others], slope, 0.0)
@@ -314,7 +313,6 @@ class _Walk:
         return found
 
     def _others_step(self, s: Array, jacobian: Array, rows: Array, damping: float) -> Array:
-        """Step of the others within their bounds."""
         if not len(self.others):
             return np.zeros(0)
         low, high = (bound[self.others] - s[self.others] for bound in (self.lower, self.upper))

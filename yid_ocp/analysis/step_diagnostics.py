@@ -290,7 +290,6 @@ def _pattern(
 
 
 def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | None = None) -> list[_Block]:
-    """Blocks of a step by name, only the kept entries of the first one."""
     blocks = {block.name: block.labels for block in (*symbols.row_blocks, *symbols.column_blocks)}
     found = [(name, blocks[name]) for name in wanted]
     if kept is not None:

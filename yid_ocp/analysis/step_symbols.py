@@ -66,8 +66,6 @@ _FUNCTION_NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name 
 
 
 class _SymbolName(NamedTuple):
-    """Name of a variable in plain text and in LaTeX."""
-
     text: str
     latex: str
 

@@ -69,7 +69,6 @@ class ChangedExperimentResult:
 
     @property
     def _is_complete(self) -> bool:
-        """Whether every parameter is identifiable."""
         return bool(self.verdicts) and self.identifiable == len(self.verdicts)
 
 
@@ -163,7 +162,6 @@ def evaluate_experiment_change_sets(
 def _smallest(
     outcomes: _Outcomes, changes: Sequence[ExperimentChange], base: ChangedExperimentResult
 ) -> list[ChangedExperimentResult]:
-    """All sets of as few changes as will do with which every parameter is identifiable."""
     if base._is_complete:
         return [base]
     for size in range(1, _MAX_CHANGE_SET_SIZE + 1) if changes else ():
@@ -176,7 +174,6 @@ def _smallest(
 def _greedy(
     outcomes: _Outcomes, changes: Sequence[ExperimentChange], base: ChangedExperimentResult
 ) -> list[ChangedExperimentResult]:
-    """Best single change added one after the other."""
     chosen: tuple[ExperimentChange, ...] = ()
     steps: list[ChangedExperimentResult] = []
     best = base
@@ -208,8 +205,6 @@ def _words(changes: Sequence[ExperimentChange]) -> str:
 
 
 class _Outcomes:
-    """Outcomes of sets of changes, each computed once."""
-
     def __init__(
         self,
         setting: RecordedExperiment,

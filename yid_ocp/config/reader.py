@@ -336,7 +336,6 @@ def _refuse_nan(word: str) -> float:
 
 
 def _absolute(value: Any, hint: Any, base: Path) -> Any:
-    """Paths within a value, relative to the configuration no longer."""
     if isinstance(value, tuple):
         entries = options.variadic_tuple_entry_type(hint)
         return value if entries is None else tuple(_absolute(entry, entries, base) for entry in value)

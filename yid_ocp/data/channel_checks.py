@@ -249,7 +249,6 @@ def typical_point_pair_distances(
 
 
 def _measured_positions(recording: Recording, point: str) -> Array:
-    """Measured positions of a point, shape (M, 3) [m], NaN where it was not seen."""
     for group in recording.points:
         if point in group.names:
             return group.position[:, group.names.index(point)]

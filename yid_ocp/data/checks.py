@@ -210,7 +210,6 @@ def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array
 
 
 def _velocities(recording: Recording) -> Iterator[Issue]:
-    """Issues from comparing differentiated angles with recorded velocities."""
     joints = recording.joints
     if joints is None or joints.velocity is None or len(joints.t) < 50:
         return
@@ -295,7 +294,6 @@ def _transitions(one: JointGroup | PointGroup, other: JointGroup | PointGroup) -
 
 
 def _longest_shared_run(one: IntArray, other: IntArray) -> int:
-    """Length of the longest stretch that two sequences have in common."""
     if not np.intersect1d(one, other).size:
         return 0
     least, most, size = 0, min(len(one), len(other)), max(len(one), len(other))

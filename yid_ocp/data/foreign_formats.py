@@ -151,7 +151,6 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
 
 
 def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
-    """Markers of the section `Trajectories`."""
     lines = [[cell.strip() for cell in cells] for _, cells in rows]
     begin = next((i for i, cells in enumerate(lines) if cells[:1] == ["Trajectories"]), None)
     if begin is None or len(lines) < begin + 6:

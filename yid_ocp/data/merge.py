@@ -27,8 +27,6 @@ _LARGEST_START = 1e6  # from which on times are counted from the first sample [s
 
 
 class _MotionLag(NamedTuple):
-    """Delay of points relative to joints [s], and the share of their motion that angles explain with it."""
-
     lag: float
     explained: float
 

@@ -362,7 +362,6 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
 
 
 def _sampled(t: Array) -> str:
-    """Number of samples and their rate."""
     rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else 0.0
     return f"{count_with_noun(len(t), 'sample')} at {rate:.4g} Hz" if rate else count_with_noun(len(t), "sample")
 

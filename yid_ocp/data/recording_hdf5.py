@@ -289,7 +289,6 @@ def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.Fi
 
 
 def _complaint(path: Path) -> str:
-    """Reason why a file cannot be read; nothing where all of it can be read."""
     try:
         with h5py.File(path, "r") as file:
             complaint = _foreign(file) or _excess(file)

@@ -30,7 +30,6 @@ def _recorded_joints(system: System) -> tuple[str, ...]:
 
 
 def _effort_joints(system: System) -> tuple[str, ...]:
-    """Names of arm joints whose recorded effort drives them or is compared."""
     return tuple(name for name in _recorded_joints(system) if name not in system.servos)
 
 
@@ -39,7 +38,6 @@ def _dc_motor_joints(system: System) -> tuple[str, ...]:
 
 
 def _published_motor_joints(system: System) -> tuple[str, ...]:
-    """Names of joints whose motor has a published torque constant."""
     return tuple(name for name in _dc_motor_joints(system) if system.servos[name].torque_constant is not None)
 
 
@@ -57,7 +55,6 @@ def _limit_definition(lowest: float, unit: str, text: str) -> ParameterDefinitio
 
 
 def _effort_arms(system: System) -> tuple[str, ...]:
-    """Names of arms with a joint whose recorded effort drives it or is compared."""
     known = set(_effort_joints(system))
     return tuple(name for name, joints in base.joint_names_by_arm(system).items() if known & set(joints))
 

@@ -230,7 +230,6 @@ def _value(value: float) -> str:
 
 
 def _vector(values: ca.SX | Sequence[float]) -> str:
-    """A vector of numbers in mathematics mode."""
     return "$(" + r",\, ".join(_value(float(value)) for value in np.array(ca.DM(values)).ravel()) + ")$"
 
 

@@ -102,7 +102,6 @@ def ros_signals_from_recording(recording: Recording) -> list[RosTopicTimeSeries]
 
 
 def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[tuple[int, Any]]:
-    """Stamp [ns] and message of every time at which there is a number."""
     types = store.types
 
     def vector(kind: str, xyz: Array) -> Any:

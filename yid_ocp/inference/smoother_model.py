@@ -203,7 +203,6 @@ def _loads(course: _LinearizedEpisode) -> Array:
 
 
 def _segment_weights(system: System, theta: Array) -> dict[str, float]:
-    """Return the weight of every segment that has a mass [N]."""
     tree, masses = system.mechanism, {}
     for segment in system.segment_layouts:
         joints = [tree.joints[tree.joint_index(name)] for link in segment.link_joints for name in link]
@@ -217,7 +216,6 @@ def _segment_weights(system: System, theta: Array) -> dict[str, float]:
 
 
 def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segments: Sequence[str]) -> Array:
-    """Return the generalized forces of 1 N along x, y and z on each of some segments."""
     if not segments:
         return np.zeros((*q.shape, 0))
     symbol = ca.SX.sym("q", system.n_coordinates)
@@ -387,7 +385,6 @@ def _recording(
 
 
 def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span: float, decay: float) -> Array:
-    """Variance of unknown forces that represent the noise of recorded torques, in units of the squared reference."""
     errors, driven = course.episode.input_errors, course.system.driven
     known = np.zeros(len(unknowns.names))
     if errors is None:

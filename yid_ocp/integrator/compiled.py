@@ -49,7 +49,6 @@ class _Struct(ctypes.Structure):
 
 
 def _struct(name: str, *fields: str) -> type[_Struct]:
-    """A struct of fields that are given as a kind and names."""
     kinds = {"int": ctypes.c_int, "double": ctypes.c_double, "long": ctypes.c_longlong, "pointer": ctypes.c_void_p}
     words = [part.split() for part in fields]
     return type(name, (_Struct,), {"_fields_": [(field, kinds[kind]) for kind, *names in words for field in names]})
@@ -289,7 +288,6 @@ def _batch_key(member: RolloutInputs) -> Hashable:
 
 
 def _width(member: RolloutInputs) -> int:
-    """Columns of derivatives."""
     return 0 if member.directions is None else member.directions.count
 
 

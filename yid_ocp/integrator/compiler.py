@@ -80,7 +80,6 @@ def _optimization_flag() -> str:
 
 
 def _cache_folder() -> Path:
-    """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it."""
     wanted = os.environ.get("YID_OCP_CACHE")
     folder = Path(wanted or platformdirs.user_cache_dir("yid_ocp"))
     allowed = "a folder that you own, writable by you alone"

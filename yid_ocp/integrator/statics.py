@@ -186,14 +186,12 @@ class EquilibriumSolver:
         return starts
 
     def _configuration(self, w: Array, given: Array) -> Array:
-        """All coordinates, shape (n,); driven ones are where the holding spring lets them be."""
         q = np.zeros(self.step.system.n_coordinates)
         q[list(self.known_coordinates)] = given
         q[list(self.free_coordinates)] = w[: len(self.free_coordinates)]
         return q
 
     def _energy(self, q: Any, z: Array, hold: _Hold, theta: Array) -> Any:
-        """Potential energy of a configuration, that of the holding springs included."""
         give = hold.give(q, self.step.system)
         energy = self._potential(q, q, z, z, hold.held + hold.stiffness * give, theta)
         if not len(hold.held):
@@ -326,7 +324,6 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
 
 
 def _is_motor_off(system: System, command: Array) -> BoolArray:
-    """Which driven joints have a servo whose motor is off, shape (nu,)."""
     return np.asarray(bool(system.servos) & (command >= MOTOR_OFF_COMMAND / 2))
 
 

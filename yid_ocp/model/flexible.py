@@ -155,8 +155,6 @@ def flexible_object(
 
 @dataclass(frozen=True)
 class _Parts:
-    """An object under construction."""
-
     frames: dict[str, Frame]
     parameters: list[Parameter] = field(default_factory=list)
     joints: list[Joint] = field(default_factory=list)

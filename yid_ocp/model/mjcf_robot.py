@@ -80,7 +80,6 @@ def _is_position_actuator(model: Any, i: int) -> bool:
 
 
 def _is_motor(model: Any, i: int) -> bool:
-    """Whether an actuator's command is a torque of a joint, or a force, but for a factor."""
     constant = int(model.actuator_gaintype[i]) == int(model.actuator_biastype[i]) == int(model.actuator_dyntype[i]) == 0
     return constant and int(model.actuator_trntype[i]) == 0
 
@@ -241,7 +240,6 @@ def _shift(translation: Array) -> Array:
 
 
 def _moved(axis: Array, amount: float, kind: str) -> Array:
-    """Pose of a joint's moving side at a coordinate."""
     if kind == "prismatic":
         return _shift(amount * axis)
     return homogeneous_transform(rotation_from_axis_sin_cos(axis, math.sin(amount), math.cos(amount)), np.zeros(3))

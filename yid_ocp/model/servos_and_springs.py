@@ -210,7 +210,6 @@ class PositionServo:
 
 
 def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
-    """x / (1 + tightness x^p)^(1/p)."""
     p = TORQUE_SATURATION_EXPONENT
     return x / (1 + tightness * x**p) ** (1 / p)
 

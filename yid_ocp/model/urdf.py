@@ -257,7 +257,6 @@ def _part(element: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 
 def _check_numbers(robot: ElementTree.Element, where: str) -> None:
-    """Refuse missing, surplus or invalid numbers."""
     for owner in robot:
         if owner.tag not in ("link", "joint"):
             continue

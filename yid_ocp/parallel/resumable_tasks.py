@@ -181,7 +181,6 @@ def _task_input(function: _TaskFunction, task: Task, code: str) -> dict[str, Any
 
 
 def _mapped(value: Any, change: Callable[[Path], Any]) -> Any:
-    """Plain data with its paths replaced."""
     if isinstance(value, Path):
         return change(value)
     if isinstance(value, Mapping):

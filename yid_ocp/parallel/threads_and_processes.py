@@ -54,7 +54,6 @@ def _max_threads() -> int:
 
 
 def _limit_max_threads(count: int) -> None:
-    """Limit the number of threads that the current thread may use."""
     _THREAD_SHARE.count = count
 
 
@@ -146,7 +145,6 @@ class _March:
 
 
 def _answer(requests: Sequence[_Request]) -> None:
-    """Call one function for several requests and distribute its results."""
     try:
         found = iter(requests[0].function([question for request in requests for question in request.questions]))
     except Exception as error:

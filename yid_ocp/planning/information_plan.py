@@ -40,8 +40,6 @@ _MIN_VISIBLE_MOTION = 1e-4  # of a point that a camera may see, for a change of 
 
 @dataclass(frozen=True)
 class _ParameterPrecision:
-    """Relative standard deviations of a parameter by the existing recordings, the planned one and both; or infinite."""
-
     std_recorded: float
     std_planned: float
     std_combined: float
@@ -352,7 +350,6 @@ def _distances(
     rivals: Sequence[EffectBase],
     w: Array,
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Distances of effects in the recordings that there are, and in the planned one."""
     assert isinstance(criterion, EffectDiscriminationCriterion)
     recorded, planned = experiment.existing_recording_sensitivities, experiment.configured_problem_sensitivities(w)
     before, after = criterion.pairwise_effect_distances(recorded), criterion.pairwise_effect_distances(planned)
@@ -364,7 +361,6 @@ def _distances(
 def _active(
     search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions, w: Array
 ) -> dict[str, tuple[str, ...]]:
-    """Limits that a motion reaches."""
     mover, found = search.experiment.simulator, {}
 
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:

@@ -156,7 +156,6 @@ class SplinePath:
     n_coefficients: int  # K, coefficients of each joint; the last one is its displacement at the end
 
     def _splines(self, order: int) -> BSpline:
-        """One spline for each coefficient, or a derivative of it."""
         ends, free = _N_REST_CONTROL_POINTS, self.n_coefficients - 1
         controls = np.zeros((2 * ends + free, self.n_coefficients))
         controls[ends : ends + free, :-1] = np.eye(free)
@@ -318,7 +317,6 @@ class PlannedMotion:
 
 
 def _position_limits(system: System) -> tuple[Array, Array]:
-    """Lower and upper limits of the moved joints, shape (nc,) each."""
     joints = [system.mechanism.joints[i] for i in system.prescribed_coordinate_indices]
     return np.array([joint.lower_limit for joint in joints]), np.array([joint.upper_limit for joint in joints])
 

@@ -35,8 +35,6 @@ _ACCELERATION_WEIGHT = 1e-3  # of their mean square, in parts of their limit: of
 
 @dataclass(frozen=True, eq=False)
 class _LimitRows:
-    """Bounds of limit rows of one kind."""
-
     description: str  # the limited quantity, with its unit
     lower: Array  # (rows,)
     upper: Array  # (rows,)

@@ -161,7 +161,6 @@ def _held(values: Array, edges: Array) -> scipy.interpolate.PPoly:
 
 
 def _straight(values: Array, t: Array) -> scipy.interpolate.PPoly:
-    """Straight lines between samples."""
     return scipy.interpolate.PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
 
 

@@ -193,7 +193,6 @@ class FirstOrderLag:
         return passed - rates.T @ (lead * pull), direct
 
     def _factors(self) -> tuple[Array, Array, Array, Array]:
-        """E, f and their derivatives by T."""
         ratio = np.maximum(self.time_constant, 0.0) / self.time_step
         inverse = 1.0 / np.maximum(ratio, 1e-3)  # beyond it exp(-1/ratio) is zero
         decay = np.where(ratio > 1e-3, np.exp(-inverse), 0.0)
@@ -253,7 +252,6 @@ def _filtered_both_ways(sections: Array, values: Array, pad: int) -> Array:
 
 @lru_cache(maxsize=16)
 def _rates(count: int, time_step: float) -> scipy.sparse.csr_array:
-    """Central differences of values at nodes, from node 1 on, one-sided there and at the last one, (N, N)."""
     before, after = np.arange(count) - 1, np.arange(count) + 1
     before, after = np.clip(before, 1, count - 1), np.clip(after, 1, count - 1)
     width = np.maximum(after - before, 1) * time_step

@@ -33,8 +33,6 @@ _MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # what counts as one place [m],
 
 @dataclass(frozen=True)
 class _Stick:
-    """A straight line between two positions, of an arm or of the object; its radius in m."""
-
     end_indices: tuple[int, int]
     radius: float
     is_object_part: bool

@@ -38,7 +38,6 @@ _MAX_RUN_DIFFERENCE = 2  # between two runs, from which on a parameter is named 
 
 @register_summary("yid-diagnosis/2")
 def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of a diagnosis."""
     yield from issue_summary_blocks(result)
     yield SummaryStatement(result["summary"], "verdict")
     before, steps = result["gap"]["before"], result.get("steps", ())
@@ -114,7 +113,6 @@ def _planning_command(section: Mapping[str, Any]) -> str:
 
 @register_summary("yid-blind/1")
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of a blind validation."""
     score, *others, cases = _blind_tables(result)
     yield replace(score, is_key_table=True)
     yield from others
@@ -214,7 +212,6 @@ def _rate(own: Mapping[str, Any]) -> str:
 
 @register_summary("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of the runs of a batch side by side: estimates, drift and outlying runs."""
     runs = result["runs"]
     found: dict[str, list[Mapping[str, Any]]] = {}
     for entry in runs:
@@ -267,7 +264,6 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> 
 
 @register_summary("yid-compare/1")
 def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of several methods on one problem."""
     methods: dict[str, Any] = result["methods"]
     judged, disturbed = result["judged"], result["disturbed"]
     runs = methods | {"solve": judged}
@@ -350,7 +346,6 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 
 @register_summary("yid-history/1")
 def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of how estimates drifted over runs of one model, and which runs disagree with the others."""
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
@@ -412,7 +407,6 @@ def _relation(p_value: float) -> str:
 
 @register_summary("yid-overlay/1")
 def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of two runs of the same recordings: errors of both, how far they are apart, and their parameters."""
     first, second = result["runs"]
     rows: TableRows = [("parameter", first, second, "difference", "in std", "unit")]
     differing = []

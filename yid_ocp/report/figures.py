@@ -183,7 +183,6 @@ def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along
 
 
 def _axis_title(text: str, y: float) -> dict[str, Any]:
-    """A text above the left end of an axis."""
     at = {"x": 0, "xref": "paper", "xanchor": "left", "y": y, "yref": "paper", "yanchor": "bottom"}
     return {"text": text, "showarrow": False, **at}
 
@@ -297,7 +296,6 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
 
 
 def _rows_figure(height: int, names: Sequence[str], title: str) -> Figure:
-    """An empty figure with one named row for each name, the first on top."""
     order = {"categoryorder": "array", "categoryarray": list(names)}
     return _styled_figure(height, title, "").update_yaxes(autorange="reversed", automargin=True, **order)
 

@@ -70,14 +70,12 @@ def _installed() -> bool:
 
 @functools.cache
 def _plotly_script() -> tuple[str, str]:
-    """Name of the file of plotly's script, and its text."""
     import plotly.offline
 
     return f"plotly-{plotly.offline.get_plotlyjs_version()}.min.js", plotly.offline.get_plotlyjs()
 
 
 def _shared_script(path: Path) -> str:
-    """Relative path of a page's shared script; empty where there is none."""
     scripts = [folder / _plotly_script()[0] for folder in (path.parent, *path.parent.parents)]
     found = next(filter(_is_plotly_script, scripts[: _SHARED_SCRIPT_LEVELS + 1]), None)
     return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()
@@ -103,7 +101,6 @@ def _format_number(value: object, digits: int = 4) -> str:
 
 
 def _column_classes(table: SummaryTable) -> list[str]:
-    """CSS class of every column (`number`, `long` or `text`); empty for columns without an entry."""
     kinds: list[str] = []
     for _, *cells in zip(*table.rows, strict=True):
         wide = max(map(len, cells), default=0) > _WRAP_LENGTH

@@ -48,7 +48,6 @@ _NEGLIGIBLE_STDS = 1e-6  # standard deviations: beneath are the tolerance of a r
 
 @register_summary("yid-solve/1")
 def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of a fit."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
     if not failed:
@@ -218,7 +217,6 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 @register_summary("yid-identifiability/1")
 def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of what recordings tell of each parameter."""
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
         said = f"{result['status']}: {result['message']}; there is no point to analyse"
@@ -267,7 +265,6 @@ def _relative(value: float | None) -> str:
 
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of which friction law the recordings warrant."""
     unit, best = result["unit"], result["warranted"]
     rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
@@ -287,7 +284,6 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-plan/1")
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of a planned motion."""
     rows: TableRows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
     for name, own in result["joints"].items():
         travel = own["travel"] if own["travel"] > 1e-9 else 0.0
@@ -351,7 +347,6 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-check/1")
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of a model and its recordings before a run."""
     model = result["model"]
     yield (
         f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
@@ -405,7 +400,6 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
 
 @register_summary("yid-inspect/1")
 def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of a model's equations and linearised step."""
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     equations, linear = result["equations"], result["linearisation"]
@@ -499,7 +493,6 @@ def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-simulate/1")
 def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of a simulation."""
     if result["status"] == "failed":
         yield SummaryStatement(f"failed: {result['message']}", "verdict")
     else:
@@ -510,7 +503,6 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-track/1")
 def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summary of points tracked in the frames of a depth camera."""
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
     rows: TableRows = [("point", "frames", "± std [mm]", *heads)]

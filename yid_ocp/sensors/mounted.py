@@ -49,7 +49,6 @@ class MountedSensor(Sensor):
         return ca.vertcat(*(sign * self._frame_reading(state, frame) for sign, frame in frames))
 
     def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
-        """Reading of the sensor in one frame, along the frame's axes, shape (3, 1)."""
         raise NotImplementedError
 
 

@@ -459,7 +459,6 @@ class _MultiStartSearch:
 
 
 def _noting(callback: IterationCallback | None, note: str) -> IterationCallback | None:
-    """The callback for a part of the search, whose points say which part it is."""
     if callback is None or not note:
         return callback
     return lambda entry: callback(replace(entry, note=", ".join(filter(None, (note, entry.note)))))
@@ -468,7 +467,6 @@ def _noting(callback: IterationCallback | None, note: str) -> IterationCallback 
 def _minimize_cost(
     solver: Solver, problem: EstimationProblem, x: Array, callback: IterationCallback | None
 ) -> SolverResult:
-    """Result of a solver, of its last iterate where the callback stops it."""
     seen: list[Iterate] = []
 
     def watched(entry: Iterate) -> None:

@@ -162,7 +162,6 @@ class MultipleShooting(SolverWithCheckedSettings):
         return SolverResult(status, message, x, tuple(recorder.history), int(stats["n_call_nlp_g"]), warm)
 
     def _solver_options(self, cost_factor: float) -> dict[str, Any]:
-        """Options of CasADi's IPOPT interface."""
         told = {"max_iter": self.max_iterations, "tol": self.ipopt_tolerance, "mu_init": self.mu_init}
         acceptable = {"tol": 1e-3, "iter": 4, "constr_viol_tol": 1e-6, "obj_change_tol": 1e-5}
         ipopt = {

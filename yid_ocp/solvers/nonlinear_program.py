@@ -185,14 +185,12 @@ class ResidualTerm:
         return placed if matrix is None else ca.mtimes(matrix, placed)
 
     def _evaluate_loss(self, r: ca.MX) -> ca.MX:
-        """Loss of residuals r: half the sum of squares, or Huber's loss."""
         if math.isinf(self.huber_threshold):
             return ca.sumsqr(r) / 2
         size, limit = ca.fabs(r), self.huber_threshold
         return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
 
     def _loss_gradient_by_residual(self, r: ca.MX) -> ca.MX:
-        """Gradient of the loss with respect to the residuals r, shape (nr, 1)."""
         limit = self.huber_threshold
         return r if math.isinf(limit) else ca.fmax(ca.fmin(r, limit), -limit)
 
@@ -223,7 +221,6 @@ class GaussNewtonHessianRidge:
 
 
 def _nonzero_values(matrix: ca.MX) -> ca.MX:
-    """Nonzero entries of a sparse expression as a column."""
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
 
 
@@ -488,7 +485,6 @@ class NonlinearProgram(ReprMixin):
         return total
 
     def _curvature(self, term: MappedFunctionTerm, weight: ca.MX) -> ca.MX | int:
-        """Hessian of weight . values of a term."""
         curved = term._weighted_hessian_triplets(self.w, self.p, weight)
         return 0 if curved is None else _sparse_matrix_summing_duplicates(*curved, self.w.numel())
 

@@ -183,7 +183,6 @@ def record_simulation(
 
 
 def _random_generators(seed: int) -> _Generators:
-    """A stream of random numbers for every sensor."""
     seeds = np.random.SeedSequence(seed).spawn(len(_RANDOM_STREAMS))
     return {name: np.random.default_rng(own) for name, own in zip(_RANDOM_STREAMS, seeds, strict=True)}
 

@@ -102,7 +102,6 @@ class ParameterEvaluator:
         return bool(ca.sparsify(self._substitute_parameter_values(expression)).is_zero())
 
     def _substitute_parameter_values(self, expression: ca.SX) -> ca.SX:
-        """The expression with parameters replaced by their values."""
         return ca.substitute(expression, self._symbols, ca.DM(self._theta))
 
 

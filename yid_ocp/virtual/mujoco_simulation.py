@@ -249,7 +249,6 @@ def _settling_model(scene: MujocoScene, damping: Array) -> Any:
 
 
 def _lost(scene: MujocoScene) -> bool:
-    """Whether MuJoCo lost the state at some time, and began again from its first one."""
     kinds = scene.mujoco.mjtWarning
     return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _INSTABILITY_WARNINGS)
 
@@ -585,5 +584,4 @@ def _point_error(
 
 
 def _at(t: Array, known: Array, values: Array) -> Array:
-    """Values at other times, linear in between, shape (len(t), width)."""
     return np.stack([np.interp(t, known, column) for column in values.T], axis=1)

@@ -139,7 +139,6 @@ def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: floa
 
 
 def _mean_square(error: Array, count: int) -> float:
-    """Mean square of errors, those of the other points being beyond the reach."""
     return float((error @ error + (count - len(error)) * _OFF_ARM_DISTANCE**2) / count)
 
 
@@ -411,7 +410,6 @@ class _Calibrator:
         return state, cost(state), chosen
 
     def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
-        """Message on camera and clock in the middle of the recording, as estimated from the arm."""
         stds = np.sqrt(np.diag(covariance))
         known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms (stamp minus joint time)"
         searched = self.clock.search_half_width > 0

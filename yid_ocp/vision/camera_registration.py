@@ -131,7 +131,6 @@ class CalibrationFrame:
 
     @cached_property
     def _trees(self) -> tuple[cKDTree, cKDTree]:
-        """Search trees of the points and of their directions."""
         return cKDTree(self.points), cKDTree(self.points[:, :2] / self.points[:, 2:])
 
 
@@ -158,7 +157,6 @@ class ArmSurface:
         return np.array([joint >= 0 for joint in self.robot_surfaces.part_joints])
 
     def _part_poses_at_time(self, t: float) -> Array:
-        """World poses of the robot's surface parts at a time [s], shape (parts, 4, 4)."""
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
     def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:

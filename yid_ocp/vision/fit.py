@@ -178,7 +178,6 @@ class ShapeFitter:
         self.free_end_links = tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING_DISTANCE))
 
     def _links_at(self, q: Array) -> Array:
-        """Start and end of every link, shape (K, 2, 3) [m]."""
         return np.array(self._corners(q)[0]).reshape(-1, 2, 3)
 
     def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
@@ -211,7 +210,6 @@ class ShapeFitter:
         return self._judged(best, evidence, self._rivals(best, evidence, sight), sight)
 
     def _with_free(self, q: Array, angles: Array) -> Array:
-        """A configuration with other angles of the free joints."""
         trial = q.copy()
         trial[list(self.free_joints)] = angles
         return trial

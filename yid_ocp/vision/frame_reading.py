@@ -65,7 +65,6 @@ def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str |
 
 
 def _frames(bag: OpenBag, topic: str) -> tuple[list[BagMessage], Array]:
-    """Messages of a topic, each with its connection and how many of its time stand before it, and their times [s]."""
     frames: list[BagMessage] = []
     with bag.read_errors_as_data_errors():
         for connection, logged, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
@@ -85,7 +84,6 @@ def _stamp(bag: OpenBag, data: bytes) -> int:
 
 
 def _decoded(bag: OpenBag, message: BagMessage) -> Any:
-    """Contents of a message."""
     connection, before = message.content
     with bag.read_errors_as_data_errors():
         found = bag.reader.messages([connection], start=message.logged, stop=message.logged + 1)
@@ -96,7 +94,6 @@ def _decoded(bag: OpenBag, message: BagMessage) -> Any:
 
 
 def _first(bag: OpenBag, topic: str) -> Any:
-    """Contents of the first message of a topic."""
     with bag.read_errors_as_data_errors():
         for connection, _, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
             return bag.reader.deserialize(data, connection.msgtype)

@@ -229,8 +229,6 @@ def system_with_free_root(system: System, values: Mapping[str, float] | None = N
 
 
 class _Link(NamedTuple):
-    """A link: joints by which it turns, how far from the root it begins and ends [m], and a tip that lies behind it."""
-
     joints: tuple[int, ...]
     begin: float
     end: float

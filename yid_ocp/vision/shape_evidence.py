@@ -82,7 +82,6 @@ def link_normals_perpendicular_to_sight(link_ends: Array, camera: Array) -> Arra
 
 
 def _faces_away_from_camera(normal: Array, sight: Array) -> BoolArray:
-    """Whether surface normals (N, 3) face away from the camera, by lines of sight (N, 3)."""
     return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_HIDDEN_SIDE_COSINE * np.linalg.norm(sight, axis=1))
 
 
@@ -143,7 +142,6 @@ class ProcessedFrameCloud:
 
     @cached_property
     def _point_spacing(self) -> float:
-        """Usual distance of a point from its nearest neighbour [m]."""
         if len(self.points) < 2:
             return math.inf
         return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)

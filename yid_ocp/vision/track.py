@@ -362,7 +362,6 @@ class FrameTracker:
         return sequence_calibration.group_foreign_clusters(seen, noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
-        """Poses of what moves with the robot at a time, by the names of the links."""
         if self.robot_surfaces is None:
             return {}
         poses = self.robot_surfaces.part_poses_at_configuration(self._configuration_at_rest(t))

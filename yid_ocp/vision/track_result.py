@@ -154,7 +154,6 @@ def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os
 
 
 def _pictures(stages: FrameProcessingStages) -> list[_Picture]:
-    """The pictures of every stage that the frame came to, in order."""
     raw, near, skeleton, fit = stages.raw_points, stages.filtered_points, stages.skeleton, stages.report.shape_fit
     made = [_Picture("cloud", f"{len(raw)} points of the camera", [(raw, _GREY, 0.4)])]
     if near is not None:

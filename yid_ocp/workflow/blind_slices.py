@@ -118,7 +118,6 @@ def score_slices(
 
 
 def _write_result(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
-    """Write `result.json`, `table.md` and the pictures; return what was written."""
     written: dict[str, Any] = to_json_types(result)
     write_strict_json(folder / "result.json", written)
     write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")

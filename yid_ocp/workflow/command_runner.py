@@ -196,8 +196,6 @@ class StderrLogLinesProgress(Progress):
 
 
 class _BarProgress(Progress):
-    """Progress as one bar for the running stage and a table of results, below a line for each finished stage."""
-
     def __init__(self, bars: rich.progress.Progress, left: _RemainingTime, table: list[str], verbose: bool) -> None:
         self._bars, self._left, self._table, self._is_verbose = bars, left, table, verbose
         self._task: rich.progress.TaskID | None = None

@@ -56,8 +56,6 @@ _LAST_KEYS = "clocks=clock_descriptions still=still_joints motor=motor_preset fi
 
 @dataclass(frozen=True)
 class _ArmChain:
-    """A chain of recorded joints, base to tip, and the frames at its end, most likely tool first."""
-
     joints: tuple[str, ...]
     tool_frames: tuple[str, ...]
 

@@ -148,8 +148,6 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _LoggedProgress(Progress):
-    """Progress that is shown, and entered in the run folder's log."""
-
     shown: Progress
     folder: RunFolder
 

@@ -204,8 +204,6 @@ def _outcome(entry: ChangedExperimentResult) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _IdentifiabilityTasks:
-    """Workers and common task arguments of the identifiability analysis of one run."""
-
     workers: WorkerConfig | Executor
     results_folder: Path
     common: Mapping[str, Any]

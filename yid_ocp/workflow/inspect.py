@@ -43,8 +43,6 @@ _DEPENDENCE_KEYS = (
 
 @dataclass(frozen=True)
 class _LinearisationPoint:
-    """State and inputs at which the equations are linearised."""
-
     description: str
     is_equilibrium: bool
     state: Array

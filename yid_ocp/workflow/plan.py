@@ -79,7 +79,6 @@ run_from_arguments = command_with_settings(run_plan)
 
 
 def _compile_step_for_planning(run: RunSettings) -> Step:
-    """The compiled step of a run with prescribed arms, for planning."""
     model = replace(run.model, arms=replace(run.model.arms, mode="prescribed"))
     recordings = run.recordings if run.model.robot is None else replace(run.recordings, estimate=(), held_out=())
     return build_step(replace(run, model=model, recordings=recordings))

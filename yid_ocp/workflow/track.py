@@ -252,7 +252,6 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
 
 
 def _camera_scene(run: RunSettings, system: System) -> ObservedScene:
-    """The scene seen by the camera: system, robot meshes and extra meshes."""
     return ObservedScene(system, run.model.robot, extra_meshes=run.model.extra_meshes)
 
 
@@ -280,8 +279,6 @@ def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Reco
 
 @dataclass(frozen=True, eq=False)
 class _FrameTasks:
-    """Tracking tasks of one run: settings, work folder, input hashes, and virtual frames that were made for it."""
-
     settings: RunSettings
     work_folder: Path
     input_hashes: dict[str, str]

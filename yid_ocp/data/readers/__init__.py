@@ -73,7 +73,6 @@ def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
 
 
 def _format_of(path: Path) -> str:
-    """Key of the reader of a file or folder."""
     if not path.suffix and not path.exists():
         near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
         hint = nearest_name_hint(path.name, near) if near else "check the path"

@@ -53,8 +53,6 @@ class BagMessage:
 
 
 class _BagTopic(NamedTuple):
-    """A topic of a bag with its type and number of messages."""
-
     name: str
     kind: str
     n_messages: int
@@ -130,8 +128,6 @@ def relative_message_time_function(
 
 @dataclass(frozen=True)
 class _Contents:
-    """A bag and the messages of it that can be used, in its order."""
-
     file: OpenBag
     states: Sequence[BagMessage]
     places: Sequence[BagMessage]
@@ -217,7 +213,6 @@ def read_bag(
 
 
 def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> base.FilePreview:
-    """Preview of a bag: topics, the channels that they become, and likely units."""
     path = Path(path)
     file_sha256(path)
     bag = _contents(path, None, progress)
@@ -316,7 +311,6 @@ def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
-    """The needed fields of a message as Python types; a bag's own definitions may be damaged."""
     if kind in JOINT_MESSAGE_TYPES:
         return joint_values_of_message(content, kind)
     frame = str(content.header.frame_id)
@@ -369,7 +363,6 @@ def _mounted_sensors(
 def _sensor_group(
     group: str, name: str, messages: Sequence[BagMessage], seconds: Callable[[BagMessage], float]
 ) -> Iterator[SensorChannelGroup]:
-    """The group of one sensor, called like the frame of its headers, or by `name`; none without messages."""
     if messages := sorted(messages, key=seconds):
         first = messages[0].content
         values = {key: np.array([[m.content.values[key]] for m in messages]) for key in first.values}
@@ -389,7 +382,6 @@ class _States(NamedTuple):
 
 
 def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
-    """Choose topics, joints and the messages that have them; with what was left out."""
     known, command = bag.file.topic_names_of_types(*_JOINT_TYPES), options.command_topic
     topics = options.joint_topics
     default = [bag.topic_of_fields] if bag.topic_of_fields else _default_joint_topics(bag.file)

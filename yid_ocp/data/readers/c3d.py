@@ -67,7 +67,6 @@ def read_c3d(
 
 @base.FILE_PREVIEWERS.register(".c3d")
 def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
-    """Preview of a C3D file; errors as `read_c3d`."""
     path = Path(path)
     file_sha256(path)
     found = _markers(path)

@@ -100,7 +100,6 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
 
 
 def _mocap_table(path: Path) -> tuple[PointGroup, str, tuple[str, ...]] | None:
-    """Contents of an export of a motion capture program; None for another table."""
     delimiter = _delimiter(path)
     read = mocap_table_reader(next(_rows(path, delimiter), (1, []))[1])
     return None if read is None else read(_rows(path, delimiter), str(path))
@@ -163,7 +162,6 @@ def _mounted_sensors(
 
 
 def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
-    """Preview of a table: columns, their meanings, and likely units."""
     path = Path(path)
     file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
@@ -345,7 +343,6 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Me
 
 
 def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> tuple[list[_Meaning], dict[str, str]]:
-    """Meaning of every column, given or by its name, and the units that names state."""
     given: dict[str, str] = {}
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         pattern = re.escape(key).replace(r"\*", "(.*)")

@@ -42,8 +42,6 @@ class _Feature(BaseModel):
 
 
 class _Info(BaseModel):
-    """The used fields of `meta/info.json`."""
-
     codebase_version: str
     fps: float = Field(gt=0, allow_inf_nan=False)
     features: dict[str, _Feature]
@@ -54,8 +52,6 @@ class _Info(BaseModel):
 
 
 class _Dataset(NamedTuple):
-    """A dataset's folder and its `meta/info.json`."""
-
     folder: Path
     info: _Info
 
@@ -100,7 +96,6 @@ def read_lerobot_episode(
 
 @base.FILE_PREVIEWERS.register("LeRobot dataset")
 def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
-    """Preview of a LeRobot dataset, by its first episode; errors as `read_lerobot_episode`."""
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
     names, channels, left = _channels(dataset, table)
@@ -266,7 +261,6 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
 
 
 def _matrix(column: Any, name: str, folder: Path) -> Array:
-    """Numbers of a column, shape (rows, numbers in a row); NaN where one is missing."""
     from pyarrow import compute
 
     rows, n_lengths = len(column), 1
@@ -280,7 +274,6 @@ def _matrix(column: Any, name: str, folder: Path) -> Array:
 
 
 def _names(dataset: _Dataset, feature: str, count: int) -> list[str]:
-    """Names of a feature's entries: a list, lists by kind of motor, or numbers where there are none."""
     said = dataset.info.features[feature].names
     if isinstance(said, Mapping):
         parts = [list(part) if isinstance(part, (list, tuple)) else [key] for key, part in said.items()]
@@ -290,6 +283,5 @@ def _names(dataset: _Dataset, feature: str, count: int) -> list[str]:
 
 
 def _entry(name: str) -> tuple[str, str]:
-    """Joint and channel of an entry's name."""
     joint, _, suffix = name.rpartition(".")
     return (joint, _SUFFIXES[suffix]) if joint and suffix in _SUFFIXES else (name, "position")

@@ -47,7 +47,6 @@ _JOINT_CHANNEL_UNITS = {
 
 @register_report_section("verdict", 0, "What was found")
 def _verdict(findings: ReportData) -> Mapping[str, Any] | None:
-    """Conclusions, verdicts and the blocks up to the key table."""
     said, first, _ = _result_blocks(findings)
     return {"verdict": said, "blocks": first} if said or first else None
 
@@ -72,7 +71,6 @@ def _result_blocks(findings: ReportData) -> tuple[list[str], list[StatementTable
 
 @register_report_section("estimates", 10, "Estimates")
 def _estimates(findings: ReportData) -> list[tuple[str, Any]]:
-    """Free parameters ± 2 std, untrusted ones marked; one figure per unit."""
     result, lost = findings.result, ("not_identifiable", "not_trusted")
     rows = []
     for name, entry in result.get("parameters", {}).items():
@@ -111,7 +109,6 @@ def _image_files(findings: ReportData) -> Mapping[str, Any] | None:
 
 @register_report_section("days", 10, "From run to run")
 def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
-    """Parameter values ± 2 std per run, of a history or a batch of one model."""
     formats, result = ("yid-history/1", "yid-overlay/1"), findings.result
     result = result if result.get("format") in formats else result.get("history") or {}
     rows = []
