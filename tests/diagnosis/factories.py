@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy
 from made_series import seeing
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
@@ -141,10 +142,12 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
     neutral = {name: value for entry in effects for name, value in entry.neutral_values.items()}
     values = neutral | dict(values or {})
     std = dict.fromkeys(values, 0.01) | dict(std or {})
-    held = {name: std[name] for entry in effects for name in entry.amplitude_names} | dict(held or {})
+    held = std | dict(held or {})
+    sizes = {e.label: [(values[n] - neutral[n]) / (held[n] or 1e-9) for n in e.amplitude_names] for e in effects}
+    p_values = {label: float(scipy.special.chdtrc(len(z), np.square(z).sum())) for label, z in sizes.items()}
     noisy = getattr(problem, "has_process_noise", False)
     rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, noisy, problem, evaluation([1.0]))
-    return RefittedModel(values, std, held, "made up", *rest)
+    return RefittedModel(values, std, p_values, "made up", *rest)
 
 
 def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:

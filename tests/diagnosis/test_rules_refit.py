@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy
 from factories import amplitude, cases, costing, effect, evaluation, fit, loss, measurements, shape
 from heard import Heard
 
@@ -13,7 +14,7 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     StoredFit,
     _block_duration,
-    _conditional_amplitude_std,
+    _effect_p_values,
     _half_done,
     _held_out_loss,
     load_stored_refit,
@@ -97,7 +98,7 @@ def solved(monkeypatch):
     monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
     monkeypatch.setattr(module, "_held_out_loss", held_out)
     monkeypatch.setattr(
-        module, "_refit_covariance", lambda problem, finish, limits: 0.01 * np.eye(len(problem.unknown_names))
+        module, "_refit_covariance_factor", lambda problem, finish, limits: 0.1 * np.eye(len(problem.unknown_names))
     )
     return made
 
@@ -206,21 +207,25 @@ def test_a_model_that_cannot_be_rolled_out_at_all_has_no_refit(solved):
     assert [run[A] for run in solved.failed] == pytest.approx([0.75, 0.5, 0.35, 0.275, 0.25])
 
 
-def test_an_amplitude_is_judged_with_its_shape_held():
+def test_an_effect_is_judged_with_its_shape_held():
     # a weak spring: torque and stiffness are known well, the rest angle is their quotient
     names = ["k", A, S]
     jacobian = np.array([[1.0, 0.3, 0.2], [0.0, 8.0, 0.1], [0.0, 0.4, 0.01], [0.1, 0.0, 0.0]])
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
-    found = _conditional_amplitude_std(names, [FRICTION], covariance)
-    held = np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])
-    assert found == {A: pytest.approx(np.sqrt(held[1, 1]))}
-    assert found[A] < 0.7 * np.sqrt(covariance[1, 1])
-    # what says nothing of the shape, or of the amplitude
-    covariance[2, 2] = np.nan
-    assert _conditional_amplitude_std(names, [FRICTION], covariance) == {A: pytest.approx(np.sqrt(covariance[1, 1]))}
-    covariance[1, 1] = np.nan
-    assert _conditional_amplitude_std(names, [FRICTION], covariance) == {A: np.inf}
-    assert _conditional_amplitude_std(names, [FRICTION], np.zeros((0, 0))) == {}
+    held = np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])[1, 1]
+    for away in (0.1, 0.3):
+        found = _effect_p_values([FRICTION], names, np.array([1.0, 0.25 + away, 9.0]), np.linalg.pinv(jacobian))
+        assert found == {"friction@elbow": pytest.approx(math.erfc(away / np.sqrt(2 * held)), rel=1e-6)}
+
+
+def test_amplitudes_are_judged_together_as_a_load_is_known_that_each_of_them_could_carry():
+    """Where a direction is not informed at all too, of a std that would leave no digits of a covariance."""
+    load, names = effect("load@x", *map(amplitude, "abc")), ["load@x.a", "load@x.b", "load@x.c"]
+    axes = np.linalg.qr(np.array([[1.0, 1.0, 0.3], [1.0, -1.0, 0.2], [0.5, 0.1, 1.0]]))[0]
+    factor = axes * [1e-3, 1e3, 1e8]
+    along = {z: _effect_p_values([load], names, axes[:, 0] * z * 1e-3 + axes[:, 1], factor)["load@x"] for z in (1, 9)}
+    assert along[1] == pytest.approx(scipy.special.chdtrc(3, 1.0), rel=1e-3)
+    assert along[9] == pytest.approx(scipy.special.chdtrc(3, 81.0), rel=1e-3)
+    assert _effect_p_values([load], names, axes[:, 2] * 1e7, factor)["load@x"] > 0.9
 
 
 def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatch):
@@ -243,12 +248,12 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
-    store = Memory({"friction@elbow": StoredFit(values, std, {A: 0.2}, "long ago")})
+    store = Memory({"friction@elbow": StoredFit(values, std, {FRICTION.label: 0.2}, "long ago")})
     problem = Problem(lambda values: 5.0)
     found = refit_with_effects(problem, [FRICTION], START, store)
     assert solved.runs == []
     assert (found.values, found.std, found.solver_message, found.is_from_store) == (values, std, "long ago", True)
-    assert found.amplitude_std == {A: 0.2}
+    assert found.p_values == {FRICTION.label: 0.2}
     assert found.cost == pytest.approx(5.0)
     assert solved.losses == [values]
     assert problem.freed == (FRICTION,)
@@ -258,16 +263,16 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
 
 
 @cases(
-    "values, std, held, cost",
+    "values, std, known, cost",
     {
-        "other unknowns": ({"k": 1.0}, {"k": 1.0}, {A: 0.2}, 5.0),
-        "deviations of others": (START, {"k": 1.0}, {A: 0.2}, 5.0),
-        "other amplitudes": (START, dict.fromkeys(START, 0.3), {"k": 0.2}, 5.0),
-        "cannot be rolled out": (START, dict.fromkeys(START, 0.3), {A: 0.2}, None),
+        "other unknowns": ({"k": 1.0}, {"k": 1.0}, {FRICTION.label: 0.2}, 5.0),
+        "deviations of others": (START, {"k": 1.0}, {FRICTION.label: 0.2}, 5.0),
+        "other effects": (START, dict.fromkeys(START, 0.3), {"k": 0.2}, 5.0),
+        "cannot be rolled out": (START, dict.fromkeys(START, 0.3), {FRICTION.label: 0.2}, None),
     },
 )
-def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, held, cost):
-    store = Memory({"friction@elbow": StoredFit(values, std, held, "")})
+def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, known, cost):
+    store = Memory({"friction@elbow": StoredFit(values, std, known, "")})
     assert load_stored_refit(Problem(lambda _: cost), [FRICTION], store) is None
 
 

@@ -469,7 +469,7 @@ def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> Ref
             slopes, moved = first.evaluation.jacobian, first.problem.vector(first.values) - first.problem.vector(start)
             if slopes is not None and float(np.linalg.norm(slopes @ moved)) < _SAME_WEIGHTS_STDS:
                 if search.store is not None:
-                    known = StoredFit(first.values, first.std, first.amplitude_std, first.solver_message)
+                    known = StoredFit(first.values, first.std, first.p_values, first.solver_message)
                     search.store.put(name or join_effect_labels(()), known)
                 return first
             start = first.values

@@ -22,7 +22,11 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
-from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, std_from_covariance
+from yid_ocp.inference.uncertainty import (
+    assess_goodness_of_fit,
+    misfit_robust_covariance,
+    unknowns_covariance_factor,
+)
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_whitened_by_sensor_noise,
@@ -76,7 +80,7 @@ class StoredFit:
 
     values: dict[str, float]  # of every unknown
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing
-    amplitude_std: dict[str, float]  # of the effects' amplitudes, with their shapes held
+    p_values: dict[str, float]  # by effect: that its amplitudes are as far from neutral by chance, with its shapes held
     solver_message: str  # why the solver ended
 
 
@@ -268,10 +272,9 @@ def refit_with_effects(
     x, finish = best.outcome.x, best.finish
     values = best.problem.named_values(x)
     own = problem.with_relinearized_held_out_filters(best.problem, effects, values)
-    covariance = _refit_covariance(own, finish, limits)
-    std = _mark_uninformative_std(effects, own.named_values(std_from_covariance(covariance, x)))
-    held = _mark_uninformative_std(effects, _conditional_amplitude_std(own.unknown_names, effects, covariance))
-    found = StoredFit(values, std, held, best.outcome.message)
+    factor = _refit_covariance_factor(own, finish, limits)
+    std = _mark_uninformative_std(effects, own.named_values(np.linalg.norm(factor, axis=1)))
+    found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, x, factor), best.outcome.message)
     if store is not None:
         store.put(name or join_effect_labels(effects), found)
     return _model(found, effects, own, finish, x)
@@ -283,10 +286,8 @@ def load_stored_refit(
     """Restore a refit from the store by one evaluation. None if the store does not have it."""
     known = None if store is None else store.get(name or join_effect_labels(effects))
     unknowns = {*problem.with_nominal_and_effects_free(effects).unknown_names}
-    amplitudes = {amplitude for effect in effects for amplitude in effect.amplitude_names}
-    if known is None or not (
-        set(known.values) == set(known.std) == unknowns and set(known.amplitude_std) == amplitudes
-    ):
+    labels = {effect.label for effect in effects}
+    if known is None or not (set(known.values) == set(known.std) == unknowns and set(known.p_values) == labels):
         return None
     own = problem.with_effects_and_relinearized_filters(effects, known.values)
     x = own.vector(known.values)
@@ -305,7 +306,7 @@ def _model(
     x: Array,
     is_from_store: bool = False,
 ) -> RefittedModel:
-    kept = (known.values, known.std, known.amplitude_std, known.solver_message, tuple(effects), finish.cost)
+    kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), finish.cost)
     size = (len(finish.residual), own.has_process_noise)
     return RefittedModel(*kept, _held_out_loss(own, x), *size, own, finish, is_from_store)
 
@@ -383,27 +384,29 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
     return _Attempt(placed, outcome, finish) if finish.ok else None
 
 
-def _refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
-    """Covariance of the unknowns, shape (nx, nx), inflated by the misfit as in `solve`."""
-    return misfit_robust_covariance(problem, finish, assess_goodness_of_fit(problem, finish, limits.null_test_limits))
+def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
+    """Factor F of the covariance F F' of the unknowns, (nx, nx), inflated by the misfit as in `solve`."""
+    factor = unknowns_covariance_factor(problem, finish)
+    fit = assess_goodness_of_fit(problem, finish, limits.null_test_limits)
+    std = np.sqrt(np.diag(misfit_robust_covariance(problem, finish, fit)))
+    return factor * (std / np.linalg.norm(factor, axis=1))[:, None]
 
 
-def _conditional_amplitude_std(
-    names: Sequence[str], effects: Sequence[EffectBase], covariance: Array
-) -> dict[str, float]:
-    """Standard deviations of the effects' amplitudes with their shapes held, as a weak effect has any shape.
+def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Array, factor: Array) -> dict[str, float]:
+    """Wald's test of each effect: all its amplitudes together, its shapes held, as a weak effect has any shape.
 
-    Davies 1987, doi:10.1093/biomet/74.1.33.
+    A load that is known well may be divided among its amplitudes in any way, so that none alone differs from neutral.
+    `factor` F gives the covariance F F'. Davies 1987, doi:10.1093/biomet/74.1.33.
     """
     found = {}
-    for effect in effects if len(covariance) else ():
-        shapes = [names.index(name) for name in effect.shape_parameter_names]
-        for name in effect.amplitude_names:
-            i = names.index(name)
-            own, along, other = covariance[i, i], covariance[shapes, i], covariance[np.ix_(shapes, shapes)]
-            if np.isfinite(along).all() and np.isfinite(other).all():
-                own = own - along @ np.linalg.pinv(other, hermitian=True) @ along
-            found[name] = math.inf if np.isnan(own) else math.sqrt(max(float(own), 0.0))
+    for effect in effects:
+        shapes, sized = ([names.index(n) for n in of] for of in (effect.shape_parameter_names, effect.amplitude_names))
+        away = x[sized] - [effect.neutral_values[names[i]] for i in sized]
+        others = np.linalg.qr(factor[shapes].T)[0]
+        rows = factor[sized] - factor[sized] @ others @ others.T
+        scale = np.linalg.norm(rows, axis=1)
+        whitened = np.linalg.lstsq(rows / scale[:, None], away / scale, rcond=None)[0]
+        found[effect.label] = chi2_p_value(float(whitened @ whitened), len(sized))
     return found
 
 

@@ -7,7 +7,7 @@ doi:10.1214/aos/1176347265).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -133,20 +133,30 @@ def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool
 
 
 def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether an effect is significant, and no parameter surely outside its prior range by a width or a factor."""
+    """Whether an effect is significant, and no parameter surely outside its prior range."""
+    return _is_within_range(effect, fit, limits, effect.prior_ranges) and _is_significant(effect, fit, limits)
+
+
+def _has_plausible_size(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
+    """Whether no amplitude is surely outside its prior range: others mend what the effects before it do wrong."""
+    return _is_within_range(effect, fit, limits, effect.amplitude_names)
+
+
+def _is_within_range(effect: EffectBase, fit: RefitStatistics, limits: Thresholds, names: Iterable[str]) -> bool:
+    """Whether parameters may lie within their prior ranges, widened by a width or a factor."""
     room = limits.prior_range_margin_in_widths
-    for name, (low, high) in effect.prior_ranges.items():
+    for name in names:
+        low, high = effect.prior_ranges[name]
         unsure, width = limits.min_z * fit.std.get(name, 0.0), room * (high - low)
         least = low / (1 + room) if low > 0 else low - width
         if not least - unsure <= fit.values[name] <= high + width + unsure:
             return False
-    return _is_significant(effect, fit, limits)
+    return True
 
 
 def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether any amplitude is at least `min_z` standard deviations from neutral."""
-    neutral, std = effect.neutral_values, fit.amplitude_std
-    return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
+    """Whether the amplitudes together are at least as unlikely by chance as one of `min_z` standard deviations."""
+    return fit.p_values[effect.label] <= math.erfc(limits.min_z / math.sqrt(2.0))
 
 
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
@@ -252,7 +262,7 @@ def select_effects(
             )
             fits += [fit for fit in pairs if _is_plausible(fit.effects[0], fit, limits)]
         # of an unlikely size it would mend what those before it do wrong
-        fits = [fit for fit in fits if not base or _is_plausible(fit.effects[-1], fit, limits)]
+        fits = [fit for fit in fits if not base or _has_plausible_size(fit.effects[-1], fit, limits)]
         near = _near_best_models(fits, limits) if fits else []
         first = first or [*near[:1], *sorted((fit for fit in fits if fit is not near[0]), key=_chi2)]
         better = next((fit for fit in near if _is_needed(current, fit, fit.effects[-1], limits)), None)
@@ -323,7 +333,9 @@ def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choi
     tried = [pair for pair in tried if pair[0][0].label != label]
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
-    near = _near_best_models([own, *(fit for fit in others if _is_plausible(fit.effects[-1], fit, limits))], limits)
+    near = _near_best_models(
+        [own, *(fit for fit in others if _has_plausible_size(fit.effects[-1], fit, limits))], limits
+    )
     better = next((fit for fit in near if _is_needed(without, fit, fit.effects[-1], limits)), own)
     if better is not own:
         search.progress.begin_stage(f"put {better.effects[-1].label} in the place of {label}")
