@@ -154,7 +154,7 @@ def in_band(case: Case, table: Any, visited: tuple[float, float]) -> float:
     at = np.linspace(*visited, 200)
     zeros = np.zeros(200)
     true = case.torque(at, zeros) if table.quantity == "angle" else case.torque(zeros, at)
-    found, std = table.torque_at(at), np.interp(at, table.knots, table.torque_std)
+    found, std = table.interpolated_torque(at), np.interp(at, table.knots, table.torque_std)
     shift: Array = np.zeros(200)
     if case.withheld is None:
         # what is linear or constant is the stiffness's, the damping's or an offset's as much as the law's

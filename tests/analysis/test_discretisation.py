@@ -23,9 +23,9 @@ from yid_ocp.analysis.discretisation import (
     _half_step_error,
     inflate_estimates_by_discretisation,
     largest_alternating_error_growth,
+    longest_accurate_time_step,
     measure_discretisation_shifts,
     refitted_residual_at_finer_step,
-    time_step_for_motion,
 )
 from yid_ocp.analysis.estimation import _checked_solution_and_step_stability
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -248,7 +248,7 @@ def test_a_brisk_motion_has_a_shorter_step_than_a_calm_one(urdf_folder):
         truth = EstimationProblem(copy_of_step_with_time_step(step, 0.00125), [drawn], ("elbow.stiffness",), options)
         recording = truth.simulate_synthetic_recording(seed=1)
         problem = EstimationProblem(step, [recording], ("elbow.stiffness",), options)
-        h = time_step_for_motion(problem)
+        h = longest_accurate_time_step(problem)
         assert h == pytest.approx(0.02 / 2 ** round(math.log2(0.02 / h)))
         errors = [
             _half_step_error(problem.with_time_step(at), problem.with_time_step(at / 2), problem.initial_unknowns)

@@ -36,7 +36,7 @@ parameters:
 problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, initial_configuration_std: 0.2,
           initial_velocity_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
-output: {write_report: false, discretisation_check_mode: none}
+output: {write_report: false, checked_discretisations: none}
 """
 NOISE, LOAD = 1e-4, 0.05
 TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}

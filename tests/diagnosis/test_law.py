@@ -102,7 +102,7 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
     expected = spline(np.clip(middle, -0.5, 0.7))
     # a prescribed joint's effort at a node has half of the force on either side
     np.testing.assert_allclose((efforts[0] - efforts[1])[1:, 1], (expected[1:] + expected[:-1]) / 2, atol=1e-9)
-    np.testing.assert_allclose(table.torque_at(middle), expected, atol=1e-12)
+    np.testing.assert_allclose(table.interpolated_torque(middle), expected, atol=1e-12)
     assert np.ptp(middle) > 2 * np.ptp(table.knots)
 
 

@@ -206,7 +206,7 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
 def test_what_is_detectable_survives_as_plain_data(drawn):
     told = json.loads(json.dumps(drawn().candidate_sensitivities_to_json()))
     other = drawn(seed=5)
-    other.load_candidate_sensitivities(told)
+    other.set_candidate_sensitivities_from_json(told)
     assert other.candidate_sensitivities_to_json() == told
     assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
     assert other._inside(np.random.default_rng(1), 3.0) == drawn()._inside(np.random.default_rng(1), 3.0)

@@ -58,7 +58,7 @@ def test_every_row_and_every_slope_has_its_name(case, made):
     assert kinds == [kind for kind, count in counts.items() for _ in range(count)]
     assert made.residual_names[0] == f"del[{system.mechanism.joint_names[system.unprescribed_coordinate_indices[0]]}]"
     assert made.residual.numel() == len(made.residual_names)
-    by_rows, by_effort = made.parameter_jacobians(system.parameters.names[:2])
+    by_rows, by_effort = made.residual_and_effort_jacobians_by_parameters(system.parameters.names[:2])
     assert by_rows.shape == (len(made.residual_names), 2)
     assert by_effort.shape == (s["nc"], 2)
 

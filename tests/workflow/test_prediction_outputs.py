@@ -63,7 +63,7 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_pa
     ((episode, outcome),) = solved_pendulum[2]
     other = SimpleNamespace(predicted_outputs=[2 * array for array in outcome.predicted_outputs])
     finding = SimpleNamespace(smoother_result=None, events=NO_EVENTS)
-    prediction_outputs.write_diagnosis_trajectories(tmp_path / "t.h5", finding, [(episode, outcome, other)])
+    prediction_outputs.write_diagnosis_hdf5(tmp_path / "t.h5", finding, [(episode, outcome, other)])
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-diagnosis-trajectories/1"
         assert list(file) == ["held_out"]

@@ -140,7 +140,7 @@ def refitted_residual_at_finer_step(
     return None if isinstance(made, str) else made[1]
 
 
-def time_step_for_motion(problem: EstimationProblem) -> float:
+def longest_accurate_time_step(problem: EstimationProblem) -> float:
     """Find the longest time step [s] whose error is small beside the prediction residual at the initial unknowns.
 
     From 20 ms on it is halved, at most five times, until half of it changes the prediction of the recordings to

@@ -450,11 +450,11 @@ class OutputSettings:
 
     runs_folder: Annotated[_FilePath | None, OptionInfo("folder of run folders; `runs` in the working folder")] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
-    discretisation_check_mode: Annotated[
+    checked_discretisations: Annotated[
         Literal["none", "time_step", "both"] | None,
         OptionInfo(
-            "refinement by which `solve` tests the estimates: the time step, or the links too; both for an object "
-            "of segments and the time step for any other when absent"
+            "what `solve` refines to test the estimates: nothing, the time step, or both step and links; when absent "
+            "both for an object of segments and the time step for any other"
         ),
     ] = None
 

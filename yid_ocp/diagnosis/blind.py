@@ -321,7 +321,7 @@ class BlindCaseGenerator:
             for effect, shape, factor in self._detectable
         ]
 
-    def load_candidate_sensitivities(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+    def set_candidate_sensitivities_from_json(self, detectable: Sequence[Mapping[str, Any]]) -> None:
         """Set the candidates' sensitivities to those that `candidate_sensitivities_to_json` returned elsewhere."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(

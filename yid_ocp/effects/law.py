@@ -48,7 +48,7 @@ class LawTable:
     torque: Array  # [N m]
     torque_std: Array  # [N m]; NaN where it is not known
 
-    def torque_at(self, x: Array) -> Array:
+    def interpolated_torque(self, x: Array) -> Array:
         """Torque at values of the quantity, shape (m,) [N m]."""
         spline = scipy.interpolate.CubicSpline(self.knots, self.torque, bc_type="natural")
         return np.asarray(spline(np.clip(x, self.knots[0], self.knots[-1])), float)

@@ -198,7 +198,7 @@ def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_v
     return (ctypes.c_void_p * len(arrays))(*(None if array is None else array.ctypes.data for array in arrays))
 
 
-def kalman_steps_and_final_covariance(
+def prepare_kalman_steps(
     covariance: Array,
     observation: Array,
     row_start: Sequence[int],
@@ -207,7 +207,7 @@ def kalman_steps_and_final_covariance(
     decay: Array,
     variance: Array,
 ) -> tuple[KalmanSteps, Array]:
-    """Successive filter steps with fixed gains, and the state covariance (nx, nx) after the last.
+    """Prepare successive filter steps, whose gains no data change, and the state covariance (nx, nx) after the last.
 
     Of the moves (k, ns, ns + m + noises) the last columns are what unit noises add to the states; `variance`
     (k, nx - ns) is that of the parameters' process noise. Other arguments are as in `KalmanSteps`.

@@ -431,7 +431,7 @@ class NlpStepConstraints:
     prescribed_effort: ca.SX  # effort of the prescribed coordinates at the first node [N m]
     effort_jacobians: dict[str, ca.SX]
 
-    def parameter_jacobians(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
+    def residual_and_effort_jacobians_by_parameters(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
         """Sparse derivatives of `residual` and `prescribed_effort` with respect to parameters, (..., len(names))."""
         parameters = self.equations.system.parameters
         chosen = ca.vertcat(ca.SX(0, 1), *(parameters[name].symbol for name in names))

@@ -206,7 +206,10 @@ class InterpretedKernel:
     def step_derivatives_along_rollout(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of next states and efforts. Arguments are as in `step.step_derivatives_along_rollout`."""
+        """Derivatives of each step's next state and efforts with respect to state, input torques and loads.
+
+        Arguments are as in `step.step_derivatives_along_rollout`.
+        """
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))

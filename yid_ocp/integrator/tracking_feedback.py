@@ -287,7 +287,7 @@ class EffectMomentumShift:
 
 
 def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative of the applied torque with respect to a recorded torque's error, with feedback, (..., nu, nu).
+    """Derivative of the torque that acts under feedback with respect to the recorded torque's error, (..., nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
     `gain` (..., nu, nb) is that of a step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.

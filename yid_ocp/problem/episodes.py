@@ -72,7 +72,7 @@ class EpisodePrediction:
 
 @dataclass(frozen=True)
 class InitialStateWithSensitivity:
-    """Initial state of a rollout with its derivative and equilibrium. A message says why it was not found."""
+    """Initial state of a rollout, its derivative, and the equilibrium it starts from; or why there is none."""
 
     state: Array  # (q, p, z), (nx,)
     state_sensitivity: Array  # with respect to (wanted parameters, state offset), (nx, d)
@@ -126,7 +126,7 @@ class InputErrorModel:
         )
 
     def on_finer_steps(self, ratio: int) -> InputErrorModel:
-        """Divide each step into `ratio` steps. Torques are held, the reference is interpolated."""
+        """Make the same error model for `ratio` times shorter steps. Torques are held, the reference interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
         if (known := self.smoothed_reference) is not None:

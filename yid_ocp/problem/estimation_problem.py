@@ -33,7 +33,7 @@ from yid_ocp.problem.evaluation import (
     check_free_parameters,
     check_parameter_bounds,
     estimated_initial_state_names,
-    max_allowed_initial_state_offsets,
+    initial_internal_state_offset_bounds,
     soft_logarithm_and_slope,
     stated_prior_jacobian,
     stated_prior_stds,
@@ -182,7 +182,7 @@ class EstimationProblem(ReprMixin):
         """Lower and upper bounds of the unknown vector, two arrays (nx,)."""
         parts = (self.shared_parameters, self.local_parameters)
         (low, high), (own_low, own_high) = (self.system.parameters.bounds(part) for part in parts)
-        wide = max_allowed_initial_state_offsets(self.system, self.unknowns.initial_state_names)
+        wide = initial_internal_state_offset_bounds(self.system, self.unknowns.initial_state_names)
         pack = self.unknowns.pack_same_for_all_recordings
         return pack(low, own_low, -wide), pack(high, own_high, wide)
 
@@ -224,7 +224,7 @@ class EstimationProblem(ReprMixin):
         return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Replace entries of the initial unknown vector by `values`, clipped to the bounds, shape (nx,)."""
+        """Copy of the initial unknown vector with the named `values` in it, all clipped to the bounds, shape (nx,)."""
         start = self.named_values(self.initial_unknowns)
         return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
 
@@ -464,7 +464,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
     short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
-    limit = max_allowed_initial_state_offsets(predictor.system, predictor.unknowns.initial_state_names)
+    limit = initial_internal_state_offset_bounds(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

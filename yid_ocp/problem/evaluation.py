@@ -266,8 +266,8 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
     return {name: size for effect in effects for name, size in effect.max_abs_unknown_initial_states.items()}
 
 
-def max_allowed_initial_state_offsets(system: System, names: Sequence[str]) -> Array:
-    """Largest absolute offset of each estimated initial state component. Infinite for coordinates and momenta."""
+def initial_internal_state_offset_bounds(system: System, names: Sequence[str]) -> Array:
+    """Largest absolute initial offset of effects' internal coordinates, infinite for other names, (len(names),)."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 

@@ -45,7 +45,7 @@ class TimeGrid:
 
 
 def recording_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
-    """Make a time grid over a recording's joint samples, or without joints over its first point group.
+    """Make an equally spaced time grid over the span of the joint samples, or without joints of the first point group.
 
     `DataError` where it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its length.
     """

@@ -256,7 +256,7 @@ class TimeGridStateValues:
 
 
 def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Velocity at some nodes of a trajectory as mean over the adjacent steps, (K, ...) to (len(nodes), ...)."""
+    """Velocity at `nodes` from the positions (K, ...) of their neighbours, shape (len(nodes), ...)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))

@@ -74,7 +74,10 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 @dataclass(frozen=True)
 class JointDynamicsTerms:
-    """Terms at one joint in SI units. Force = constant - stiffness q - cubic q^3 - damping v - friction."""
+    """Stiffness, damping, dry friction, armature and constant force of one joint, in SI units.
+
+    Force = constant - stiffness q - cubic q^3 - damping v - friction.
+    """
 
     stiffness: float = 0.0
     constant_force: float = 0.0

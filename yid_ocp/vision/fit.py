@@ -452,7 +452,7 @@ class ShapeFitter:
         return FrameTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
     def tube_links_at_configuration(self, q: Array) -> TubeLinks:
-        """Tube links in the world at a configuration."""
+        """Links of the object as tubes in the world at the configuration `q`."""
         return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
     def gripper_positions_at_configuration(self, q: ArrayLike) -> Array:

@@ -112,7 +112,7 @@ def _topic(bag: OpenBag, wanted: str | None) -> str:
     clouds = bag.topic_names_of_types(_CLOUD_MESSAGE)
     usable = bag.topic_names_of_types(_CLOUD_MESSAGE, _IMAGE_MESSAGE)
     if wanted is not None:
-        bag.check_topic_is_known(wanted, usable, "clouds or depth images")
+        bag.check_topic_is_among(wanted, usable, "clouds or depth images")
         return wanted
     deep = [name for name in usable if name in clouds or _is_depth(bag, name)]
     if len(deep) == 1:

@@ -260,7 +260,7 @@ def _draw_case(
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.load_candidate_sensitivities(read_input_json(detectable))
+    ensemble.set_candidate_sensitivities_from_json(read_input_json(detectable))
     case, label = ensemble.draw_planned_case(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, time_step_for_motion
+from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_closure_error_by_grasp
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
@@ -109,7 +109,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
 
 def _checked_discretisations(run: RunSettings) -> tuple[DiscretisationName, ...]:
     """Discretisations that a run's settings check after a solve, by default those that matter for its object."""
-    said, item = run.output.discretisation_check_mode, run.model.object
+    said, item = run.output.checked_discretisations, run.model.object
     if said is None:
         said = "both" if item is not None and item.default_link_refinement else "time_step"
     choices: dict[str, tuple[DiscretisationName, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
@@ -162,7 +162,7 @@ def build_problem(
     said = replace(options, data_issues=issues)
     problem = EstimationProblem(step, estimate, free, said, None, held_out)
     if run.problem.time_step == "auto":
-        step = copy_of_step_with_time_step(step, time_step_for_motion(problem))
+        step = copy_of_step_with_time_step(step, longest_accurate_time_step(problem))
         log.info("problem.time_step: auto chooses %g s for these recordings", step.time_step)
         problem = EstimationProblem(step, estimate, free, said, None, held_out)
     _check_grasps_close(run, problem)

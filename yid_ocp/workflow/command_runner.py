@@ -67,7 +67,7 @@ def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progres
 def print_result(
     arguments: argparse.Namespace, result: Mapping[str, Any], texts: Callable[[], Sequence[str]], place: str, path: str
 ) -> None:
-    """Print a command's result as text and `place`, as path alone (`quiet`) or as JSON (`json`).
+    """Print a command's result: as text and the line `place`, as `path` alone (`quiet`) or as JSON (`json`).
 
     Beside JSON nothing else goes to standard output; the place goes to standard error.
     """

@@ -104,7 +104,7 @@ def run_diagnose(
             raise
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
-        prediction_outputs.write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
+        prediction_outputs.write_diagnosis_hdf5(folder.path / "trajectories.h5", finding, predicted)
         if finding.law is not None:
             write_text(folder.path / "law.csv", law_tables_csv(finding.law.tables))
         last, told = finding.final_model, finding.to_dict()

@@ -164,10 +164,10 @@ def write_solve_trajectories(
                 _store_sensor(group, episode, samples, {"predicted": predicted})
 
 
-def write_diagnosis_trajectories(
+def write_diagnosis_hdf5(
     path: Path, finding: DiagnosisResult, pairs: Sequence[EpisodeWithNominalAndEffectPredictions]
 ) -> None:
-    """Write held-out predictions and smoothed unknowns as `yid-diagnosis-trajectories/1`.
+    """Write held-out predictions, smoothed unknowns and event forces to HDF5 as `yid-diagnosis-trajectories/1`.
 
     `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
     attributes `channels`, `unit`.

@@ -99,8 +99,8 @@ class OpenBag:
         """Names of the bag's topics that have one of the given message types."""
         return [topic.name for topic in self.topics if topic.kind in kinds]
 
-    def check_topic_is_known(self, name: str, known: Sequence[str], noun: str) -> None:
-        """Raise `DataError` if the topic `name` is not in `known`. `noun` says what the topic provides."""
+    def check_topic_is_among(self, name: str, known: Sequence[str], noun: str) -> None:
+        """Raise `DataError` if the topic `name` is not among `known`. `noun` says what these topics provide."""
         if name not in known:
             what = f"there are no {noun} on the topic '{name}'"
             raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known))
@@ -287,7 +287,7 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
     topics = sorted({topic for topic, _, _ in split.values()})
     where, allowed = str(bag.path), "CHANNEL=/TOPIC.FIELD, of one topic, position among them"
     for channel, (topic, _, path) in split.items():
-        bag.check_topic_is_known(topic, [known.name for known in bag.topics], "messages")
+        bag.check_topic_is_among(topic, [known.name for known in bag.topics], "messages")
         if not path:
             raise DataError(f"the field of '{channel}' has no name", where=where, allowed=allowed)
     if len(topics) > 1 or (fields and "position" not in fields):
@@ -387,7 +387,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
     default = [bag.topic_of_fields] if bag.topic_of_fields else _default_joint_topics(bag.file)
     known = list(dict.fromkeys([*known, *default]))
     for topic in (*(topics or ()), *((command,) if command else ())):
-        bag.file.check_topic_is_known(topic, known, "joint states")
+        bag.file.check_topic_is_among(topic, known, "joint states")
     chosen = [topic for topic in (default if topics is None else topics) if topic != command]
     wanted = None if options.joints is None else base.parse_renamings(options.joints, "joint", where)
     found, notes = [], []
@@ -496,7 +496,7 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
     known = [*present, *(f"{tree}:FRAME" for tree in bag.file.topic_names_of_types(*_TREES))]
     for source in () if points is None else names:
         if source not in present:
-            bag.file.check_topic_is_known(source, known, "points")
+            bag.file.check_topic_is_among(source, known, "points")
     base.check_unique_point_names(names, where)
     groups: _MessagesByFrame = {}
     for message in bag.places:

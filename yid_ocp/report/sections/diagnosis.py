@@ -254,7 +254,7 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
     for table in law.tables:
         low, high = table.knots[0], table.knots[-1]
         at = np.linspace(low, high, 200)
-        torque, std = table.torque_at(at), np.interp(at, table.knots, table.torque_std)
+        torque, std = table.interpolated_torque(at), np.interp(at, table.knots, table.torque_std)
         nearest = _library_curves(table, at)
         words = (f"{table.quantity} [{LAW_QUANTITY_UNITS[table.quantity]}]", "torque [N m]")
         visited = law.visited_range[table.quantity]
