@@ -19,6 +19,7 @@ from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.cli import build_argument_parser
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings
+from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.base import EffectBase
 from yid_ocp.errors import ConfigError
@@ -110,6 +111,11 @@ def test_names_in_the_pages_exist(repository):
             words = {word for span in spans for word in re.findall(r"(?<![\w$])[a-z]+_[a-z_]+(?!\w)", span)}
             absent |= {file.name: sorted(words - known)} if words - known else {}
     assert not absent
+
+
+def test_the_page_of_checks_lists_every_issue_with_its_description(page):
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", page("data_checks"), re.MULTILINE)
+    assert dict(rows[3:]) == dict(ISSUE_CAUSE_DESCRIPTIONS)  # behind the three weights
 
 
 def test_the_tutorial_runs(page, run_script, repository, shipped_optimization):
