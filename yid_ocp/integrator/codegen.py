@@ -1,6 +1,6 @@
 """Generate CasADi functions, index tables and C code from symbolic step equations.
 
-Functions of several members at once, and long ones, are written in the arithmetic of `simd.c`.
+Batched kernels, and functions of very many instructions, are written with the SIMD arithmetic of `simd.c`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _Indices = NDArray[np.int32]
 class StepFunctions:
     """CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
 
-    What is at the midpoint and after it is empty where the constraints pull at the node. A function is made, and its
-    common subexpressions found, when it is first used: a kernel from the cache needs none of them.
+    Each is built when it is first used, because a cached kernel needs none of them. With constraint forces at the node,
+    the outputs for the midpoint and the end of the step are empty.
     """
 
     def __init__(
@@ -43,20 +43,22 @@ class StepFunctions:
 
     @property
     def jacobian_parts(self) -> ca.Function:
-        """Function of the Jacobian's parts: pair vectors, then nonzeros of the rest, p1, constraints and curvature.
+        """Function that returns the parts of the step's Jacobians.
 
-        The curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}.
+        Its outputs are the vectors per joint, then the nonzeros of the remaining entries of the residual, of p1 and of
+        the constraints, and the curvature. The curvature is the derivative of the midpoint's constraint force with
+        respect to q_k, which equals the one with respect to q_{k+1}.
         """
         return self._function("linear")
 
     @property
     def row_scale_and_time_step(self) -> ca.Function:
-        """Scale of the momentum balance's rows, and the clock-corrected time step [s]."""
+        """Function that returns the scale of the momentum balance's rows and the clock-corrected time step [s]."""
         return self._function("scales")
 
     @property
     def internal_residual_at_rest(self) -> ca.Function:
-        """Internal equations at rest and their derivatives with respect to (q, z, lam, u). Both nodes are equal."""
+        """Function of the internal equations at rest (both nodes equal) and their derivatives by (q, z, lam, u)."""
         return self._function("resting")
 
     @property
@@ -65,16 +67,15 @@ class StepFunctions:
         return tuple(map(self._function, self._outputs))
 
     def _expression_text(self) -> str:
-        """Text that determines the functions, from which a compiled kernel is found again: their serialized graphs."""
+        """Serialized graphs of the functions, which identify a compiled kernel in the cache."""
         with CASADI_LOCK:
             together = [output for own in self._outputs.values() for output in own]
             return str(ca.Function("step", self.equations.arguments, together).serialize())
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
-    """Build the CasADi functions that the stepping kernel calls.
-
-    The bodies' part of the Jacobians comes as vectors per joint, everything else from automatic differentiation.
+    """Build the CasADi functions that the stepping kernel calls. The bodies' Jacobians are formed from vectors per
+    joint.
     """
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
@@ -124,7 +125,9 @@ def _pairs(e: DiscreteEquations) -> ca.SX:
 
 
 def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Sparse derivatives besides the pairs: rows and p1 by (unknowns, old, input), the constraint by unknowns."""
+    """Sparse derivatives without the bodies' part: residual and p1 by (unknowns, old, input), constraints by the
+    unknowns.
+    """
     unknown, old = ca.vertcat(e.q1, e.z1, e.lam), ca.vertcat(e.q0, e.z0)
     inputs = ca.vertcat(unknown, old, e.u)
     m, n = e.lam.numel(), e.q0.numel()
@@ -156,7 +159,10 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 
 
 def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
-    """Build a CasADi function of a step's sparse parameter derivatives. Outputs: residual, p1, prescribed effort."""
+    """Build a CasADi function of the sparse derivatives of a step with respect to the parameters `names`.
+
+    Its outputs are the derivatives of the residual, of p1 and of the prescribed effort.
+    """
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     prescribed = list(e.system.prescribed_coordinate_indices)
@@ -235,16 +241,16 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
 
 
 def kernel_source_text(functions: StepFunctions, tables: StepSparsityTables) -> str:
-    """Collect the text that identifies a kernel without generating C, from equations, tables and generators."""
+    """Collect the text that identifies a kernel in the cache: generators, index tables and serialized equations."""
     folder = resources.files("yid_ocp.integrator")
     files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]
     return "\0".join([*files, *_kernel_tables(functions, tables), functions._expression_text()])
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
-    """Generate the C source of the stepping kernel. Order: `simd.c`, CasADi's functions, sizes, tables, `kernel.c`.
+    """Generate the C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables and `kernel.c`.
 
-    With `batched` for several rollouts at once, as many as `yid_simd_width` returns; then None where a function has no
+    With `batched`, the kernel integrates `yid_simd_width` rollouts at once; the result is None if a function has no
     SIMD form.
     """
     made = _simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
@@ -302,7 +308,7 @@ def _kernel_tables(functions: StepFunctions, tables: StepSparsityTables) -> list
 
 
 def _step_source(functions: Sequence[ca.Function]) -> str:
-    """C source of a step's functions: CasADi's own, but for long ones, which no compiler takes whole."""
+    """C source of a step's functions: CasADi's own code, except for functions too long for a compiler."""
     long = [function for function in functions if _is_long_function(function)]
     ours = _simd_c_source(long)
     if not long or ours is None:
@@ -311,7 +317,7 @@ def _step_source(functions: Sequence[ca.Function]) -> str:
 
 
 def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
-    """Generate C source for CasADi functions, which keep their names. `name` names the file."""
+    """Generate C source for CasADi functions under their own names. `name` is the name of the generated file."""
     generator = ca.CodeGenerator(name, {"with_header": False, "indent": 0})
     for function in functions:
         generator.add(function)
@@ -319,7 +325,7 @@ def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
 
 
 def nonzero_indices(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
-    """Row and column indices of a sparsity pattern's structural nonzeros, two arrays."""
+    """Row and column indices of a sparsity pattern's structural nonzeros, each an array (nnz,)."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)
 
@@ -382,9 +388,8 @@ def _is_long_function(function: ca.Function) -> bool:
 
 
 def _simd_c_source(functions: Sequence[ca.Function]) -> str | None:
-    """SIMD C source of SX functions with CasADi's signatures; None if one uses an operation without a SIMD form.
-
-    A long one is written as functions of some instructions, which hand on what later ones need in the work vector.
+    """SIMD C source of SX functions with CasADi's signatures, long ones in parts; None if an operation has no SIMD
+    form.
     """
     sources = [_source(function) for function in functions]
     return None if None in sources else "\n".join(source for source in sources if source is not None)
@@ -418,7 +423,7 @@ def _source(function: ca.Function) -> str | None:
 
 
 def _instructions(function: ca.Function) -> list[_Instruction]:
-    """Instructions of a function, in order; of an operation without a form no input is looked up."""
+    """Instructions of a function, in order. Inputs of an operation without a SIMD form are not resolved."""
     held: dict[int, int] = {}  # the instruction whose value stands in a place now
     found = []
     for k in range(function.n_instructions()):
@@ -434,7 +439,7 @@ def _instructions(function: ca.Function) -> list[_Instruction]:
 
 
 def _part(instructions: Sequence[_Instruction], first: int, size: int, needed: Sequence[int]) -> list[str]:
-    """Some instructions, each value a constant of its own; those that later parts need go to the work vector."""
+    """C lines of some instructions. Values that later parts need are written to the work vector."""
     lines: list[str] = []
     known: dict[int, str] = {}  # values of this part, and those that it has read from the work vector
     turned: dict[int, str] = {}  # sine and cosine of a value are worked out together

@@ -98,7 +98,7 @@ def _doubles(array: ArrayLike | None) -> Array | None:
 
 @dataclass(frozen=True)
 class _ThetaColumns:
-    """Compiled derivatives by some parameters; patterns are CasADi's compressed columns."""
+    """Compiled derivatives with respect to some parameters. Patterns have CasADi's compressed-column format."""
 
     address: int
     patterns: tuple[IntArray, ...]
@@ -129,14 +129,14 @@ class CompiledKernel:
         return self._rolled_out(self._library, [inputs])[0]
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        """Simulate several rollouts in C, in SIMD batches where that is faster."""
+        """Simulate several rollouts in C. SIMD batches are used where they are faster."""
         return call_merged_with_other_threads(self._rollouts, list(members))
 
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         alike: dict[Hashable, list[int]] = {}
         for i, member in enumerate(members):
             alike.setdefault(_batch_key(member), []).append(i)
-        # a batch takes as many columns and steps as its widest and longest member
+        # a batch costs as many columns and steps as its widest and longest member
         for group in alike.values():
             group.sort(key=lambda i: (_width(members[i]), len(members[i].torque)), reverse=True)
         batches = [part for group in alike.values() for part in self._split(group, members)]
@@ -147,9 +147,8 @@ class CompiledKernel:
         return [found[i] for i in range(len(members))]
 
     def _split(self, group: Sequence[int], members: Sequence[RolloutInputs]) -> list[Sequence[int]]:
-        """Batches of members that are alike, and single ones where a batch would have too few.
-
-        As results differ by rounding, the same members are split in the same way whatever threads there are.
+        """Split similar members into batches, independent of the number of threads (results of batches differ by
+        rounding).
         """
         batches: list[Sequence[int]] = []
         left = list(group)
@@ -167,12 +166,12 @@ class CompiledKernel:
         if known is None:
             return [self._rolled_out(self._library, [member])[0] for member in members]
         found = self._rolled_out(known[0], members)
-        # a batch knows simplified Newton only; what needs more, and what fails, goes to the kernel of one member
+        # a batch has simplified Newton only; members that fail in it are repeated with the kernel for one member
         pairs = zip(found, members, strict=True)
         return [out if out.status.is_converged else self._rolled_out(self._library, [one])[0] for out, one in pairs]
 
     def _rolled_out(self, library: ctypes.CDLL, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        """Rollouts by one call of the kernel of one member, or of a batch."""
+        """Rollouts from one call of a kernel, which takes one member or a batch."""
         sizes = self._model.sizes
         outs, motions, trajectories, sensitivities = [], [], [], []
         for m in members:
@@ -203,7 +202,7 @@ class CompiledKernel:
         names: tuple[str, ...],
         by: CostDerivativesByRolloutVariables,
     ) -> RolloutCostGradient:
-        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds the cost's derivatives."""
+        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds its partial derivatives."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = RolloutCostGradient(*(np.zeros(shape) for shape in shapes))
@@ -219,7 +218,7 @@ class CompiledKernel:
     def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
-        """Evaluate step residuals along a trajectory in C, and their Jacobians if `derivatives` is set."""
+        """Evaluate step residuals along a trajectory in C, with their Jacobians if `derivatives` is set."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         # in the order of the struct
         matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
@@ -233,7 +232,7 @@ class CompiledKernel:
     def step_derivatives_along_rollout(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, in C. Arguments and shapes: `step.step_derivatives_along_rollout`."""
+        """Compute the derivatives of a rollout's steps in C. Shapes are as in `step.step_derivatives_along_rollout`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)
@@ -292,7 +291,7 @@ def _width(member: RolloutInputs) -> int:
 
 
 def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
-    """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
+    """The kernel of a batch and its number of members. None if compiler or processor do not support it."""
     parts = model.functions, model.index_tables
     source = functools.partial(codegen.kernel_c_source, *parts, batched=True)
     library = compiler.compile_and_load_library(f"batched\0{codegen.kernel_source_text(*parts)}", source)
@@ -301,11 +300,7 @@ def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
 
 
 def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]) -> _ThetaColumns:
-    """Compiled derivatives by some parameters, which fit the kernel (it does not look).
-
-    To differentiate again what is in the cache would take longer than all that a diagnosis does with it; they follow
-    from the kernel's equations and the places of the parameters.
-    """
+    """Compiled derivatives by parameters. The cache key is the kernel and the indices of the parameters."""
 
     def source() -> str:
         function = codegen.parameter_jacobian_function(model.equations, names)

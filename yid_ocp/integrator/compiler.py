@@ -35,16 +35,16 @@ _LOG = logging.getLogger(__name__)
 
 _COMMON_FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
 _NATIVE_FLAGS = ("-march=native",)
-# Straight lines of arithmetic have no branch to thread and few constants left to fold; looking for them is a third of
-# GCC's time on a step of 50 variables, and what it makes runs as fast without. Other compilers refuse these words.
+# Code without branches gains nothing from these passes, which take a third of GCC's time on a step of 50 variables.
+# Other compilers reject these options.
 _GCC_FLAGS = ("-fno-tree-dominator-opts", "-fno-tree-ccp", "-fno-tree-bit-ccp")
 
 _OPTIMIZATION_FLAG = "-O1"  # -O2 takes 1.7 times as long on a step of 43 variables, for a gain of 2 to 4 %
-# What runs for seconds in all and is new for every model is worth no more: -O1 takes a minute on 70 000 lines, this
-# three seconds, for code that is still two or three times as fast as CasADi's own machine.
+# For code that runs for seconds in all and is new for every model: 70 000 lines compile in three seconds instead of a
+# minute (-O1), and run two or three times as fast as CasADi's interpreter.
 _NO_OPTIMIZATION_FLAG = "-O0"
 
-# Ten times what the longest of our functions takes; a compiler that hangs would hang the run.
+# Ten times the compile time of the longest function; a compiler that hangs would hang the run.
 _COMPILE_TIMEOUT, _VERSION_TIMEOUT = 900.0, 30.0  # [s]
 _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spoken of [s]
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
@@ -70,7 +70,7 @@ def _compiler_path() -> str | None:
 
 
 def _optimization_flag() -> str:
-    """Flag of the step's optimisation; the environment's variable YID_OCP_OPTIMIZE says another level."""
+    """Optimisation flag for the step, from the environment variable YID_OCP_OPTIMIZE or the default."""
     level = os.environ.get("YID_OCP_OPTIMIZE", "")
     if level not in ("", "0", "1", "2", "3"):
         what, where = f"there is no optimisation '{level}'", "the environment's variable YID_OCP_OPTIMIZE"
@@ -141,12 +141,11 @@ def _machine() -> str:
 def compile_and_load_library(
     source: str, make: Callable[[], str | None] | None = None, level: str | None = None
 ) -> ctypes.CDLL | None:
-    """Load the shared library of a C source, compiled or from the cache. None if no compiler works.
+    """Load the shared library of a C source, compiled or from the cache. Returns None if no compiler works.
 
-    The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
-    which returns the C text, or None where there is none, and is called only if the library is not in the cache,
-    `source` is what determines it.
-    `level` is another flag of optimisation than the step's.
+    The cache key is the hash of `source`, the flags, the compiler, the processor and CasADi's version. With `make`,
+    `source` is only the key. `make` is called if the library is not in the cache, and returns the C text or None.
+    `level` replaces the default optimisation flag.
     """
     target = _library_file(source, level or _optimization_flag(), make)
     if target is None:
@@ -159,9 +158,9 @@ def compile_and_load_library(
 
 
 def compiled_casadi_function(function: ca.Function) -> ca.Function:
-    """Compile a CasADi function to C. It cannot be differentiated then; it is unchanged if no compiler works.
+    """Compile a CasADi function to C, without optimisation. Returns the function unchanged if no compiler works.
 
-    Without optimisation: for functions of many operations with a total run time of seconds.
+    The compiled function cannot be differentiated. This suits functions of many operations that run for seconds in all.
     """
     target = _library_file(casadi_c_source(function.name(), (function,)), _NO_OPTIMIZATION_FLAG)
     if target is None:
@@ -174,7 +173,7 @@ def compiled_casadi_function(function: ca.Function) -> ca.Function:
 
 
 def _library_file(source: str, level: str, make: Callable[[], str | None] | None = None) -> Path | None:
-    """The library in the cache, compiled if it is not there yet; None where nothing can compile it."""
+    """Path of the library in the cache, compiled if it is missing. None if no compiler works."""
     path = _compiler_path()
     if path is None or path in _HUNG_COMPILERS:
         return None
@@ -212,9 +211,8 @@ def _library_file(source: str, level: str, make: Callable[[], str | None] | None
 
 
 def _kept(folder: Path, key: str) -> Path | None:
-    """The whole library of a key; damaged ones would end the process, others' would run: they are removed.
-
-    The name, which holds the content's hash, tells damage but not the author: that is the owner of a regular file.
+    """Path of the cached library of a key. Damaged libraries (see the hash in their name) and those of others are
+    removed.
     """
     for path in sorted(folder.glob(f"{key}-*.so")):
         with contextlib.suppress(OSError, DataError):
@@ -229,7 +227,7 @@ def _kept(folder: Path, key: str) -> Path | None:
 
 
 def _said(command: list[str], patience: float) -> tuple[bool, str]:
-    """Whether a program ended well, and what it said."""
+    """Whether a program ended with success, and its output."""
     notice = "the C compiler %s has been at work for %g s; it is given %g s, and CC=none does without it"
     timer = threading.Timer(_NOTICE_DELAY, _LOG.warning, (notice, command[0], _NOTICE_DELAY, patience))
     timer.daemon = True
@@ -248,7 +246,7 @@ def _said(command: list[str], patience: float) -> tuple[bool, str]:
 
 
 def _is_ours(built: Path) -> bool:
-    """Whether what a compiler left is a library with our symbols."""
+    """Whether a compiled library has our marker symbol."""
     try:
         return bool(getattr(ctypes.CDLL(str(built)), _MARKER_SYMBOL)() == 1)
     except (OSError, AttributeError):
@@ -256,9 +254,9 @@ def _is_ours(built: Path) -> bool:
 
 
 class MappedFunction:
-    """A CasADi function of dense columns, evaluated at many points in one call and compiled where possible.
+    """A CasADi function of dense columns, evaluated at many points in one call, compiled if possible.
 
-    `shared_inputs` are the positions of inputs that are the same at every point.
+    `shared_inputs` are the indices of inputs that have one value for all points.
     """
 
     def __init__(self, function: ca.Function, shared_inputs: Sequence[int] = (), use_compiler: bool = True) -> None:
@@ -298,7 +296,10 @@ int yid_map(int count, const double **in, double **out) {{
 """
 
     def __call__(self, *inputs: Array) -> list[Array]:
-        """Values at all points, (count, rows, columns), dense, for inputs (count, size) or, where shared, (size,)."""
+        """Evaluate the function at all points. Returns dense arrays (count, rows, columns), one per output.
+
+        Inputs have the shape (count, size), or (size,) if shared.
+        """
         count = next((len(x) for i, x in enumerate(inputs) if i not in self.shared_inputs), 1)
         arrays = [np.ascontiguousarray(x, dtype=float) for x in inputs]
         for i, array in enumerate(arrays):

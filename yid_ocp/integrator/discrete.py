@@ -5,17 +5,18 @@ Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h) and q_m
     p_k + D1 L_d(q_k, q_{k+1}) + f- - ((1 - s) Dphi(q_k) + s Dphi(q_m))' lam_k = 0     phi(q_{k+1}) - C lam_k / h = 0
     p_{k+1} = D2 L_d(q_k, q_{k+1}) + f+ - s (Dphi(q_m) - Dphi(q_{k+1}))' lam_k
 
-with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one; s = 0 for a constraint force at
-the node, s = 1/2 for one at the midpoint. At the node the pull's own stiffness, lam times the constraint's curvature,
-has the weights (0, 1, 0) on three neighbouring configurations, and where it exceeds 4 M/h^2 (a light twist under
-tension) the motion grows with alternating sign. With s = 1/2 its weights are a spring's, (1/4, 1/2, 1/4), which no
-tension makes unstable, while lam_k is still what node k needs: with a constant Dphi the two rules are one, and in
-general they differ by h/4 (d Dphi/dt)' (lam_k - lam_{k-1}) and a curvature of order h^2, so that the order stays two.
+The symmetric force split has f- = f+ = (h/2) F, the left one f- = h F and f+ = 0. s = 0 puts the constraint force at
+the node, s = 1/2 at the midpoint.
 
-The first equation holds for free coordinates; at a prescribed one its left side is -h times the effort that the
-prescription needs at node k. Both equations of a compliant coordinate are multiplied by its compliance, its momentum
-with them: there p is the compliance times the momentum [rad s], which keeps the spring's force (1/compliance) finite
-and the rule's order two.
+The constraint force has a stiffness of its own, lam times the constraint's curvature. With s = 0 this stiffness has the
+weights (0, 1, 0) on three neighbouring configurations. If it exceeds 4 M/h^2 (a light twist under tension), the motion
+grows with alternating sign. With s = 1/2 the weights are those of a spring, (1/4, 1/2, 1/4), which is stable under any
+tension. The two rules are equal if Dphi is constant. In general they differ by h/4 (d Dphi/dt)' (lam_k - lam_{k-1}) and
+a term of order h^2, so both have order two.
+
+The first equation holds for free coordinates. At a prescribed coordinate its left side is -h times the effort that the
+motion requires at node k. Both equations of a compliant coordinate are multiplied by its compliance, and so is its
+momentum p [rad s]. The spring force (1/compliance) thus stays finite, and the order stays two.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ ConstraintForcePlacement = Literal["node", "midpoint"]
 
 @dataclass(frozen=True)
 class _ConstraintImpulses:
-    """Dphi (m, n) and d(Dphi(q)' lam)/dq (n, n) at q_k, q_m and q_{k+1}; the Jacobians have one sparsity.
+    """Dphi (m, n) and d(Dphi(q)' lam)/dq (n, n) at q_k, q_m and q_{k+1}, with one sparsity pattern.
 
-    The balance loses (start Dphi(q_k) + share Dphi(q_m))' lam, p1 loses share (Dphi(q_m) - Dphi(q_{k+1}))' lam, where
-    start and share, at the midpoint, add up to one.
+    The balance loses (start Dphi(q_k) + share Dphi(q_m))' lam with start + share = 1. p1 loses share (Dphi(q_m) -
+    Dphi(q_{k+1}))' lam.
     """
 
     start_share: float
@@ -60,12 +61,12 @@ class _ConstraintImpulses:
 
     @property
     def left_jacobian(self) -> ca.SX:
-        """What the balance loses, times lam."""
+        """Jacobian whose transpose times lam is subtracted from the momentum balance, (m, n)."""
         return self.start_share * self.before_jacobian + self.midpoint_share * self.middle_jacobian
 
     @property
     def right_jacobian(self) -> ca.SX:
-        """What p1 loses, times lam."""
+        """Jacobian whose transpose times lam is subtracted from p1, (m, n)."""
         return self.midpoint_share * (self.middle_jacobian - self.after_jacobian)
 
 
@@ -73,8 +74,8 @@ class _ConstraintImpulses:
 class DiscreteEquations:
     """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system.
 
-    Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters. 0 and 1 are the
-    two nodes; coordinates q (n, 1), internal ones z (nz, 1), momenta p (n, 1) [N m s].
+    The digits 0 and 1 denote the step's two nodes. q (n, 1) are coordinates, z (nz, 1) internal coordinates and p (n,
+    1) momenta [N m s]. The system has m constraints, nu inputs and ntheta parameters.
     """
 
     system: System
@@ -116,13 +117,15 @@ class DiscreteEquations:
 
     @property
     def residual(self) -> ca.SX:
-        """Residual of the step, with momentum balance of free coordinates, internal and constraint equations."""
+        """Residual of the step: momentum balance of free coordinates, internal equations and constraint equations."""
         balance = self.momentum_balance[list(self.system.unprescribed_coordinate_indices), 0]
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
     def impulses_of_force_with_derivatives(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulses of the closed-form force in `momentum_balance` and `p1`, (n, 1) [N m s]. None without one."""
+        """Impulses of the closed-form force in `momentum_balance` and in `p1`, each (n, 1) [N m s]; None without such a
+        force.
+        """
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares
@@ -130,14 +133,14 @@ class DiscreteEquations:
 
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
-        """Constraint violation at the end of the step without relaxation, phi(q) - C lam / h, shape (m, 1)."""
+        """Constraint violation at the end of the step without relaxation, phi(q_{k+1}) - C lam / h, shape (m, 1)."""
         if self.constraint_relaxation_gain is None:
             return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
     def newton_unknowns(self) -> ca.SX:
-        """Unknowns of Newton's method. They are free coordinates of q1, internal coordinates z1 and multipliers lam."""
+        """Unknowns of Newton's method: free coordinates of q1, internal coordinates z1 and multipliers lam."""
         return ca.vertcat(self.q1[list(self.system.unprescribed_coordinate_indices), 0], self.z1, self.lam)
 
 
@@ -146,7 +149,7 @@ def discrete_equations(
 ) -> DiscreteEquations:
     """Build the discrete Euler-Lagrange equations of one step. Arguments are as in `compile_step`.
 
-    `ModelError` for an unknown force split or constraint force, or an internal coordinate without an equation.
+    Raises `ModelError` for an unknown rule, or if an internal coordinate has no equation.
 
     References
     ----------
@@ -204,7 +207,7 @@ def discrete_equations(
 
 @dataclass(frozen=True)
 class _Symbols:
-    """The symbols of a step, and those of its midpoint until `placed` inserts the nodes."""
+    """The symbols of a step and of its midpoint. `placed` expresses the midpoint by the two nodes."""
 
     q0: ca.SX
     q1: ca.SX
@@ -233,7 +236,7 @@ class _Symbols:
         return _Symbols(**symbols, h=symbols["time_step"] * system.recorded_time_scale, internal=own)
 
     def placed(self, expression: ca.SX, dense: bool = True) -> ca.SX:
-        """An expression of the midpoint as one of the two nodes."""
+        """Expression of the midpoint in terms of the two nodes."""
         midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
         (q, v), (z, z_rate) = (((a + b) / 2, (b - a) / self.h) for a, b in ((self.q0, self.q1), (self.z0, self.z1)))
         values = ca.vertcat(q, v, z, z_rate, self.lam / self.h, z)
@@ -244,7 +247,9 @@ class _Symbols:
 def _summed_terms(
     system: System, at: _Symbols, kinematics: Kinematics
 ) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithDerivativeFactors | None]:
-    """Lagrangian, force, internal equations (in motion, at rest) and closed force of springs, inputs and effects."""
+    """Lagrangian, force, internal equations (in motion and at rest) and closed-form force of springs, inputs and
+    effects.
+    """
     names = tuple(system.effect_internal_coordinate_symbols)
     rows_of = {name: i for i, name in enumerate(names)}
     state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
@@ -270,7 +275,7 @@ def _summed_terms(
 
 
 def _row_scale(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX]:
-    """Factor on every row, and what the spring of a compliant coordinate takes off it, both shape (n, 1)."""
+    """Factor on every row, and the term subtracted for the spring of a compliant coordinate, both (n, 1)."""
     scale, held = [ca.SX(1)] * system.n_coordinates, [ca.SX(0)] * system.n_coordinates
     for joint, compliance in system.joint_compliances.items():
         index = system.mechanism.joint_index(joint)
@@ -311,7 +316,8 @@ def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m:
 def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) -> list[ca.SX]:
     """Dphi(q) and d(Dphi(q)' lam)/dq in closed form.
 
-    A point moves with d2x/dq_i dq_j = w_i x dx/dq_j, a direction with d2v/dq_i dq_j = w_i x (w_j x v), for i above j.
+    For joint i before joint j in the chain: d2x/dq_i dq_j = w_i x dx/dq_j for a point x, d2v/dq_i dq_j = w_i x (w_j x
+    v) for a direction v.
     """
     n, turning = system.n_coordinates, [joint.kind != "prismatic" for joint in system.mechanism.joints]
     blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
@@ -358,7 +364,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
 
 
 def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
-    """Each orientation row of a grasp as a sum of products of a vector on the holder with one on the held frame."""
+    """Each orientation row of a grasp as a sum of products of a holder vector and a vector of the held frame."""
     if grasp.kind == "point":
         return []
     a = ca.horzsplit(kinematics.frame_pose(grasp.holder_frame).rotation @ grasp.held_orientation)
@@ -380,7 +386,9 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
 
 @dataclass(frozen=True)
 class EquilibriumEquations:
-    """Symbolic equations of static equilibrium. Torques and springs hold driven joints; prescribed joints are given."""
+    """Symbolic equations of static equilibrium. Torques and springs hold the driven joints; prescribed joints are
+    given.
+    """
 
     # (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
     # held torque, holding spring's stiffness, theta, time step
@@ -390,7 +398,9 @@ class EquilibriumEquations:
 
 
 def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
-    """Build the static equilibrium equations, a step from a configuration to itself with unchanged momentum."""
+    """Build the equations of static equilibrium. They are a step from a configuration to itself with unchanged
+    momentum.
+    """
     system, h, nu = e.system, e.h, e.u.numel()
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
     driven = list(system.driven_coordinate_indices)
@@ -415,7 +425,8 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
 class NlpStepConstraints:
     """Symbolic equality constraints of one step in a nonlinear program (NLP), with their Jacobians.
 
-    The latter are sparse derivatives of `residual` (nr, 1) and `prescribed_effort` (nc, 1) by `x0`, `x1`, `lam`, `u`.
+    `residual_jacobians` and `effort_jacobians` are the sparse derivatives of `residual` (nr, 1) and `prescribed_effort`
+    (nc, 1) with respect to `x0`, `x1`, `lam` and `u`.
     """
 
     equations: DiscreteEquations
@@ -439,16 +450,15 @@ class NlpStepConstraints:
 
 
 def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpStepConstraints:
-    """Build one step's equality constraints for a nonlinear program, and their derivatives, at a time step [s].
+    """Build one step's equality constraints for a nonlinear program, with their Jacobians, for a time step [s].
 
-    With x = (q, p, z) the rows are, all of order one,
+    The state is x = (q, p, z), and p1 is the momentum after the step. The constraint rows are scaled to order one:
 
         free rows of the momentum balance / h   internal equations   constraints   (p_{k+1} - p1(q_k, q_{k+1})) / h
 
-    They do not depend on recordings: torques, prescribed coordinates and parameters may be data or unknowns.
-
-    The bodies' second derivatives have a closed form (`MultibodyLagrangianDerivatives`) with a quarter of the
-    operations of automatic differentiation, which gives all others.
+    The rows do not depend on recordings: torques, prescribed coordinates and parameters may be data or unknowns. The
+    bodies' second derivatives have a closed form (`MultibodyLagrangianDerivatives`) with a quarter of the operations of
+    automatic differentiation. All other derivatives come from automatic differentiation.
     """
     e, h, system = equations, time_step, equations.system
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
@@ -477,10 +487,10 @@ def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpS
 
 
 def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
-    """Derivatives of `momentum_balance` and of `p1` by the step's symbols, and by `none`, on which neither depends.
+    """Derivatives of `momentum_balance` and of `p1` with respect to the step's symbols. The key `none` holds zeros.
 
-    With L the bodies' Lagrangian at the midpoint and a = -1 in the balance, +1 in p1,  h/2 L_q + a L_v  changes by
-    h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv)  with q_k (b = -1) and with q_{k+1} (b = 1).
+    With L the bodies' Lagrangian at the midpoint and a = -1 in the balance, +1 in p1, the term h/2 L_q + a L_v has the
+    derivative h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv) with respect to q_k (b = -1) and q_{k+1} (b = 1).
     """
     n, h, scale, pulls = e.q0.numel(), e.h, e.row_scale, e.constraint_impulses
     rigid = e.rigid_body_terms

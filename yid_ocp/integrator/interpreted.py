@@ -1,6 +1,6 @@
 """The stepping kernel for machines without a C compiler, in CasADi and NumPy with a plain Newton method.
 
-It shares nothing with `kernel.c` but the `DiscreteEquations`, so that each is a check of the other.
+It shares only the `DiscreteEquations` with `kernel.c`, so that each kernel is a check of the other.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class InterpretedKernel:
     """Thread-safe stepping kernel in CasADi's interpreter and NumPy. It has the methods of `CompiledKernel`.
 
     A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
-    constraint equations, then p1, then the effort of prescribed coordinates.
+    constraint equations, then p1, then the effort of the prescribed coordinates.
     """
 
     def __init__(self, model: StepModel) -> None:
@@ -64,7 +64,7 @@ class InterpretedKernel:
         return other
 
     def _evaluators(self) -> list[_PointEvaluator]:
-        """Outputs at a point, the slope of the residual by the unknowns, and that of the outputs by the point."""
+        """Outputs at a point, Jacobian of the residual by the unknowns, and Jacobian of the outputs by the point."""
         return [_evaluator(function) for function in self._functions(None)]
 
     def _made(self, _: None) -> list[ca.Function]:
@@ -113,7 +113,7 @@ class InterpretedKernel:
                     break
                 if factor < 1e-4:
                     return NewtonStatusCode.NOT_CONVERGED, error, iteration
-                # near the tolerance a correction that no step makes smaller is rounding
+                # near the tolerance, a correction that no step length reduces is rounding
                 noise, factor = error < 1e3 * tolerance, 0.5 * factor
             if noise:
                 point[self._at["lam"]] += change[self._coordinates :]
@@ -173,10 +173,7 @@ class InterpretedKernel:
         k: int,
         loads: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array, Array] | None:
-        """Derivatives of state, multipliers and effort after step k by the implicit function theorem.
-
-        Loads, the last directions, add to the equations (nt, e) and to the next momentum (n, e).
-        """
+        """Derivatives of state, multipliers and effort after step k, by implicit differentiation; loads come last."""
         n, at, names = self._model.sizes["n"], self._at, wanted.parameter_names
         moved = np.zeros((slopes.shape[1], wanted.count))
         moved[at["q0"]], moved[at["p0"]], moved[at["z0"]] = before[:n], before[n : 2 * n], before[2 * n :]
@@ -206,10 +203,7 @@ class InterpretedKernel:
     def step_derivatives_along_rollout(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of each step's next state and efforts with respect to state, input torques and loads.
-
-        Arguments are as in `step.step_derivatives_along_rollout`.
-        """
+        """Compute the derivatives of a rollout's steps. Shapes are as in `step.step_derivatives_along_rollout`."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
@@ -234,7 +228,7 @@ class InterpretedKernel:
         names: tuple[str, ...],
         by: CostDerivativesByRolloutVariables,
     ) -> RolloutCostGradient:
-        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds the cost's derivatives.
+        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds the cost's partial derivatives.
 
         costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
         """
@@ -269,7 +263,7 @@ class InterpretedKernel:
     def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
-        """Evaluate step residuals along a trajectory one by one, and Jacobians if `derivatives` is set."""
+        """Evaluate step residuals along a trajectory one by one, with their Jacobians if `derivatives` is set."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
@@ -287,7 +281,7 @@ class InterpretedKernel:
 
 
 def _evaluator(function: Any) -> _PointEvaluator:
-    """A function of one column with a dense output, without CasADi's conversions; for one thread."""
+    """A function of one column with a dense output, without CasADi's type conversions; not thread-safe."""
     buffer, run = function.buffer()
     point, result = np.zeros(function.numel_in(0)), np.zeros(function.size_out(0)[::-1])
     buffer.set_arg(0, point.data)
@@ -304,7 +298,7 @@ def _evaluator(function: Any) -> _PointEvaluator:
 
 
 def _factorised(matrix: Array) -> tuple[Array, NDArray[np.int32]] | None:
-    """LU factors, None where the matrix is singular; LAPACK itself, which prints no warning."""
+    """LU factors by LAPACK, without warnings; None if the matrix is singular."""
     if not len(matrix):
         return matrix, np.zeros(0, np.int32)
     factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)

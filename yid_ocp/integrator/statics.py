@@ -36,14 +36,14 @@ class Equilibrium:
     message: str
 
 
-# Driven joints are held at their measured posture by a spring [N m/rad], so that an equilibrium exists also where
-# encoder noise stretches the object by a hair beyond its reach. With a measured torque the spring is as soft as the
-# ratio of torque error to encoder error; without one it is stiff enough to give less than an encoder's noise.
+# A spring [N m/rad] holds each driven joint at its measured angle, so that an equilibrium exists even if encoder noise
+# stretches the object slightly beyond its reach. With a measured torque, the stiffness is the ratio of torque error to
+# encoder error. Without one, the spring is stiff: its deflection is below the encoder noise.
 _HOLD_STIFFNESS = 1e5
 _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 
-# A servo holds its joint itself, and what it is commanded is known: nothing is left to make up for. Not zero, so that
-# derivatives by the command are those by the posture over it.
+# A servo holds its joint at a known command. The value is not zero, so that derivatives with respect to the command
+# follow from those with respect to the posture.
 _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
 _NEWTON_ITERATION_LIMIT = 100
@@ -57,7 +57,8 @@ _MAX_HOLD_DEFLECTION = 0.02  # of a holding spring, by more than which the postu
 class EquilibriumSolver:
     """Newton solver for a system's static equilibrium. Driven joints are held, prescribed joints are given.
 
-    `known_coordinates` and `free_coordinates` are indices of those given (driven, then prescribed) and sought.
+    `known_coordinates` are the indices of the given coordinates (driven, then prescribed), `free_coordinates` those of
+    the unknown coordinates.
     """
 
     def __init__(self, step: Step) -> None:
@@ -76,7 +77,7 @@ class EquilibriumSolver:
 
     @property
     def symbolic_equations(self) -> EquilibriumEquations:
-        """The symbolic equilibrium equations that are solved."""
+        """The symbolic equilibrium equations of the system."""
         return self._equations(None)
 
     def solve(
@@ -94,13 +95,13 @@ class EquilibriumSolver:
         configuration : array_like, shape (nk,)
             Known coordinates, driven then prescribed [rad or m].
         torque : array_like, shape (nu,), optional
-            Measured torque there [N m]; the holding spring then only makes up for noise. Of servos what they are
-            commanded: the configuration is then where the search begins. Where a motor is off (`MOTOR_OFF_COMMAND`) the
-            joint is held where it is and let go as the motion begins.
+            Measured torque at this configuration [N m]; the holding spring then only compensates noise. For servos, the
+            commands; the search then starts from `configuration`. A joint with `MOTOR_OFF_COMMAND` is held until motion
+            begins.
         guess : array_like, shape (n,), optional
-            Configuration to start from; the undeformed object when absent.
+            Configuration to start from; default: the undeformed object.
         names : sequence of str
-            Parameters by which to differentiate.
+            Parameters with respect to which the equilibrium is differentiated.
         """
         step, system = self.step, self.step.system
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
@@ -141,20 +142,17 @@ class EquilibriumSolver:
         if not failed and not by_itself and np.max(np.abs(give), initial=0.0) > _MAX_HOLD_DEFLECTION:
             joint = int(np.argmax(np.abs(give)))
             failed = True
-            # with a torque given, any of the three may be wrong
+            # with a torque, any of the three starts may lead to a wrong equilibrium
             parts = "posture does not fit the grasp" if torque is None else "posture, torques and grasp do not balance"
             far = f"{system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad"
             message = f"the measured {parts} at rest: {far}"
-        # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture
+        # torque and posture enter only as torque + holding stiffness * posture
         by_torque = np.where(hold.by_hand > 0, 0.0, by_posture[:, :nu] / stiffness)
         derivatives, said = (by_theta, by_posture, by_torque), (not failed, error, message)
         return Equilibrium(state, held + stiffness * give, w[count:], *derivatives, *said)
 
     def _near(self, equations: Callable[[Array], tuple[Array, Array]], start: Array) -> tuple[Array, float, bool]:
-        """What `_damped_newton` finds near a start that has no grasp forces yet; not converged where it is far.
-
-        With forces that fit the start at best. Without, steps are as long as the forces, and are cut short.
-        """
+        """Root near a start, with grasp forces first fitted by least squares; not converged if the root is far."""
         count = len(start) - self.step.sizes["m"]
         residual, slopes = equations(start)
         if not np.all(np.isfinite(residual)):
@@ -165,10 +163,7 @@ class EquilibriumSolver:
         return w, error, converged and float(np.max(np.abs(w - start)[:count])) < _NEAR_GUESS
 
     def _guesses(self, given: Array, guess: ArrayLike | None) -> list[Array]:
-        """Starts of the search: the given configuration or the undeformed object, then small bends of it.
-
-        A straight chain at full stretch is a singular point of the grasp constraints, from which Newton cannot leave.
-        """
+        """Starts of the search: the given or undeformed shape, then bent copies (Newton fails for a straight chain)."""
         system = self.step.system
         first = np.zeros(len(self.free_coordinates) + self.step.sizes["nz"] + self.step.sizes["m"])
         q = np.zeros(system.n_coordinates)
@@ -201,10 +196,10 @@ class EquilibriumSolver:
         return energy + hold.stiffness / 2 * ca.sumsqr(give) + ca.dot(hold.held, give)
 
     def _lowest_energy(self, theta: Array, hold: _Hold) -> Array | None:
-        """A configuration of lowest potential energy within the constraints, shape (n,); None where there is none.
+        """Configuration (n,) of lowest energy within the constraints, where Newton fails (cables between clamps), or
+        None.
 
-        Newton's iteration leaves an object that is held far from its undeformed shape, as a cable between two clamps;
-        an interior-point method does not (Waechter and Biegler 2006, doi:10.1007/s10107-004-0559-y).
+        Interior-point method: Waechter and Biegler 2006, doi:10.1007/s10107-004-0559-y.
         """
         size, m, given = len(self.free_coordinates), self.step.sizes["m"], hold.given
         if not size or not m:
@@ -231,10 +226,8 @@ class EquilibriumSolver:
     def _rest_equations(
         self, w: Array, theta: Array, hold: _Hold, h: float, names: tuple[str, ...] = ()
     ) -> tuple[list[Array], list[Array]]:
-        """Equations of rest at unknowns `w`, as in `EquilibriumEquations`, and the momentum of a step that rests.
-
-        Each with its derivatives by (q, z, forces of constraints), by torques and by named parameters. At rest the
-        equations are those of a step from a configuration to itself, with p such that it comes out again.
+        """Equilibrium equations at `w` and the momentum at rest, each with derivatives by (q, z, forces), torques and
+        `names`.
         """
         step, system, free = self.step, self.step.system, len(self.free_coordinates)
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
@@ -269,7 +262,7 @@ class EquilibriumSolver:
                 rows[3][inner] = np.array(ca.densify(self._inner_slopes(None)(*at)))[:, chosen]
         for part in rows:
             part[:n] /= h
-        # what holds a joint whose motor is off lets go as the motion begins
+        # the spring at a joint whose motor is off is released when the motion begins
         hand = hold.by_hand * hold.give(q, system)
         rows[0][driven] += hand
         by_rows[driven, driven] -= hold.by_hand
@@ -282,7 +275,7 @@ class EquilibriumSolver:
     def _differentiate(
         self, w: Array, theta: Array, hold: _Hold, h: float, names: tuple[str, ...]
     ) -> tuple[Array, Array, Array]:
-        """State (q, p, z) at rest, and its derivatives by named parameters and by the known coordinates."""
+        """State (q, p, z) at equilibrium, with derivatives by named parameters and by the known coordinates."""
         n, nz, nu = (self.step.sizes[key] for key in ("n", "nz", "nu"))
         free, fixed = len(self.free_coordinates), list(self.step.system.prescribed_coordinate_indices)
         (_, rows, push, others), (p, by_p, push_p, others_p) = self._rest_equations(w, theta, hold, h, names)
@@ -316,8 +309,9 @@ class EquilibriumSolver:
 
 
 def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
-    """Sum of 1/2 gain (u - q)^2 over all servos [J]; their limits tell which of several equilibria is lowest as little
-    as their dampers do."""
+    """Sum of 1/2 gain (u - q)^2 over all servos [J]. Torque limits and damping do not change which equilibrium is
+    lowest.
+    """
     at = zip(system.driven, system.driven_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
     known = ((system.servos[name], part, q[i]) for name, i, part in at)
     return sum((0.5 * servo.gain * servo.error(command, angle) ** 2 for servo, command, angle in known), ca.SX(0))
@@ -328,7 +322,7 @@ def _is_motor_off(system: System, command: Array) -> BoolArray:
 
 
 def measured_angle_holding_stiffness(system: System, known: bool) -> float:
-    """Stiffness of the springs that hold driven joints at measured angles. `known`: torques or commands are given."""
+    """Stiffness of springs at measured angles [N m/rad]. `known` states whether torques or servo commands are given."""
     if not known:
         return _HOLD_STIFFNESS
     return _HOLD_STIFFNESS_WITH_COMMAND if system.servos else _HOLD_STIFFNESS_WITH_TORQUE
@@ -336,7 +330,7 @@ def measured_angle_holding_stiffness(system: System, known: bool) -> float:
 
 @dataclass(frozen=True)
 class _Hold:
-    """Known coordinates, and the torque and spring that hold the driven ones of them."""
+    """Known coordinates, and the torque and spring that hold the driven coordinates."""
 
     given: Array
     held: Array
@@ -351,11 +345,7 @@ class _Hold:
 def _damped_newton(
     function: Callable[[Array], tuple[Array, Array]], w: Array, tolerance: float
 ) -> tuple[Array, float, bool]:
-    """Root, largest residual there and whether that is up to the tolerance, of a function with its Jacobian.
-
-    Newton's iteration, damped until it meets the natural monotonicity test (Deuflhard 2011, section 3.3) or reduces the
-    residual.
-    """
+    """Root, largest residual and convergence of Newton's method with natural monotonicity (Deuflhard 2011, 3.3)."""
     if len(w) == 0:
         return w, 0.0, True
     residual, jacobian = function(w)
@@ -388,7 +378,7 @@ def _damped_newton(
 
 
 def _solved(matrix: Array, right: Array) -> Array:
-    """The solution; of least squares where redundant grasps leave forces open."""
+    """Solution of a linear system; the least-squares solution if redundant grasps make the forces undetermined."""
     if not right.size:
         return np.zeros((matrix.shape[1], right.shape[1]))
     factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)
@@ -399,7 +389,7 @@ def _solved(matrix: Array, right: Array) -> Array:
 
 
 def steady_effect_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
-    """Relaxed internal coordinates of a system held at configuration `q` for a long time, shape (nz,)."""
+    """Relaxed internal coordinates (nz,) of a system held at configuration `q` for a long time."""
     e = step.equations
     nz = e.z0.numel()
     if nz == 0:

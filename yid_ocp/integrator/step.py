@@ -38,7 +38,9 @@ _ALL_STEPS = slice(None)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(ReprMixin):
-    """Step map of a system over one time step, made by `compile_step`. It `is_compiled` if it runs generated C code."""
+    """Step map of a system over one time step, made by `compile_step`. `is_compiled` tells whether it runs generated C
+    code.
+    """
 
     model: StepModel
     kernel: CompiledKernel | InterpretedKernel
@@ -61,14 +63,14 @@ class Step(ReprMixin):
         return self.model.time_step
 
     def clock_scaled_time_step(self, theta: Array) -> float:
-        """Time step corrected for the recording's clock [s], h times `System.recorded_time_scale` at `theta`."""
+        """Time step corrected for the recording's clock [s]: h times `System.recorded_time_scale` at `theta`."""
         s = self.sizes
         none = [np.zeros(s[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
         return float(self.functions.row_scale_and_time_step(*none, theta, self.time_step)[1])
 
     @property
     def force_split(self) -> ForceSplit:
-        """Split of a step's forces between its two nodes. `symmetric` gives half each, `left` all to the first."""
+        """Split of a step's forces between its two nodes: `symmetric` (half to each) or `left` (all to the first)."""
         return self.model.equations.force_split
 
     @property
@@ -83,7 +85,9 @@ class Step(ReprMixin):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Dimensions by symbol. Some are n (coordinates), nz (internal), m (constraints), nu (inputs) and ntheta."""
+        """Dimensions: n (coordinates), nz (internal), m (constraints), nu (inputs), nc (prescribed), nx (state) and
+        ntheta.
+        """
         return self.model.sizes
 
     def __call__(
@@ -95,7 +99,7 @@ class Step(ReprMixin):
         prescribed: tuple[ArrayLike, ArrayLike] | None = None,
         internal: ArrayLike | None = None,
     ) -> tuple[Array, Array, Array, RolloutStatus]:
-        """Compute one DEL step, to (q, p)_{k+1}, the multipliers lam (m,) and a status.
+        """Compute one DEL step. Returns q_{k+1}, p_{k+1}, the multipliers lam (m,) and a status.
 
         Parameters
         ----------
@@ -104,9 +108,9 @@ class Step(ReprMixin):
         u : array_like, shape (nu,)
             Motor torques held over the step [N m].
         prescribed : pair of array_like, shape (nc,), optional
-            s_k and s_{k+1}; required when the system has prescribed coordinates.
+            Prescribed coordinates at both nodes; required if the system has any.
         internal : array_like, shape (nz,), optional
-            z_k, zero when absent.
+            Internal coordinates z_k; default: zero.
         """
         rollout, n = self._single(q0, p0, u, theta, prescribed, internal, None), self.sizes["n"]
         return rollout.state[1, :n], rollout.state[1, n : 2 * n], rollout.multipliers[0], rollout.status
@@ -121,9 +125,9 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of the next state with respect to state, input and parameters, from implicit functions.
+        """Derivatives A (nx, nx), B_u (nx, nu), B_theta (nx, len(names)) of the next state by state, input, parameters.
 
-        Returns A (nx, nx) by (q, p, z)_k, B_u (nx, nu) and B_theta (nx, len(names)), by all of theta without `names`.
+        They follow from the implicit function theorem. Without `names`, the parameters are all of theta.
         """
         sizes = self.sizes
         chosen = tuple(self.system.parameters.names if names is None else names)
@@ -179,19 +183,19 @@ def compile_step(
     time_step : float
         h [s], positive.
     force_split : "symmetric" or "left"
-        Order two, or the rule of Caldwell et al. (2014).
+        "symmetric" has order two; "left" is the rule of Caldwell et al. (2014).
     constraint_force : "node" or "midpoint"
-        Where the constraints pull: as in that paper, or so that no tension makes the motion grow (see
-        `discrete_equations`).
+        Where the constraint forces act. "node" is the rule of that paper; "midpoint" is stable under any tension (see
+        the module `discrete`).
     use_compiler : bool
-        Without it, and without a compiler on the machine (with one notice), the step is interpreted.
+        If False, or if the machine has no compiler (with one log message), the step is interpreted.
     tolerance : float, optional
-        Newton's, on the coordinates [rad or m]; follows from the time step when absent.
+        Newton's tolerance on the coordinates [rad or m]; default: from the time step.
 
     Raises
     ------
     ModelError
-        Time step not positive, unknown force split or constraint force.
+        The time step is not positive, or the force split or constraint force is unknown.
     """
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
     library = None
@@ -224,7 +228,7 @@ def _positive(time_step: float) -> float:
 
 
 def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Convert values to a contiguous float array. `ModelError` names `name` if the shape differs from `shape`."""
+    """Convert values to a contiguous float array. Raises `ModelError` with `name` if its shape is not `shape`."""
     array = np.ascontiguousarray(values, dtype=float)
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)
@@ -250,26 +254,27 @@ def simulate(
     start : array_like, shape (nx,)
         Initial (q, p, z): coordinates [rad or m], momenta [N m s or N s], internal coordinates.
     torque : array_like, shape (N, nu), optional
-        Nominal motor torque of every step [N m]; zero when absent.
+        Nominal motor torque of every step [N m]; default: zero.
     path : array_like, shape (N + 1, nc), optional
-        Prescribed coordinates at every node [rad or m]; held at their initial value when absent.
+        Prescribed coordinates at every node [rad or m]; default: their initial values.
 
     Returns
     -------
     Rollout
         (q, p, z) at every node, shape (N + 1, nx), multipliers (N, m) [N s], efforts (N, nc) and torques (N, nu) [N m].
+        If Newton fails, `status` reports it, and the later entries are NaN.
 
     Raises
     ------
     ModelError
-        An array of the wrong shape; where Newton fails `status` says so, and what follows is NaN.
+        An array has the wrong shape.
     """
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return simulate_rollouts(step, [inputs])[0]
 
 
 def simulate_rollouts(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several rollouts from `checked_rollout_inputs`. They equal `simulate` except for rounding."""
+    """Simulate several rollouts, given by `checked_rollout_inputs`. Results equal `simulate` except for rounding."""
     return step.kernel.rollout_batch(members)
 
 
@@ -308,7 +313,7 @@ def checked_rollout_inputs(
 
 
 def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
-    """Torque on driven joints in every step, the input or that of position servos, shape (N, nu) [N m]."""
+    """Torque on the driven joints in every step, (N, nu) [N m]: the input, or the torque of the position servos."""
     system, h = step.system, step.time_step
     if not system.servos:
         return rollout.torque
@@ -324,10 +329,7 @@ def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rol
 
 
 def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv at (q, v) [N m s]. Compliant coordinates are scaled by their compliance.
-
-    `q` and `v` have the shape (n,) or (K, n).
-    """
+    """Generalized momentum dL/dv at (q, v), each (n,) or (K, n) [N m s], times compliance at compliant coordinates."""
     e, s = step.equations, step.sizes
     half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
     middle = np.atleast_2d(np.asarray(q, float))
@@ -348,8 +350,9 @@ def moving_observable_state_mask(
 ) -> BoolArray:
     """Mask of the states that move and affect other states, efforts or sensors, shape (nx,).
 
-    Internal states of a neutral effect are excluded. The first and the last step of the rollout stand for all, `seen`
-    (nx,) says which states sensors depend on.
+    Internal states of a neutral effect are excluded. Only the first and the last step of the rollout are examined.
+    `loads` are extra excitations as in `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend
+    on directly.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))
@@ -378,17 +381,13 @@ def step_derivatives_along_rollout(
     loads: tuple[Array, Array] | None = None,
     chosen: slice = _ALL_STEPS,
 ) -> Iterator[tuple[Array, Array]]:
-    """Iterate over the derivatives of a rollout's steps in blocks. Prescribed coordinates are held fixed.
+    """Iterate over the derivatives of a rollout's steps, in blocks of k steps. Prescribed coordinates are held fixed.
 
-    Derivatives of the next state (k, nx, d), and of prescribed coordinates' effort followed by constraint forces
-    (k, nc + m, d), are by the state, under the feedback where one is given, by c columns of torque that are `inputs`
-    (N, nu, c), and by e loads, d = nx + c + e. What `loads` add to the equations (nt, e) and to the next momentum
-    (n, e) is equal in all steps. `chosen` is a slice of steps in a row; all by default.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The equations of a step are singular.
+    Yields two arrays per block: the derivatives of the next state, (k, nx, d), and those of the efforts at prescribed
+    coordinates and of the constraint forces, (k, nc + m, d). The d = nx + c + e columns are the state (including the
+    feedback, if given), the c torque directions `inputs` (N, nu, c) and e loads. `loads` are additions to the nt = n +
+    nz + m step equations, (nt, e), and to the next momentum, (n, e), the same in all steps. `chosen` is a range of
+    consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular.
     """
     if loads is None:
         rows = sum(step.sizes[key] for key in ("n", "nz", "m"))

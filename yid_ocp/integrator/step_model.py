@@ -1,4 +1,4 @@
-"""Data types that all stepping kernels share, for step models, rollouts, adjoints and linearizations."""
+"""Data types that all stepping kernels share: step models, rollouts, adjoints and linearizations."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from yid_ocp.model.system import System
 NEWTON_ITERATION_LIMIT = 60
 """Newton iterations of one step before it is given up."""
 
-# Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
-# RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
+# Newton stops when a correction of the coordinates is below _COORDINATE_TOLERANCE [rad or m], and for short steps below
+# _VELOCITY_TOLERANCE times the step: a remaining correction loses momentum in every step (mass times correction over
+# step).
 _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class StepModel:
-    """Equations, functions and index tables of one step. A kernel is built from them.
+    """Equations, functions and index tables of one step, from which a kernel is built.
 
-    `sizes` holds n, nz, m, nu, nc, nx and ntheta, `time_step` is h [s], `tolerance` Newton's [rad or m].
+    `sizes` holds n, nz, m, nu, nc, nx and ntheta; `time_step` is h [s]; `tolerance` is Newton's [rad or m].
     """
 
     system: System
@@ -65,7 +66,7 @@ def newton_correction_tolerance(time_step: float) -> float:
 
 
 class NewtonStatusCode(IntEnum):
-    """Status codes of Newton's method in one step, with the numbers of the C kernel."""
+    """Status codes of Newton's method in one step. The C kernel uses the same numbers."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -94,10 +95,10 @@ _INSTABILITY_HINT = (
 
 @dataclass(frozen=True)
 class RolloutStatus:
-    """Convergence of a rollout with status code, Newton's last correction [rad or m] and totals over all steps.
+    """Convergence of a rollout: status code, Newton's last correction [rad or m] and totals over all steps.
 
-    `prescribed_effort` (nc,) is that at the first node of the last step [N m], `internal_coordinates` (nz,) are those
-    after it.
+    `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
+    the values after the last step.
     """
 
     code: NewtonStatusCode
@@ -115,7 +116,7 @@ class RolloutStatus:
 
     @property
     def message(self) -> str:
-        """Explain the status in a sentence, with the step, the last correction and a remedy."""
+        """Explain the status in a sentence: step, last correction and remedy."""
         if self.is_converged:
             return _STATUS_MESSAGES[self.code]
         step, what = self.completed_steps, _STATUS_MESSAGES[self.code]
@@ -127,9 +128,10 @@ class RolloutStatus:
 
 @dataclass(frozen=True)
 class SensitivityDirections:
-    """The d directions in which a rollout is differentiated. Named parameters precede tangents of start and inputs.
+    """The d directions in which a rollout is differentiated. The first directions are those of the named parameters.
 
-    Derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path (N + 1, nc, d).
+    The tangents are the derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path
+    (N + 1, nc, d) along the directions.
     """
 
     parameter_names: tuple[str, ...]
@@ -152,8 +154,8 @@ class SensitivityDirections:
 class TrackingFeedback:
     """Time-varying feedback of the tracking filter. The torque is u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
-    Of the rows of the state (q, p, z) in `state_indices` (nb,), with K_k in `gain` (N, nu, nb) [N m/rad for a
-    coordinate, 1/s for a momentum] and the rows' measured values in `reference` (N, nb).
+    `state_indices` (nb,) selects entries of the state (q, p, z). `gain` (N, nu, nb) holds K_k [N m/rad for a
+    coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries.
     """
 
     state_indices: NDArray[np.int32]
@@ -165,8 +167,8 @@ class TrackingFeedback:
 class RolloutInputs:
     """Inputs of one rollout, with feedback and directions of differentiation.
 
-    The parameters (ntheta,), the initial state (q, p, z) (nx,), the nominal motor torque of every step (N, nu) [N m],
-    and the prescribed coordinates at every node (N + 1, nc).
+    `theta` has the shape (ntheta,), the initial state (q, p, z) the shape (nx,). The torque (N, nu) [N m] is the
+    nominal motor torque of every step. The prescribed path (N + 1, nc) holds the prescribed coordinates at every node.
     """
 
     theta: Array
@@ -179,12 +181,12 @@ class RolloutInputs:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A simulated trajectory with derivatives on request, (..., d) along d directions. NaN follows a failed step.
+    """A simulated trajectory. Sensitivities (..., d) are its derivatives along d directions. NaN follows a failed step.
 
-    (q, p, z) at every node (N + 1, nx) with q in rad or m and p in N m s or N s, multipliers (N, m) [N s], effort
-    of prescribed coordinates at nodes 0..N-1 (N, nc) [N m] and applied torque (N, nu) [N m]. At node 0 the effort
-    assumes that p_0 came from a step before (an `Equilibrium` gives such a p_0); after p_0 = dL/dv it holds only
-    half a step's impulse, half the effort.
+    `state` (N + 1, nx) holds (q, p, z) at every node, q in rad or m, p in N m s or N s. `multipliers` (N, m) are in N
+    s. `effort` (N, nc) is the effort of prescribed coordinates at nodes 0..N-1 [N m], `torque` (N, nu) the applied
+    torque [N m]. The effort at node 0 is correct if p_0 contains the impulse of a previous step, as the p_0 of an
+    `Equilibrium` does. After p_0 = dL/dv it is half the effort, because it contains only half a step's impulse.
     """
 
     state: Array
@@ -205,8 +207,8 @@ CostDerivativesByRolloutVariables = tuple[Array, Array | None, Array | None]
 class RolloutCostGradient:
     """Gradient of a scalar cost along a rollout by the adjoint method. NaN if a step's equations are singular.
 
-    By the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the prescribed coordinates at
-    every node (N + 1, nc), those at node 0 as in `by_initial_state`.
+    Derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the
+    prescribed coordinates at every node (N + 1, nc). Those at node 0 are also part of `by_initial_state`.
     """
 
     by_theta: Array
@@ -219,9 +221,10 @@ class RolloutCostGradient:
 class StepEquationLinearizations:
     """Residuals and Jacobians of the step equations along any trajectory, even one that does not satisfy them.
 
-    Of every step the momentum balance (n), internal (nz) and constraint (m) equations, nt in all, and the p_{k+1} (n)
-    that follows from the other values, with their derivatives by what is new, (q_{k+1}, z_{k+1}, lam_k), by what is
-    old, (q_k, z_k), by the torque and by the chosen parameters; that of the balance by p_k is the identity.
+    Each step has nt = n + nz + m equations: momentum balance (n), internal (nz) and constraint (m). `p1` is the
+    momentum p_{k+1} (n) that follows from the other values. Derivatives are with respect to the new values (q_{k+1},
+    z_{k+1}, lam_k), the old values (q_k, z_k), the torque and the chosen parameters. The derivative of the balance with
+    respect to p_k is the identity.
     """
 
     residual: Array
@@ -237,7 +240,7 @@ class StepEquationLinearizations:
 
 
 def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
-    """Allocate a rollout filled with NaN for a kernel. `count` is the number of directions (None: no sensitivities)."""
+    """Allocate a rollout filled with NaN. `count` is the number of directions; None omits the sensitivities."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
     names = [f"{name}_sensitivity" for name in ("state", "multipliers", "effort")]
@@ -251,7 +254,7 @@ def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -
 def allocate_linearization(
     sizes: dict[str, int], count: int, width: int, derivatives: bool
 ) -> StepEquationLinearizations:
-    """Allocate zero linearizations of `count` steps and `width` parameters. No Jacobians without `derivatives`."""
+    """Allocate zero linearizations of `count` steps and `width` parameters, without Jacobians if not `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
     shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
@@ -268,7 +271,7 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
 
 
 def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
-    """Make the `InsufficientMemoryError` for `size` bytes of `what` that cannot be allocated."""
+    """Return the `InsufficientMemoryError` for `what`, which needs `size` bytes."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}: it takes {amount}"
     hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
@@ -278,7 +281,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 def attach_status_to_rollout(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """Copy a rollout with a `RolloutStatus`. `counts` are Newton iterations and matrix factorisations."""
+    """Return a rollout with a `RolloutStatus`. `counts` are the Newton iterations and matrix factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
     return replace(rollout, status=RolloutStatus(NewtonStatusCode(code), step, error, *counts, last, inner))

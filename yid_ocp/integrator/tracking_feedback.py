@@ -1,7 +1,7 @@
-"""Tracking filter of driven arms, a feedback about the measured motion with LQR gains.
+"""Tracking filter of driven arms: a feedback about the measured motion with LQR gains.
 
-The discrete momentum contains half the impulse of the previous step, so a torque other than the recorded one, or an
-effect, changes the momentum of the same motion.
+The discrete momentum contains half the impulse of the previous step. An effect, or a torque other than the recorded
+one, therefore changes the momentum of the same motion.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the sam
 
 
 def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
-    """Make a proportional tracking feedback on the driven joints. u_k = ubar_k - K (q_k - qbar_k), K diagonal.
+    """Make a proportional tracking feedback on the driven joints, u_k = ubar_k - K (q_k - qbar_k), with diagonal K.
 
-    `measured` are their angles qbar at every node, shape (N + 1, nu) [rad], `gains` one or one arm's worth or nu
-    [N m/rad]; `ModelError` of another number of gains, or a negative one.
+    `measured` holds the joint angles qbar at every node, (N + 1, nu) [rad]. `gains` holds one gain, one per joint of an
+    arm, or nu gains [N m/rad]. Raises `ModelError` for another number of gains or a negative gain.
     """
     reference = np.asarray(measured, float)
     nu = step.sizes["nu"]
@@ -49,11 +49,12 @@ def lqr_tracking_feedback(
 ) -> TrackingFeedback:
     """Compute a tracking feedback with finite-horizon LQR gains, linearised about the driven arms' measured motion.
 
-    Minimises the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording for the arms without
-    the object, with the errors that weigh the same; the gains act on the arms' angles and momenta (Anderson and Moore
-    1990, Optimal Control: Linear Quadratic Methods, section 2.4). The reference momentum follows from the measured
-    angles (N + 1, nu) [rad], smooth enough to be differenced, and torques (N, nu) [N m] by the arms' own DEL equations,
-    so that it means the same as the model's. `arms` is the `compile_driven_arms_only_step`, made when absent.
+    The cost is the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording, for the arms
+    without the object, with fixed scales for angle, rate and torque (Anderson and Moore 1990, Optimal Control: Linear
+    Quadratic Methods, section 2.4). The gains act on the arms' angles and momenta. The reference momentum follows from
+    the measured angles (N + 1, nu) [rad] and torques (N, nu) [N m] by the arms' DEL equations, so it is comparable with
+    the model's momentum. The angles must be smooth enough for numerical differentiation. `arms` is the result of
+    `compile_driven_arms_only_step`, compiled if absent.
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
@@ -86,10 +87,7 @@ def lqr_tracking_feedback(
 
 
 def compile_driven_arms_only_step(step: Step) -> Step:
-    """Compile a step of the driven joints alone, without object, grasps, prescribed joints and effects.
-
-    `ModelError` where the driven joints do not come first in the configuration.
-    """
+    """Compile a step of the driven joints alone. Raises `ModelError` if other joints come before them."""
     system, mechanism = step.system, step.system.mechanism
     keep = [mechanism.joint_index(name) for name in system.driven]
     if sorted(keep) != list(range(len(keep))):
@@ -104,7 +102,7 @@ def compile_driven_arms_only_step(step: Step) -> Step:
 
 
 def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: Array) -> Array:
-    """p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, shape (N + 1, nu); the first from a standing start."""
+    """p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, (N + 1, nu), which starts from rest."""
     angles, torques = np.vstack([measured[:1], measured]), np.vstack([torque[:1], torque])
     state = np.hstack([angles, np.zeros_like(angles)])
     none = np.zeros((len(torques), 0))
@@ -112,12 +110,11 @@ def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: A
 
 
 def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, theta: Array) -> tuple[Array, Array]:
-    """A_k (N, 2 nu, 2 nu) and B_k (N, 2 nu, nu) of one step from each state, by Newton's iteration of all at once.
-
-    `guess` (N, nu) says where about the steps lead; NaN where that has no answer.
+    """A_k (N, 2 nu, 2 nu) and B_k (N, 2 nu, nu) of a step from each state to about `guess` (N, nu); NaN if Newton
+    fails.
     """
     count, nu = torque.shape
-    # the kernel takes states in a row: each start and what follows it; the steps between them mean nothing
+    # the kernel takes consecutive states: each start and its successor; the steps between these pairs are not used
     state, torques = np.repeat(start, 2, axis=0), np.repeat(torque, 2, axis=0)[:-1]
     state[1::2, :nu] = guess
     none, own = np.zeros((2 * count - 1, 0)), slice(None, None, 2)
@@ -142,9 +139,9 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 @dataclass(frozen=True)
 class JointMotionWithSensitivities:
-    """Angles and torques of the driven joints over the steps of a recording, with derivatives.
+    """Angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
 
-    The latter (..., d) are by d parameters and what follows these; None where nothing depends on them.
+    The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
     """
 
     angles: Array  # at every node, (N + 1, nu) [rad]
@@ -163,11 +160,10 @@ class JointMotionWithSensitivities:
 class EffectMomentumShift:
     """Computes by how much effects change the momentum of the recorded motion.
 
-    `lqr_tracking_feedback` computes its reference once, from recorded angles and torques without effects. With a torque
-    other than the recorded one, or an effect such as an armature, the motion has another momentum, and the feedback
-    would counteract the difference: at a wrist, whose gain by momentum times h/2 is near one, by half of the effect.
-
-    `parameter_names` are those of effects on which the momentum of a motion under known torques depends.
+    `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
+    effect such as an armature, or a torque other than the recorded one, changes the momentum of the motion. The
+    feedback would counteract this change: at a wrist, whose momentum gain times h/2 is near one, by half of the effect.
+    `parameter_names` are the effect parameters on which the momentum depends if the torques are known.
     """
 
     def __init__(self, step: Step) -> None:
@@ -190,7 +186,7 @@ class EffectMomentumShift:
         [momentum, law] = ca.substitute(wanted, [e.q0, e.q1, e.z0, e.z1, e.lam], known)
         last, then = e.z0[self._kept], e.z1[self._kept]
         self._time_step = np.array([step.time_step])
-        # an effect that does not say with what values it is absent is taken as it stands
+        # an effect without neutral values keeps its parameters
         neutral: dict[str, float] = {}
         for effect in system.effects:
             neutral |= getattr(effect, "neutral_values", {})
@@ -229,10 +225,10 @@ class EffectMomentumShift:
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Momentum shift, with effects minus recorded, at nodes 0..N-1. Shapes: (N, nu), derivatives (N, nu, d).
+        """Momentum shift at nodes 0..N-1, with effects minus recorded, (N, nu), and its derivatives (N, nu, d).
 
-        `recorded` is the recorded motion, `true` that corrected for effects, whose derivatives alone are used; `names`
-        are the parameters of the first of the d derivatives.
+        `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
+        `names` are the parameters of the first of the d directions.
         """
         steps, plain_theta = len(true.torque), self.theta_without_effects(theta)
         still = np.zeros((steps, len(self._kept)))
@@ -263,7 +259,9 @@ class EffectMomentumShift:
     def _remembered(
         self, motion: JointMotionWithSensitivities, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
-        """Memory of joints at every node but the last, (N, nk), and its derivatives, (N, nk, d), or None."""
+        """Internal coordinates of joint effects at every node but the last, (N, nk), and derivatives (N, nk, d) or
+        None.
+        """
         steps = len(motion.torque)
         z, total = np.zeros((steps, len(self._kept))), np.zeros((steps, len(self._kept), width))
         freed, away = {own for _, own in wanted}, theta[self._columns] != self._neutral
@@ -276,28 +274,29 @@ class EffectMomentumShift:
         return z, total if np.any(total) else None
 
     def theta_without_effects(self, theta: Array) -> Array:
-        """Copy theta with neutral effect parameters. The feedback's reference is computed with it."""
+        """Copy of theta with neutral effect parameters, with which the feedback's reference is computed."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
         return plain
 
     def is_active(self, theta: Array, names: Sequence[str]) -> bool:
-        """Whether an effect shifts the momentum. A parameter is then in `names` or not neutral at `theta`."""
+        """Whether an effect shifts the momentum: one of its parameters is in `names`, or is not neutral at `theta`."""
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 
 def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative of the torque that acts under feedback with respect to the recorded torque's error, (..., nu, nu).
+    """Derivative of the applied torque (recorded plus feedback) by an error of the recorded torque, (..., nu, nu).
 
-    The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
-    `gain` (..., nu, nb) is that of a step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.
+    The reference momenta of the feedback follow from the recorded torque. The error is assumed to be the same in this
+    step and the previous one. `gain` (..., nu, nb) is the feedback gain of the step. `by_torque` (nu, nu) is
+    `EffectMomentumShift.momentum_derivative_by_previous_torque`.
     """
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
 
 
 class _Memory:
-    """The internal coordinates of one effect along a motion; `rows` among those that the momentum depends on."""
+    """Internal coordinates of one effect along a motion. `rows` are their indices among those in the momentum."""
 
     def __init__(self, step: Step, inputs: list[ca.SX], law: ca.SX, rows: list[int], columns: list[int]) -> None:
         before, now, last, then, theta, symbol = inputs
@@ -357,5 +356,5 @@ def _columns(expression: ca.SX, theta: ca.SX) -> list[int]:
 
 
 def _one_before(values: Array) -> Array:
-    """Every entry but the last moved by one; the first stands twice."""
+    """Entries delayed by one step; the first entry is repeated."""
     return np.concatenate([values[:1], values[:-1]])
