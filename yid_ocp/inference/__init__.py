@@ -1,1 +1,1 @@
-"""Statistical inference from residuals, with whitening, covariances, verdicts, null tests and smoothing."""
+"""Statistical inference from residuals: whitening, covariances, verdicts, null tests and smoothing."""

@@ -39,13 +39,13 @@ class FilterStateTransition:
         return len(self.decay) // m if m else 0, m
 
     def propagate_state(self, columns: Array) -> Array:
-        """Propagate states over the step. They are the columns of an (nx, c) array."""
+        """Propagate states, the columns of an (nx, c) array, over the step."""
         ns, rows, own = len(self.state_rows), self.state_rows, columns[len(self.state_rows) :]
         together = own.reshape(*self._shape, own.shape[1]).sum(axis=0)
         return np.vstack([rows[:, :ns] @ columns[:ns] + rows[:, ns:] @ together, self.decay[:, None] * own])
 
     def _propagate_costate_back(self, costate: Array) -> Array:
-        """Costates before the step, from those after it, by the transposed map, as columns (nx, c)."""
+        """Costates (nx, c) before the step, from those after it, by the transposed map."""
         ns = len(self.state_rows)
         earlier = self.state_rows.T @ costate[:ns]
         apart = np.tile(earlier[ns:], (self._shape[0], 1)) + self.decay[:, None] * costate[ns:]
@@ -56,9 +56,9 @@ class FilterStateTransition:
 class KalmanStepMatrices:
     """One step of a linear Kalman filter with fixed gains. A measurement update precedes a state transition.
 
-    A state x = (s, p) of s and parameters p is measured by y = H x + e with noise e of unit covariance, and goes on by
-    x' = (M x, f p) + process noise. With the covariance P before the measurement and S = I + H P H', the normalized
-    innovations S^(-1/2) (y - H mean) of all steps are independent, of unit variance.
+    The state x = (s, p) contains parameters p. It is measured by y = H x + e, where the noise e has unit covariance,
+    and becomes x' = (M x, f p) + process noise. P is the covariance before the measurement, and S = I + H P H'. The
+    normalized innovations S^(-1/2) (y - H mean) of all steps are independent and have unit variance.
     """
 
     observation: Array  # H, shape (r, nx)
@@ -72,7 +72,7 @@ class KalmanStepMatrices:
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
-        """Smoothed measurement noise (r, c), and the costate before the step from that after it (nx, c).
+        """Smoothed measurement noise (r, c) and the costate before the step (nx, c), from the costate after the step.
 
         The smoothed state is the filter's prediction + P costate.
         """
@@ -81,7 +81,7 @@ class KalmanStepMatrices:
         return noise, pulled + self.observation.T @ noise
 
     def costate_covariance_before_step(self, information: Array) -> Array:
-        """Covariance of the costate before the step. `information` is that after the step; both are (nx, nx)."""
+        """Covariance of the costate before the step (nx, nx), from the one after the step, `information`."""
         shaped, projected = self.whitening @ self.observation, self.projected_covariance
         pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
         pulled -= (pulled @ projected.T) @ shaped
@@ -94,8 +94,8 @@ def kalman_matrices_and_next_covariance(
 ) -> tuple[KalmanStepMatrices, Array, float]:
     """Compute a filter step's gains, the next state covariance without process noise, and log det S.
 
-    `covariance` is P (nx, nx) before the measurement by H (r, nx). The determinant is infinite, and S counts by its
-    diagonal alone, where covariances differ by so many decades that rounding shows.
+    `covariance` is P (nx, nx) before the measurement by H (r, nx); S = I + H P H'. If rounding makes S indefinite, only
+    its diagonal is used, and log det S is returned as infinity.
     """
     cross = observation @ covariance
     whitening, log_determinant = np.zeros((0, 0)), 0.0
@@ -120,7 +120,7 @@ def _library() -> ctypes.CDLL | None:
 class KalmanSteps:
     """Successive steps of a linear Kalman filter with fixed gains, in compiled code if possible.
 
-    Matrices are those of `KalmanStepMatrices`, one step after another; rows of step j begin at `row_start[j]`.
+    The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`.
     """
 
     row_start: Sequence[int]
@@ -152,10 +152,10 @@ class KalmanSteps:
     def normalized_innovations_and_next_mean(
         self, mean: Array, measured: Array, shift: Array, push: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """Normalized innovations (r, c), the state means (nx, c) after the steps, and those before each (k, nx, c).
+        """Normalized innovations (r, c), state means (nx, c) after all steps, and means before each step (k, nx, c).
 
-        `push` (k, m, c) is added to a step's parameters in its transition; `shift` (k, nx - ns) to those of the first
-        column after it.
+        `push` (k, m, c) is added to the parameters during a step's transition. `shift` (k, nx - ns) is added to the
+        parameters of the first column after it.
         """
         if (library := _library()) is not None:
             return self._compiled_columns(library, measured, mean, shift, push)
@@ -169,7 +169,7 @@ class KalmanSteps:
         return white, mean, seen
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
-        """Smoothed measurement noise (r, c), the costate (nx, c) before the steps, and those after each (k, nx, c)."""
+        """Smoothed measurement noise (r, c), costates (nx, c) before all steps, and costates after each (k, nx, c)."""
         if (library := _library()) is not None:
             return self._compiled_columns(library, white, costate, None, None)
         noise, seen = np.empty_like(white), np.empty((len(self.moves), *costate.shape))
@@ -181,7 +181,7 @@ class KalmanSteps:
     def _compiled_columns(
         self, library: ctypes.CDLL, rows: Array, state: Array, shift: Array | None, push: Array | None
     ) -> tuple[Array, Array, Array]:
-        """Results of the mean's recursion, or without a shift of the costate's."""
+        """Results of the recursion of the mean or, without a shift, of the costate."""
         rows, state, seen = rows.copy(), state.copy(), np.empty((len(self.moves), *state.shape))
         size = np.array([*self.moves.shape, len(state), self.moves.shape[2] - self.noises], np.int32)
         steps: list[NDArray[Any] | None] = [size, np.array(self.row_start, np.int32), self.moves, self.decay, None]
@@ -194,7 +194,7 @@ class KalmanSteps:
 
 
 def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_void_p]:
-    """A struct of the addresses of contiguous arrays, which must be kept as long; None is a null pointer."""
+    """A struct of the addresses of contiguous arrays, which the caller keeps alive; None is a null pointer."""
     return (ctypes.c_void_p * len(arrays))(*(None if array is None else array.ctypes.data for array in arrays))
 
 
@@ -207,10 +207,10 @@ def prepare_kalman_steps(
     decay: Array,
     variance: Array,
 ) -> tuple[KalmanSteps, Array]:
-    """Prepare successive filter steps, whose gains no data change, and the state covariance (nx, nx) after the last.
+    """Prepare successive filter steps. Returns them and the state covariance (nx, nx) after the last step.
 
-    Of the moves (k, ns, ns + m + noises) the last columns are what unit noises add to the states; `variance`
-    (k, nx - ns) is that of the parameters' process noise. Other arguments are as in `KalmanSteps`.
+    The last columns of the moves (k, ns, ns + m + noises) are the effect of unit noises on the states. `variance` (k,
+    nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`.
     """
     count, library, covariance = np.diff(row_start), _library(), covariance.copy()
     white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)

@@ -25,8 +25,9 @@ from yid_ocp.problem.model_functions import ModelFunctions, TimeGridStateValues
 class NominalTrajectory:
     """Trajectory of an episode with its measurements, about which the residual is linearized.
 
-    Measurements are shifted by their delays to the times at which they were true. The derivatives of the start by the
-    first angles and the first torque of the driven joints, shape (nx, nu), are zero where it does not follow from them.
+    Measurements are shifted by their delays to the times at which they were true. `initial_state_by_angles` and
+    `initial_state_by_torque` (nx, nu) are derivatives with respect to the driven joints' first angles and torques. They
+    are zero if the initial state does not follow from these.
     """
 
     model_functions: ModelFunctions
@@ -71,8 +72,8 @@ class ResidualDerivativesAtNodes:
     ) -> ResidualDerivativesAtNodes:
         """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
 
-        A sensor that reads velocities, accelerations or constraint forces depends on four nodes, the first one before
-        its sample's; `DataError` of such a sensor unless that is allowed by `with_neighbours`.
+        A sensor of velocities, accelerations or constraint forces depends on four nodes; the first one is before the
+        sample's node. Raises `DataError` for such a sensor unless `with_neighbours` is set.
         """
         step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
@@ -89,7 +90,7 @@ class ResidualDerivativesAtNodes:
                 message = f"'{name}' depends on velocities, accelerations or constraint forces"
                 message += ", and cannot be weighted together with process noise"
                 raise DataError(message, hint=f"set sensors.{name}.use: false, or prescribe the arms' motion")
-            # of each reading by the states and efforts of the node before, its own and the next
+            # derivatives of each reading by the states and efforts of the previous node, its own and the next
             before = 1 if read.needs_neighbours else 0
             slopes = np.zeros((2 * before + 1, *read.output.shape, nx))
             slopes[before, :, :, :n], slopes[before, :, :, 2 * n :] = read.by_q, read.by_z
@@ -122,17 +123,17 @@ class ResidualDerivativesAtNodes:
         return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
     def select_states(self, kept: IntArray) -> ResidualDerivativesAtNodes:
-        """Keep only derivatives with respect to the states at the indices `kept`."""
+        """Return a copy with the derivatives with respect to the states at the indices `kept`."""
         return replace(self, by_state=self.by_state[:, :, kept])
 
     def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesAtNodes:
-        """Keep only derivatives of the residuals at the indices `rows`."""
+        """Return a copy with the derivatives of the residuals at the indices `rows`."""
         return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Residual derivatives (r, d) in d directions, from node states' (K, nx, d) and efforts' (K, nc, d).
+        """Residual derivatives (r, d) in d directions, from those of node states (K, nx, d) and efforts (K, nc, d).
 
-        The K nodes begin with `first`; a residual beyond them uses the last one.
+        The K nodes begin with node `first`. A residual beyond them uses the last node.
         """
         found = np.zeros((len(self.node), by_node.shape[2]))
         for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
@@ -149,12 +150,13 @@ class ResidualDerivativesAtNodes:
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
 
-# A fit is at its end where no step promises more than this part of the cost, or this much of it in units of the noise.
+# A fit is complete if no step predicts a larger cost reduction than this fraction of the cost, or this much in units of
+# the noise.
 _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
 def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
-    """Noise-scaled residual and Jacobian of data and stated priors, without weak priors. Shapes: (r,), (r, nx)."""
+    """Noise-scaled residual (r,) and Jacobian (r, nx) of the data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
     units = np.ones(len(evaluation.residual))
@@ -164,7 +166,7 @@ def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Ev
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
-    """Minimise |J d + r|^2 + mu c |d|^2 over bounded steps d. c is the largest squared column norm of J."""
+    """Minimise |J d + r|^2 + mu c |d|^2 over steps d within bounds; c is the largest squared column norm of J."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
     small = np.zeros((count + 1, count + 1))
@@ -189,14 +191,14 @@ def predicted_cost_reduction(jacobian: Array, residual: Array, step: Array) -> f
 
 
 def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
-    """Whether no step from `x` predicts a relevant cost reduction. False without a Jacobian."""
+    """Whether no step from `x` predicts a relevant cost reduction. Returns False without a Jacobian."""
     noise = problem.rms_noise_of_data_residuals**2
     worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * noise)
     return achievable_cost_reduction(problem, x, evaluation) <= worth
 
 
 def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
-    """Predicted cost reduction of the best step within the unknowns' sizes. Infinite without a Jacobian."""
+    """Predicted cost reduction of the best step within the unknowns' sizes. It is infinite without a Jacobian."""
     if evaluation.jacobian is None:
         return math.inf
     if not len(x):
@@ -208,7 +210,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def solve_step_within_unknown_sizes(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Solve for the bounded least-squares step (nx,). An unknown moves by at most its value or typical size."""
+    """Solve for the bounded least-squares step (nx,). An unknown moves by at most its value or its typical size."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)

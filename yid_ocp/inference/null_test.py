@@ -1,8 +1,9 @@
 """Null test of whether noise alone explains a residual.
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
-(white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a
-chi-squared variable with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes one of them.
+(white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2). A chi-squared variable
+with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each fitted parameter removes one degree of
+freedom.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class AssumedChannelNoiseLevel:
 
 @dataclass(frozen=True)
 class _ResidualWindow:
-    """Test of one channel in a time window [s], flagged where its r'r is more than chance."""
+    """Test of one channel in a time window [s]; flagged if its r'r is significant."""
 
     recording: str
     channel: str
@@ -68,7 +69,7 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """Result of a null test with chi2 per degree of freedom and p-value."""
+    """Result of a null test: chi2 per degree of freedom, p-value, chi2 of channels and tests of time windows."""
 
     chi2_per_dof: float
     degrees_of_freedom: float  # effective ones, of autocorrelated noise
@@ -78,7 +79,7 @@ class NullTestResult:
 
 
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
-    """Noise level that the problem assumes for each channel. It is stated, not measured."""
+    """Noise level that the problem assumes for each channel. It is a stated value, not an estimate."""
     found: dict[str, list[Array]] = {}
     told: dict[str, tuple[str, int]] = {}
     for episode in problem.episodes:
@@ -111,9 +112,9 @@ def residual_chi2_null_test(
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
-    """Test whether a whitened residual is noise alone after a fit. It is (nr,); `parameters` counts the fitted ones.
+    """Test whether a whitened residual (nr,) is noise alone after a fit of `parameters` parameters.
 
-    Rows that belong to no series (priors) do not count. `level` is the false-discovery rate of the windows, `window`
+    Rows that belong to no series (priors) are ignored. `level` is the false-discovery rate of the windows, `window`
     their length [s].
     """
     count = sum(len(s.residual_indices) for s in series)
@@ -132,8 +133,8 @@ def residual_chi2_null_test(
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     """Whiten a residual r in noise units against further independent errors, by (I + F F')^(-1/2) r.
 
-    The `spread` F (nr, k) is the change of the residual per standard deviation of each error; non-finite columns are
-    ignored.
+    Column j of the `spread` F (nr, k) is the change of the residual for one standard deviation of error j. Columns that
+    are not finite are ignored.
     """
     spread = spread[:, np.isfinite(spread).all(axis=0)]
     columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)

@@ -4,12 +4,13 @@ The unknowns of `smoother_model` change from interval to interval by
 
     d_{j+1} = a d_j + sqrt(1 - a^2) s eta_j,
 
-forgetting with the time constant `_CORRELATION_TIME`; this is |d|^2_Q + gamma |d_{j+1} - d_j|^2 of a weak constraint,
-Q and gamma stated as a standard deviation s and a memory. The cost is linear in the number of intervals (Kalman filter,
-disturbance smoother: de Jong 1989, doi:10.2307/2290075). Free parameters are regression effects of the filter, so that
-whatever they can explain is left to them. Groups of unknowns (a segment's forces, a joint's, a camera's biases, ...)
-are added one after the other, that which raises the evidence most first, their standard deviations s being those of
-the largest evidence (MacKay 1992, doi:10.1162/neco.1992.4.3.415): the fewest places that explain the residual.
+where a follows from the time constant `_CORRELATION_TIME`. This equals the penalty |d|^2_Q + gamma |d_{j+1} - d_j|^2 of
+a weak constraint, with Q and gamma given by a standard deviation s and a memory. A Kalman filter and disturbance
+smoother make the cost linear in the number of intervals (de Jong 1989, doi:10.2307/2290075). Free parameters are
+regression effects of the filter: the unknowns only explain what the parameters cannot. Groups of unknowns (forces of a
+segment or a joint, biases of a camera, ...) are added one after another, the one that raises the evidence most first.
+Their standard deviations s maximise the evidence (MacKay 1992, doi:10.1162/neco.1992.4.3.415). The result is the
+smallest set of locations that explains the residual.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class SmoothedUnknowns:
 
 @dataclass(frozen=True)
 class SmoothedUnknownsResult:
-    """Result of the weak-constraint smoother, with smoothed unknowns and the evidence for each group."""
+    """Result of the weak-constraint smoother: smoothed unknowns and the evidence for each group."""
 
     smoothed_unknowns: tuple[SmoothedUnknowns, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # at the largest evidence [squared reference]
@@ -87,19 +88,19 @@ class SmoothedUnknownsResult:
 
     @property
     def plant_or_sensor_origin(self) -> str:
-        """Origin of the gap in plant or sensor. Values: "none", "plant", "sensor", "both", "either" (confounded)."""
+        """Origin of the gap in plant or sensor: "none", "plant", "sensor", "both" or "either" (confounded)."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
         heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
         if heaviest.is_confounded_with_bias:
             return "either"
-        # both must beat either alone by more than chance
+        # both must exceed either alone by more than chance
         alone = max(("plant", "sensor"), key=lambda name: self.log_evidence[name])
         return "both" if self.log_evidence["both"] - self.log_evidence[alone] > self.min_log_bayes_factor else alone
 
 
 class _Update(NamedTuple):
-    """One interval of the filter, as its backward pass needs it: prediction `mean`, covariance `p` and innovations."""
+    """One interval of the filter for the backward pass: prediction `mean`, covariance `p` and innovations."""
 
     step: KalmanStepMatrices
     mean: Array
@@ -108,7 +109,7 @@ class _Update(NamedTuple):
 
 
 class _Filtered(NamedTuple):
-    """The filter of one recording at given variances; its updates where they are kept."""
+    """Filter of one recording at given variances, with its updates if they were kept."""
 
     model: LinearResidualModel
     begin: Array  # by the first disturbances: state and unknowns of the first interval, shape (ns + nd, nd)
@@ -118,7 +119,7 @@ class _Filtered(NamedTuple):
 
 
 class _Smoothed(NamedTuple):
-    """The disturbance smoother over one recording; disturbances are of unit variance before they are scaled."""
+    """Disturbance smoother over one recording, for disturbances of unit variance before scaling."""
 
     score: Array  # of the disturbances, shape (J, nd, 1 + ntheta)
     information: Array  # variances of the disturbances, shape (J, nd)
@@ -129,7 +130,7 @@ class _Smoothed(NamedTuple):
 
 def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filtered:
     """Filter one recording with given variances of the unknowns, shape (nd,)."""
-    # nobody asks for the scores of unknowns that are known to be zero
+    # scores of unknowns with zero variance are not needed
     used = np.arange(len(variance)) if keep else np.flatnonzero(variance > 0)
     variance = variance[used]
     ns, nd = len(model.initial_state_std), len(variance)
@@ -160,7 +161,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
 
 
 def _backwards(done: _Filtered) -> _Smoothed:
-    """The smoother behind a filter whose updates were kept."""
+    """Smoother from a filter whose updates were kept."""
     model, begin, updates = done.model, done.begin, done.updates
     ns, gain = len(model.initial_state_std), math.sqrt(1 - model.interval_correlation**2)
     count, (size, columns) = len(updates), updates[0].mean.shape
@@ -184,7 +185,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
 
 @dataclass(frozen=True)
 class _State:
-    """All recordings at given variances: `shift` of the scaled free parameters, its covariance `spread`."""
+    """All recordings at given variances, with the `shift` of the scaled free parameters and its covariance `spread`."""
 
     recordings: tuple[_Smoothed, ...]
     shift: Array
@@ -193,7 +194,7 @@ class _State:
 
 
 def _run(models: _Models, variance: _Variances) -> _State:
-    """All recordings at given variances; without smoothed unknowns where rounding shows."""
+    """Smooth all recordings at given variances; without smoothed unknowns if the filter is ill-conditioned."""
 
     def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
         done = _forwards(model, model.smoothed_unknown_prior_variances(variance), True)
@@ -207,8 +208,8 @@ def _run(models: _Models, variance: _Variances) -> _State:
 
 
 def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
-    """Log evidence, the parameters' step, and its information as a Cholesky factor, from the sums over recordings."""
-    # a parameter may move by several times its size: the prior only keeps unseen ones in place
+    """Log evidence, the parameters' step, and the Cholesky factor of its information, from sums over recordings."""
+    # a parameter may move by several times its size: the prior only fixes unobserved ones
     precision = np.full(len(products) - 1, 1.0 / 9.0)
     factor = scipy.linalg.cho_factor(products[1:, 1:] + np.diag(precision), lower=True)
     shift = scipy.linalg.cho_solve(factor, products[1:, 0])
@@ -218,7 +219,7 @@ def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tupl
 
 
 def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
-    """|score|^2 of every group's unknowns and its expectation, whatever their variance is."""
+    """|score|^2 of every group's unknowns and its expectation, for any variance."""
     found: dict[SmoothedUnknownGroup, tuple[float, float]] = {}
     for model, done in zip(models, state.recordings, strict=True):
         by_theta = done.score[:, :, 1:]
@@ -231,7 +232,7 @@ def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[
 
 
 def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]:
-    """Variances of the groups at work by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
+    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
     for _ in range(_MAX_ITERATIONS):
         ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in _scores(models, state).items()}
@@ -246,7 +247,7 @@ def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]
 def _selected(
     models: _Models, sources: _Groups, variance: _Variances, state: _State, limits: SmootherThresholds
 ) -> tuple[_Variances, _State]:
-    """Add group after group, that which raises the evidence most, while it rises by more than chance."""
+    """Add the group that raises the evidence most, repeatedly, while the rise exceeds chance."""
     while sum(v > 0 for v in variance.values()) < limits.max_unknown_groups:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
@@ -278,8 +279,8 @@ def _responses(base: _Filtered, chosen: IntArray) -> Array:
     model, updates = base.model, base.updates
     ns, count, u = len(model.initial_state_std), len(updates), len(chosen)
     kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(updates[0].p)[ns:] > 0)])
-    # what the filter has not followed yet, and the disturbed unknowns themselves, by the interval of the disturbance;
-    # it follows one as far as its own unknowns let it, those without variance stay at zero
+    # state error that the filter has not yet followed, and the disturbed unknowns, by the interval of the disturbance;
+    # unknowns without variance stay at zero
     behind, unknown = np.zeros((len(kept), u, count)), np.zeros((u, count))
     behind[:ns, :, 0] = model.initial_state_jacobian[:, chosen]
     found = []
@@ -298,10 +299,9 @@ def _responses(base: _Filtered, chosen: IntArray) -> Array:
 
 
 def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) -> tuple[float, float]:
-    """The largest log evidence over the variance that one group gets on top, and that variance.
+    """Largest log evidence over the variance s^2 of one additional group, and this variance.
 
-    With W the innovations by its disturbances, those of the base have the covariance I + s^2 W W', whose inverse and
-    determinant follow for every s from the eigenvalues of W' W (Woodbury).
+    With W the innovations caused by the group, those of the base have the covariance I + s^2 W W' (Woodbury identity).
     """
     products, log_determinant = np.sum([b.products for b in bases], axis=0), sum(b.log_determinant for b in bases)
     if math.isinf(log_determinant):
@@ -345,13 +345,13 @@ def select_and_smooth_unknowns(
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
             found[side] = done[0] if done else _selected(models, own, none, nothing, limits)
         gain = {side: state.log_evidence - nothing.log_evidence for side, (_, state) in found.items()}
-        # what is chosen greedily among all may end behind a choice among fewer
+        # a greedy choice among all groups may be worse than a choice among fewer
         variance, state = max(found.values(), key=lambda entry: entry[1].log_evidence)
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
         drop, alternatives = _alternatives(models, variance, state, limits)
         traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
-        # what unknowns of the reference size add to r'r on average is the variance of their scores
+        # the variance of a group's scores is the mean rise of r'r by unknowns of the reference size
         scores = {source: max(score, 1e-300) for source, (_, score) in _scores(models, nothing).items()}
         detectable = {source: math.sqrt(limits.detectable_chi2 / score) for source, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
@@ -364,8 +364,8 @@ def force_log_likelihood_coefficients(
 ) -> tuple[Array, Array]:
     """Coefficients g (J,) and L (J, J) of an unknown's log likelihood g'f - f'L f / 2, where f are its values.
 
-    f is in units of the unknown's reference; free parameters, states and all other unknowns, whose groups have these
-    variances [squared reference], are integrated out.
+    f is in units of the unknown's reference. Free parameters, states and all other unknowns are integrated out;
+    `variance` gives the variances of their groups [squared reference].
     """
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))
@@ -396,7 +396,7 @@ def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> Smooth
 
 
 def _explained(models: _Models, variance: _Variances, plain: _State, state: _State) -> tuple[float, float, float, int]:
-    """r'r without and with the unknowns, degrees of freedom that they take, and the number of samples."""
+    """r'r without and with the unknowns, degrees of freedom of the unknowns, and the number of samples."""
     before = after = taken = 0.0
     samples = 0
     bare, full = np.append(1.0, -plain.shift), np.append(1.0, -state.shift)
@@ -414,14 +414,14 @@ def _explained(models: _Models, variance: _Variances, plain: _State, state: _Sta
 def _alternatives(
     models: _Models, variance: _Variances, state: _State, limits: SmootherThresholds
 ) -> tuple[_Variances, dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
-    """Fall of the log evidence without each group, and those that would keep most of it, or all but what is chance."""
+    """Fall of the log evidence without each group, and the groups that could replace it."""
     drop, found = dict.fromkeys(variance, 0.0), {}
     for source in [s for s, v in variance.items() if v]:
         less = variance | {source: 0.0}
         without = _run(models, less)
         drop[source] = max(state.log_evidence - without.log_evidence, 0.0)
         scores = _scores(models, without)
-        # promise at no variance says little of how far a group gets: all of them are asked
+        # the score at zero variance is a poor predictor here: all groups are tried
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         least = state.log_evidence - max(limits.min_log_bayes_factor, (1 - limits.location_tie) * drop[source])
         reached = zip(asked, _largest_evidences(models, less, asked), strict=True)
@@ -435,7 +435,7 @@ _MAX_NAMED_LOCATIONS = 3  # places that are named at most
 
 @dataclass(frozen=True)
 class GapLocation:
-    """A location in the model or sensors with its share of the gap, observability and time windows."""
+    """A location in the model or sensors: share of the gap, observability, and time windows of the gap."""
 
     location: str
     gap_share: float  # of the gap that can be located; all shares add up to one
@@ -445,7 +445,7 @@ class GapLocation:
 
 
 def main_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
-    """Choose the locations to report, those with a share above `_MIN_NAMED_SHARE` or the first, at most three."""
+    """Choose at most three locations to report: those with a share above `_MIN_NAMED_SHARE`, else the first."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
 
@@ -456,9 +456,9 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 def gap_locations_by_smoother_evidence(
     smoothed: SmoothedUnknownsResult, location_z: float = 3.0
 ) -> tuple[GapLocation, ...]:
-    """Rank all locations by their share of the log evidence. At equal shares observable ones come first.
+    """Rank all locations by their share of the log evidence. At equal shares, observable ones come first.
 
-    A location's time windows are those in which an unknown is over `location_z` standard deviations from zero.
+    A location's time windows are those in which one of its unknowns is over `location_z` standard deviations from zero.
     """
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
@@ -470,7 +470,7 @@ def gap_locations_by_smoother_evidence(
         share = weight[location] / total if total > 0 else 0.0
         seen = any(smoothed.detectable_std[s] < 1.0 or drop[s] > 0 for s in own)
         when = _windows(smoothed, [s for s in own if smoothed.group_variance[s]], location_z)
-        # places that would do in the place of every group at work there
+        # locations that could replace every selected group of this location
         also = [{e.location for e in smoothed.alternative_groups[s]} for s in own if s in smoothed.alternative_groups]
         others = tuple(sorted(set.intersection(*also) - {location})) if also else ()
         found.append(GapLocation(location, share, seen, when, others))
@@ -495,7 +495,7 @@ def _windows(
 
 
 def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Merge overlapping or adjacent time intervals. They are returned in order of time."""
+    """Merge overlapping or adjacent time intervals. The result is in order of time."""
     joined: list[tuple[float, float]] = []
     for begin, end in sorted(spans):
         if joined and begin <= joined[-1][1] + 1e-9:
@@ -511,10 +511,11 @@ def gap_locations_from_effect_closures(
     rest: Sequence[GapLocation],
     windows: tuple[tuple[float, float], ...],
 ) -> tuple[GapLocation, ...]:
-    """Share the gap among locations by the closure of effects there. The smoother distributes the rest.
+    """Divide the gap among locations: closed parts belong to the effects' locations, the smoother divides the rest.
 
-    `before` and `rest` are the locations of the nominal model and of the model with the effects, `closed` is the part
-    that the effects at each close, `windows` serve locations without an unknown of the smoother (`world`, `clock`).
+    `before` and `rest` are the locations of the nominal model and of the model with the effects. `closed` is the part
+    of the gap that the effects at each location close. `windows` are the time windows of locations at which the
+    smoother has no unknown (`world`, `clock`).
     """
     known = {place.location: place for place in before}
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
@@ -538,9 +539,9 @@ def z_scores_of_smoothed_unknowns(
     recording: int = 0,
     informed_fraction: float = 0.5,
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Interval edges (J + 1,) [s], unknowns' names and z scores (J, nd), which are posterior mean over std.
+    """Interval edges (J + 1,) [s], names of the unknowns, and z scores (J, nd): posterior mean over standard deviation.
 
-    Scores are NaN unless 1 - posterior/prior variance is above `informed_fraction`.
+    A score is NaN unless 1 - posterior/prior variance is above `informed_fraction`.
     """
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
@@ -551,13 +552,13 @@ def z_scores_of_smoothed_unknowns(
 
 
 def smoothed_unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
-    """SI unit of every smoothed unknown in `trace`, such as a force, torque, push, grasp offset or sensor bias."""
+    """SI unit of every smoothed unknown in `trace`: of a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}
     return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
 
 
 def generalised_force_unit(system: System, coordinate: str) -> str:
-    """SI unit of the generalised force at a coordinate, N for a prismatic joint, else N m."""
+    """SI unit of the generalised force at a coordinate: N for a prismatic joint, else N m."""
     kinds = {joint.name: joint.kind for joint in system.mechanism.joints}
     return "N" if kinds.get(coordinate) == "prismatic" else "N m"

@@ -1,13 +1,13 @@
 """Linear model of a recording's residual under unknown forces, grasp offsets and sensor biases.
 
-About the rollout of a fitted model every DEL row gets an unknown generalized force, every segment an unknown push (a
-force in the world on a point of it, which all joints between it and the ground feel), every grasp an unknown offset and
-every output of a point sensor an unknown bias. To first order
+The residual is linearised about the rollout of a fitted model. Every DEL row gets an unknown generalized force, every
+grasp an unknown offset, and every output of a point sensor an unknown bias. Every segment gets an unknown push, a force
+at one of its points that acts on all joints between this point and the ground. To first order
 
     x_{k+1} = A_k x_k + E_k d_j,   y_k = C_k x_k + b_j + noise,
 
-with unknowns d (and b alike) that are constant over an interval j. States inside an interval are eliminated, so that
-what follows is linear in the number of intervals.
+where the unknowns d and b are constant over an interval j. States inside an interval are eliminated, so that the cost
+of later steps is linear in the number of intervals.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _FORCE_POINT = "75%"  # by arc length, where a segment is pushed: near what acts
 
 @dataclass(frozen=True)
 class SmootherThresholds:
-    """Prior sizes of unknowns, and the log evidence that a group requires (5: odds of 150 to 1)."""
+    """Prior sizes of unknowns, and the log evidence that a group requires (5 means odds of 150 to 1)."""
 
     min_log_bayes_factor: Annotated[
         float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
@@ -83,7 +83,7 @@ class SmoothedUnknownGroup:
 
 
 class _LinearizedEpisode(NamedTuple):
-    """An episode of a problem and the trajectory about which the smoother's model of it is linear."""
+    """An episode of a problem and the trajectory about which the smoother linearises it."""
 
     problem: EstimationProblem
     episode: Episode
@@ -170,7 +170,7 @@ def _unknown_forces(
 
 
 def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
-    """Location of a sensor's bias: camera, `wrist:FRAME`, the arm that holds the frame, or its group."""
+    """Location of a sensor's bias: `camera`, `wrist:FRAME`, the grasp that holds the frame, or the sensor's group."""
     if sensor.camera_pose is not None:
         return "camera"
     if isinstance(sensor, MountedSensor):
@@ -182,7 +182,7 @@ def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
 
 
 def _loads(course: _LinearizedEpisode) -> Array:
-    """Typical load of every coordinate: of its spring, its motor or its prescription, shape (n,) [N m or N]."""
+    """Typical load of every coordinate, from its spring, motor or prescribed effort, (n,) [N m or N]."""
     system, rollout = course.system, course.nominal.rollout
     load = np.zeros(system.n_coordinates)
     q = rollout.state[:, : system.n_coordinates]
@@ -228,7 +228,7 @@ def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segme
 
 @dataclass(frozen=True)
 class _IntervalModel:
-    """Linear model of one interval: residual, transition of the state at its beginning, input of the unknowns."""
+    """Linear model of one interval: residual, transition of its initial state, input of the unknowns."""
 
     # whitened residual, then its derivative by the free parameters, both with the opposite sign, shape (r, 1 + ntheta)
     negative_residual_jacobian: Array
@@ -269,7 +269,8 @@ def recording_models_with_unknown_forces(
 ) -> tuple[LinearResidualModel, ...]:
     """Linearize every recording's residual about `x` in unknown forces, offsets and biases.
 
-    `evaluation` is that at `x`, with its Jacobian; unknowns are constant over `interval` [s] at the least.
+    `evaluation` is the evaluation at `x` with a Jacobian. Unknowns are constant over intervals of at least `interval`
+    [s].
     """
     assert evaluation.jacobian is not None
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])
@@ -285,7 +286,7 @@ def recording_models_with_unknown_forces(
         factor = np.concatenate([block.robust_factor for block in blocks])
         found.append(_recording(course, factor, observed, limits, interval))
     prior = columns[problem.residual_rows.stated_priors]
-    # stated priors of the free parameters are observations that no unknown reaches
+    # stated priors of the free parameters are observations on which no unknown acts
     first, *later = found[0].intervals
     first = replace(first, unreachable_products=first.unreachable_products + prior.T @ prior)
     return (replace(found[0], intervals=(first, *later)), *found[1:])
@@ -297,7 +298,7 @@ def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> tuple[
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
     forces, loading = len(unknowns.forced), unknowns.loading
     rows, momentum = np.zeros((n + nz + m, loading)), np.zeros((n, loading))
-    # an unknown force is held over the step and shared by both equations like any other
+    # an unknown force is constant over the step and split between both equations like any other force
     first_share = 1.0 if step.force_split == "left" else 0.5
     impulse = step.time_step * unknowns.reference[:forces]
     rows[unknowns.forced, np.arange(forces)] = first_share * impulse
@@ -314,17 +315,14 @@ def _steps(
     span: slice,
     with_forces: bool,
 ) -> tuple[Array, Array, Array]:
-    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd'); pushes in forces.
-
-    With constraint forces efforts are followed by these.
-    """
+    """A_k (steps, ns, ns), E_k (steps, ns, nd') and derivatives of efforts (and forces) (steps, nc, ns + nd')."""
     a, e, effort = [], [], []
     feedback, nominal, step = course.episode.tracking_feedback, course.nominal, course.problem.step
     nx, width, forces = step.sizes["nx"], loads[1].shape[1], pushes.shape[1]
     inputs = np.zeros((len(pushes), step.sizes["nu"], width))
     if feedback is not None:
-        # the momentum of the motion that was measured has half the impulse of an unknown force in it (of the step
-        # before; this step's stands for it)
+        # the momentum of the measured motion contains half the impulse of an unknown force (of the previous step, taken
+        # as that of this step)
         followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
         inputs = feedback.gain @ followed
     found = step_derivatives_along_rollout(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span)
@@ -341,7 +339,7 @@ def _steps(
 def _recording(
     course: _LinearizedEpisode, factor: Array, observed: Array, limits: SmootherThresholds, shortest: float
 ) -> LinearResidualModel:
-    """The linear model of one recording from its whitened residuals and their slopes."""
+    """Linear model of one recording from its whitened residuals and their derivatives."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
     length = int(max(round(shortest / h), math.ceil(steps * _MIN_INTERVAL / (_MAX_INTERVAL_COUNT * shortest)), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
@@ -366,7 +364,7 @@ def _recording(
         span_of_steps = slice(int(edges[j]), min(int(edges[j + 1]) + beyond, steps))
         made = _steps(course, loads, pushes, moving, span_of_steps, beyond > 0)
         if j == 0 and rests:
-            # rest under constant unknowns, x = A x + E d; what has no stiffness does not come to rest
+            # equilibrium under constant unknowns, x = A x + E d; coordinates without stiffness have none
             at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - made[0][0], made[1][0], rcond=1e-6)[0]
         rows = np.flatnonzero(interval_of_row == j)
         own = factor[rows, None] * by_bias[rows]
@@ -400,7 +398,7 @@ def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span:
 
 
 def _loose_start(course: _LinearizedEpisode) -> Array:
-    """Standard deviation of a start that was fitted to points, shape (nx,)."""
+    """Standard deviation (nx,) of an initial state that was fitted to points."""
     problem, free = course.problem, np.array(course.system.unprescribed_coordinate_indices, int)
     options, joints = problem.options, course.system.mechanism.joint_names
     inertia = mass_matrix_diagonal_at_zero(problem.step, course.nominal.theta, tuple(joints[i] for i in free))
@@ -413,10 +411,7 @@ def _loose_start(course: _LinearizedEpisode) -> Array:
 def _interval_response(
     steps: tuple[Array, Array, Array], slopes: ResidualDerivativesAtNodes, first: int, length: int
 ) -> tuple[Array, Array, Array]:
-    """An interval's end by its beginning and by unknowns, its rows by both, from (A_k, E_k, effort's slopes).
-
-    The steps go beyond its `length` where its rows do; there its unknowns last.
-    """
+    """Derivatives of an interval's final state and rows; steps beyond `length` serve rows of the next interval."""
     a, e, by_effort = steps
     count, ns, driving = len(a), a.shape[1], e.shape[2]
     node = np.zeros((count + 1, ns, ns + driving))
@@ -432,7 +427,7 @@ def _interval_response(
 
 
 def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Array:
-    """Slopes of all rows by the biases, in units of their reference, shape (r, nb)."""
+    """Derivatives of all rows by the biases, in units of their reference, shape (r, nb)."""
     reference, found = unknowns.reference[unknowns.driving :], []
     group, output = np.array(unknowns.biased, int).reshape(-1, 2).T
     for k, samples in enumerate(course.episode.measurements):
@@ -443,7 +438,7 @@ def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Arr
 
 
 def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> _IntervalModel:
-    """An interval with no more rows than columns: what is orthogonal to all columns only adds to the products."""
+    """An interval with as many rows as columns; residual orthogonal to all columns only adds to the products."""
     joined, count = np.hstack([by_state, by_unknown]), len(observed)
     rest = np.zeros((observed.shape[1], observed.shape[1]))
     if len(joined) > joined.shape[1]:

@@ -1,4 +1,4 @@
-"""Uncertainty of a fit, with covariance, intervals and verdicts of parameters, and goodness of fit."""
+"""Uncertainty of a fit: covariance, intervals and verdicts of parameters, and goodness of fit."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ ConfidenceInterval = tuple[float | None, float | None]
 
 MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
 MAX_WEAK_RELATIVE_STD = 4.0
-# A standard deviation of this many times the value, or its typical size, counts as infinite.
+# A standard deviation of this many times the value (or its typical size) counts as infinite.
 MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6
-# A value so near its bound, in units of the unknown's typical size, lies at it.
+# A value this close to its bound, in units of the unknown's typical size, counts as at the bound.
 _AT_BOUND_FRACTION = 1e-4
 # 95 % quantiles of chi2 with one degree of freedom, for an interval with one end and with two.
 _CHI2_95_ONE_SIDED, CHI2_95_TWO_SIDED = 2.705543454095404, 3.841458820694124
-# Blocks of time into which all recordings are cut where the misfit counts, and their shortest and longest length [s].
+# Number of time blocks into which all recordings are cut if misfit is included, and their shortest and longest length
+# [s].
 _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH = 24, 0.25, 2.0
-# So many recordings, or channels of single recordings, tell by themselves how far what they say scatters.
+# With at least this many recordings, or channels of recordings, scores are clustered by these.
 _MIN_CLUSTER_RECORDINGS, _MIN_CLUSTER_CHANNELS = 4, 8
-# A parabola whose end the cost reaches with a smaller part of the promised height is no likelihood's.
+# The Gaussian approximation is rejected if the cost rises by less than this fraction of the predicted rise.
 _MIN_COST_RISE_RATIO = 0.5
-# With more parameters two rollouts for each take longer than the search itself.
+# With more parameters, two rollouts per parameter take longer than the search itself.
 _MAX_CHECKED_PARAMETERS = 12
 
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """Result of the null test of a fit on its own recordings. It states whether the model explains them."""
+    """Result of the null test of a fit on its own recordings: whether the model explains them."""
 
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
@@ -54,10 +55,10 @@ class GoodnessOfFit:
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """Estimate of one parameter with standard deviation, bounds and verdict.
+    """Estimate of one parameter: value, standard deviation, bounds and verdict.
 
-    The 95 % `interval` is stated where a standard deviation does not tell it: one-sided at a bound, by profile
-    likelihood where the cost is no parabola; None is an open end.
+    The 95 % `interval` is set if a standard deviation is not sufficient. At a bound it is one-sided. If the cost is not
+    quadratic, it comes from the profile likelihood. None is an open end.
     """
 
     value: float
@@ -72,7 +73,7 @@ class ParameterEstimate:
 
     @property
     def confidence_interval_ends(self) -> tuple[float, float]:
-        """Ends of the 95 % interval. They are infinite where open, value ± 1.96 std where no interval is stated."""
+        """Ends of the 95 % interval, infinite if open. Without a stated interval they are value ± 1.96 std."""
         if self.interval is None:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
@@ -81,7 +82,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class EstimateShiftByLinksAndTimeStep:
-    """Shifts of one estimate when links are divided in two or the time step is halved. None if not tried."""
+    """Shift of one estimate if the number of links is doubled, or if the time step is halved. None if not computed."""
 
     links: float | None = None
     time_step: float | None = None
@@ -111,8 +112,8 @@ def assess_goodness_of_fit(
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
     """Covariance of the unknowns (nx, nx) from data and stated priors, and chi2 per degree of freedom.
 
-    Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one. A prior
-    counts with at least the standard deviation that was stated, however few of the stated ones are noise.
+    Directions without information in the data get the variance (1e8 x scale)^2 instead of an infinite one. A prior's
+    error counts with at least its stated standard deviation, even if other stated deviations are too large.
     """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
@@ -124,10 +125,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 
 
 def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
-    """Factor F of the unknowns' covariance F F' from noise alone, shape (nx, nx).
-
-    The factor keeps the digits that a covariance with uninformed directions loses.
-    """
+    """Factor F (nx, nx) of the covariance F F' from noise alone; F F' itself loses digits in uninformed directions."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
     _, jacobian = linearization_without_weak_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
@@ -138,7 +136,7 @@ def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluatio
 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
-    """Of the data, stated priors counting as observations."""
+    """Chi2 of the data per degree of freedom. Stated priors count as observations."""
     residual, _ = linearization_without_weak_priors(problem, evaluation)
     data = residual[problem.residual_rows.data]
     return float(data @ data) / max(len(residual) - len(problem.initial_unknowns), 1)
@@ -147,10 +145,10 @@ def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
 def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluation, covariance: Array) -> Array:
     """Covariance widened for model misfit, at least as large as the block-wise sandwich estimate.
 
-    The sandwich A^-1 S A^-1 (White 1982, doi:10.2307/1912526) takes S from the scores J' r summed over blocks of time
-    of one recording, all channels together, as a misfit repeats itself from sample to sample and shows in all of them,
-    and where there are enough from single channels of whole recordings (a zero that moves, friction that holds) and
-    whole recordings (clusters: Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136); the largest counts.
+    The sandwich is A^-1 S A^-1 (White 1982, doi:10.2307/1912526). S is the covariance of the scores J' r, summed over
+    clusters of rows (Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136): time blocks of one recording with all
+    channels, because a misfit is correlated in time and across channels; single channels of recordings, if there are
+    enough, for constant errors such as a sensor offset; and whole recordings. The largest result counts.
     """
     if evaluation.jacobian is None or not len(covariance):
         return covariance
@@ -170,11 +168,11 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
 
 
 def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tuple[Array, Array]]) -> Array:
-    """Covariance (nx, nx) of the sum of scores J' r over clusters of rows (J, r) that err independently of one another.
+    """Covariance (nx, nx) of the sum of scores J' r over independent clusters of rows (J, r).
 
-    A fit follows a cluster that alone informs a direction, and leaves too little of its error: the sums are divided by
-    (1 - h)^(1/2), h the cluster's part of the information (Bell, McCaffrey 2002). Of few clusters even that is too
-    little; intervals of two standard deviations then are those of Student's t.
+    A fit follows a cluster that alone informs a direction, so its residual is too small. The sums are therefore divided
+    by (1 - h)^(1/2), where h is the cluster's part of the information (Bell, McCaffrey 2002). For few clusters,
+    Student's t also widens the intervals.
     """
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
@@ -183,7 +181,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     adjusted = []
     for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
         share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
-        # what no other cluster informs cannot be separated from these
+        # directions that no other cluster informs cannot be corrected
         kept = share < 1 - 1e-6
         grown = np.where(kept, 1.0 / np.sqrt(np.where(kept, 1.0 - np.maximum(share, 0.0), 1.0)), 0.0)
         adjusted.append(root @ (axes * grown) @ axes.T @ (back @ total))
@@ -193,7 +191,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
 
 
 def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
-    """Rows of the data cut into blocks of time, and where there are enough into recordings and channels of these."""
+    """Rows of the data in time blocks and, if there are enough, in recordings and in channels of recordings."""
     total = sum(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
     length = float(np.clip(total / _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH))
     blocks: dict[tuple[str, int], list[IntArray]] = {}
@@ -222,11 +220,10 @@ def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation,
 
 
 def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array) -> Array:
-    """Standard deviation of each unknown, shape (nx,), that of parameters checked against the cost.
+    """Standard deviation of each unknown, (nx,). Those of poorly determined parameters are checked against the cost.
 
-    The covariance is that of a parabola at the fit. Where it does not fix a parameter well, the cost is worked out at
-    the end of its 95 % interval, the others moved along; where it rises less than promised, as for stiffnesses small by
-    chance, the standard deviation is that of a parabola through there, infinite where the cost does not rise at all.
+    If the cost at the end of the 95 % interval is lower than predicted, the standard deviation follows from a parabola
+    through this point. It is infinite if the cost does not rise.
     """
     spread = std_from_covariance(covariance, x)
     lower, upper = problem.bounds
@@ -239,7 +236,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
             continue
         heights = []
         for sign, room in ((-1.0, float(x[i] - lower[i])), (1.0, float(upper[i] - x[i]))):
-            # farther than this off its typical size a parabola has nothing to say
+            # beyond this distance from the value, a parabola is not a useful approximation
             step = min(math.sqrt(CHI2_95_TWO_SIDED) * spread[i], room, 10 * size)
             if step < MAX_IDENTIFIABLE_RELATIVE_STD * spread[i]:
                 continue
@@ -260,7 +257,7 @@ def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
 
 
 def std_from_covariance(covariance: Array, x: Array) -> Array:
-    """Standard deviations from a covariance, shape (nx,). They are infinite where the covariance is NaN."""
+    """Standard deviations from a covariance, (nx,). They are infinite where the covariance is NaN."""
     if not len(covariance):
         return np.zeros(len(x))
     diagonal = np.diag(covariance)
@@ -270,7 +267,7 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
     """Convert a covariance to names and data for result.json. `matrix` (n, n) holds the correlations.
 
-    Parameters without a finite and positive standard deviation are left out: nothing is known of them.
+    Parameters whose standard deviation is not finite and positive are left out.
     """
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
     factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
@@ -288,19 +285,16 @@ def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation)
 def parameter_verdict(
     value: float, std: float, *, scale: float = 0.0, explains: bool = True, at_bound: bool = False
 ) -> str:
-    """Judge a free parameter by its value and standard deviation.
+    """Judge a free parameter by its value and standard deviation. Returns the first verdict whose condition holds.
 
-    ==================  ================================================================================================
-    not_identifiable    the standard deviation is above 400 % of the value
-    not_trusted         the model does not explain the data, or the data are in grave doubt
-    at_bound            the value lies at one of its bounds
-    identifiable        the standard deviation is up to 10 % of the value
-    weak                anything else
-    ==================  ================================================================================================
+    ================== ================================================================================================
+    not_identifiable the standard deviation is above 400 % of the value not_trusted the model does not explain the data,
+    or the data have serious issues at_bound the value lies at one of its bounds identifiable the standard deviation is
+    up to 10 % of the value weak anything else ==================
+    ================================================================================================
 
-    The first that holds is returned. A value that may be zero is judged by `scale` as well, the parameter's plausible
-    size, zero where unknown: identifiable where value and two standard deviations stay below a tenth of it, weak where
-    they stay below all of it.
+    A value near zero is also judged by `scale`, the parameter's plausible size (zero if unknown). It is identifiable if
+    |value| + 2 std is at most a tenth of `scale`, and weak if it is at most `scale`.
     """
     found = verdict_by_relative_std(value, std, scale)
     if found == "not_identifiable":
@@ -311,7 +305,7 @@ def parameter_verdict(
 
 
 def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str:
-    """Judge a parameter by its relative standard deviation alone. Verdicts: identifiable, weak, not_identifiable."""
+    """Judge a parameter by its relative standard deviation alone: identifiable, weak or not_identifiable."""
     if not math.isfinite(std):
         return "not_identifiable"
     relative, reach = std / max(abs(value), 1e-12), abs(value) + 2 * std
@@ -322,12 +316,12 @@ def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str
 
 
 def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
-    """Copy an estimate with a profile-likelihood interval. Its std and verdict become consistent with it.
+    """Copy an estimate with a 95 % profile-likelihood interval, with which std and verdict become consistent.
 
-    Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
-    a bound within `scale` is that bound. Else the wider side is two standard deviations (`verdict_by_relative_std`),
-    and is the ± where a parabola's would be less than half of it. The interval is that of 95 %, the scale that of
-    `parameter_verdict`.
+    With two open ends the verdict is not_identifiable. With one open end it is at best weak, and std is infinite. An
+    open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
+    `parameter_verdict`). Otherwise the wider side counts as two standard deviations and decides the verdict. It
+    replaces std if std is less than half of it.
     """
     low, high = interval
     if low is None and entry.value - entry.lower <= scale:
@@ -349,15 +343,15 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
 
 
 def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
-    """Whether a parameter needs no profile, as its relative standard deviation is at most 10 %."""
+    """Whether a parameter needs no profile because its relative standard deviation is at most 10 %."""
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
 
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
     """Typical magnitude of each free parameter from priors, bounds, similar parameters or initial values.
 
-    A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
-    same kind (`bend`, say, or else of the same unit) with the median of their sizes.
+    The first available value counts: the prior's standard deviation, half the distance of finite bounds, the median of
+    parameters of the same kind (such as `bend`) or unit, the scale of the unknown.
     """
 
     def kind(name: str) -> str:
@@ -392,7 +386,7 @@ def parameter_estimates(
 ) -> dict[str, ParameterEstimate]:
     """Estimate all parameters from the covariance (nx, nx) and evaluation at `x`. Local ones are listed by recording.
 
-    `fit` is None where `x` is not a fit; misfit and bounds are then ignored.
+    If `x` is not a fit, `fit` is None, and misfit and bounds are ignored.
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
@@ -416,10 +410,10 @@ def parameter_estimates(
         if said == "not_identifiable":
             std = math.inf
         elif side:
-            # the slope of the cost, in units of the noise that the misfit makes
+            # slope of the cost in units of the noise, which includes the misfit
             residual, jacobian = linearization_without_weak_priors(problem, evaluation)
             pull = std * abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
-            # on one side 95 %: pull d/std + d^2/(2 std^2) = 2.71/2 at a distance d from the bound
+            # one-sided 95 % end: pull d/std + d^2/(2 std^2) = 2.71/2 at a distance d from the bound
             reach = std * (math.sqrt(pull**2 + _CHI2_95_ONE_SIDED) - pull)
             interval = (value, value + reach) if side < 0 else (value - reach, value)
         initial = float(problem.initial_unknowns[at])
@@ -428,7 +422,7 @@ def parameter_estimates(
 
 
 def free_estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
-    """Copy estimates with the verdict not_trusted. Fixed and not_identifiable parameters keep theirs."""
+    """Copy estimates with the verdict not_trusted. Fixed and not_identifiable parameters keep their verdicts."""
     doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}
 
@@ -456,14 +450,14 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
 
 
 def value_and_uncertainty_text(value: float, std: float | None, interval: ConfidenceInterval | None) -> str:
-    """Format a value with its 95 % interval, else with its standard deviation, where there is one."""
+    """Format a value with its 95 % interval or, without one, with its standard deviation if known."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
     return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return a finite number unchanged, but None for infinity or NaN."""
+    """Return a finite number unchanged, and None for infinity or NaN."""
     return value if math.isfinite(value) else None
 
 

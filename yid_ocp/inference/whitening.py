@@ -1,25 +1,25 @@
 """Whiten a recording's residual by a Kalman filter that includes errors of recorded torques and encoders.
 
-Recorded torques of driven joints are wrong by w, white from recorded sample to recorded sample, and by b, constant over
-a recording; encoders by v. Along a rollout the error d of its state, model less truth, obeys to first order
+The recorded torques of driven joints have two errors: w, white noise from sample to sample, and b, constant over a
+recording. Encoders have the error v. To first order, the error d of a rollout's state (model minus truth) obeys
 
-    d_{k+1} = A_k d_k + B_k (w_k + b) + B_k du_k                 where encoders are measurements,
-    d_{k+1} = (A_k - B_k K_k) d_k + B_k (G_k (w_k + b) - K_k v_k)      where they are not,
+    d_{k+1} = A_k d_k + B_k (w_k + b) + B_k du_k                       if encoders are measurements,
+    d_{k+1} = (A_k - B_k K_k) d_k + B_k (G_k (w_k + b) - K_k v_k)      if they are not.
 
-with the correction du_k that the tracking filter K_k added to the recorded torque, and G_k what an error of the torque
-comes to with the momentum that the filter follows (`applied_torque_by_torque_error`). In the first form du is known,
-and the outcome does not depend on the filter; in the second the filter is part of the model, as its reference is no
-measurement. Residuals are r = H d + v, so that with the filter's prediction m of (d, w, b)
+du_k is the correction of the recorded torque by the tracking filter K_k. G_k is the derivative of the applied torque
+with respect to an error of the recorded torque (`applied_torque_by_torque_error`). In the first form du is known, and
+the result does not depend on the tracking filter. In the second form the tracking filter is part of the model, because
+its reference is not a measurement. Residuals are r = H d + v. With the filter's prediction m of (d, w, b),
 
     innovations = S^(-1/2) (r - H m),    |innovations|^2 = r' Sigma^-1 r,
 
-Sigma the covariance of all residuals. The map is linear and frozen at the point where it was worked out: the same for
-residual and Jacobian, which is generalised least squares.
+where Sigma is the covariance of all residuals. The map is linear and frozen at the point of linearisation: it is the
+same for residual and Jacobian, which is generalised least squares.
 
-Recorded torques are regressors with errors: along a rollout under them the derivatives share their noise with the
-residual, and whatever stands beside accelerations, inertias above all, comes out biased. Where a filter is known
-already, the next one is therefore about the smoothed motion, w and b taken off the torques; then the derivatives are
-those of the sum of squares that is least over w and b (Golub and Pereyra).
+Recorded torques are regressors with errors: derivatives along a rollout under them contain the same noise as the
+residual, which biases estimates, above all of inertias. If a filter exists, the next one is therefore linearised about
+the smoothed motion with w and b subtracted from the torques. The derivatives are then those of the sum of squares
+minimised over w and b (Golub and Pereyra).
 
 References
 ----------
@@ -60,7 +60,7 @@ _TORQUE_BIAS_TOLERANCE = 0.05  # change of the torque offset, in stated standard
 
 
 class _FilterPart(NamedTuple):
-    """Some steps of a frozen filter of (d, w, b)."""
+    """Consecutive steps of a frozen filter of (d, w, b)."""
 
     first: int  # of them
     rows: IntArray  # of the residual, in the order of the steps
@@ -69,7 +69,7 @@ class _FilterPart(NamedTuple):
     by_torque: Array  # slopes of the rows by a known torque of their step, shape (r, nu)
 
     def fresh_noise(self, noise: Array) -> Array:
-        """Known noise (N, nu) that begins behind each of the steps, and zeros for the offsets, shape (k, 2 nu)."""
+        """Known noise (N, nu) that begins after each step, and zeros for the offsets, shape (k, 2 nu)."""
         found = np.zeros_like(self.kalman.decay)
         behind = self.first + 1 + np.flatnonzero(self.kalman.decay[:, 0] == 0)
         found[behind - self.first - 1, : noise.shape[1]] = noise[behind]
@@ -95,10 +95,10 @@ class WhiteningFilter:
     torque_bias_std: Array  # of b after all measurements, shape (nu,) [N m]
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten residual columns, and estimate torque biases (nu, c) [N m] from all rows.
+        """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.
 
-        Rows (r, c) are a residual in units of the sensors' noise, then columns of its derivative; `push` (N, nu, c) is
-        the tracking filter's correction of the torque, and its derivative [N m].
+        The columns of `rows` are a residual in units of sensor noise, then its derivatives. `push` (N, nu, c) is the
+        tracking filter's correction of the torque and its derivatives [N m].
         """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
@@ -108,7 +108,7 @@ class WhiteningFilter:
         return result, bias
 
     def _smooth_input_errors(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
-        """Smoothed torque and state errors given all measurements (Bryson, Frazier 1963); arguments as in whitening."""
+        """Smoothed torque and state errors given all measurements (Bryson, Frazier 1963)."""
         errors, (count, nu) = self.input_error_model, self.input_error_model.torque_noise.shape
         ns = int(np.count_nonzero(self.state_mask))
         torque = slice(ns, ns + nu)
@@ -121,17 +121,17 @@ class WhiteningFilter:
         mean = self._expected(1) + self.initial_covariance @ costate
         fresh = np.concatenate([part.kalman.decay[:, 0] == 0 for part in self.filter_steps])[: count - 1]
         white = np.vstack([errors.torque_noise[0] + mean[torque, 0], errors.torque_std**2 * after[: count - 1]])
-        # a torque's error stays what it is until another one begins
+        # a torque error is constant until the next sample begins
         white = white[np.maximum.accumulate(np.where(np.append(True, fresh), np.arange(count), 0))]
         error = np.zeros((count + 1, len(self.state_mask)))
         for part in self.filter_steps:
-            # without the sensors' noise there is no innovation; what rounding makes of one keeps the error bounded
+            # without sensor noise there is no innovation; rounding keeps the error bounded
             _, mean, before = self._updated(part, mean, rows[part.rows, None] - noise[part.rows], push, white)
             error[part.first : part.first + len(before), self.state_mask] = before[:, :ns, 0]
         return _SmoothedInputErrors(bias[:, 0], white, error)
 
     def _expected(self, columns: int) -> Array:
-        """Mean of (d, w, b) before all measurements; no derivative in further columns, shape (na, columns)."""
+        """Mean of (d, w, b) before all measurements, (na, columns). Only the first column is nonzero."""
         known = np.concatenate([self.input_error_model.torque_noise[0], self.input_error_model.torque_bias])
         mean = np.zeros((len(self.initial_covariance), columns))
         mean[len(mean) - len(known) :, 0] = -known
@@ -140,10 +140,7 @@ class WhiteningFilter:
     def _updated(
         self, part: _FilterPart, mean: Array, own: Array, push: Array | None, white: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """Innovations of some steps, the mean of another w after them, and the means before each.
-
-        The mean of what `white` (N, nu), if given, says of w.
-        """
+        """Innovations of some steps, the mean after them and the means before each, with torque noise `white`."""
         noise = self.input_error_model.torque_noise
         known = None
         if push is not None and part.first < len(push):
@@ -165,7 +162,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
     first = unit @ unit.T
     made, covariance = _filter_steps(course, errors, kept, slopes, rows_of_node[:-1], first)
-    # behind the last node nothing moves
+    # after the last node there is no motion
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
     still = np.eye(len(kept), len(kept) + nu)[None], 0, np.ones((1, 2 * nu)), np.zeros((1, 2 * nu))
@@ -183,9 +180,9 @@ def _filter_steps(
     rows_of_node: Sequence[IntArray],
     covariance: Array,
 ) -> tuple[list[_FilterPart], Array]:
-    """The filter of the kept states' slopes over all steps, from the covariance before them to that after them."""
+    """Filter over all steps for the kept states, and the covariance after the last step."""
     (count, nu), ns, made, begun = course.rollout.torque.shape, len(kept), list[_FilterPart](), 0
-    # another w where it is fresh, and the same b
+    # a new w at each new sample, and the same b
     fresh = np.append(np.diff(errors.sample_of_step) != 0, False)[:, None]
     decay = np.hstack([np.repeat(1.0 - fresh, nu, axis=1), np.ones((count, nu))])
     variance = np.hstack([fresh * errors.torque_std**2, np.zeros((count, nu))])
@@ -193,12 +190,12 @@ def _filter_steps(
     if errors.has_encoder_measurements:
         feedback = None
     elif feedback is not None:
-        # what torques of the step before add to the momenta that the filter follows
+        # momenta that the filter follows contain torques of the previous step
         momentum = course.model_functions.effect_momentum_shift_functions.momentum_derivative_by_previous_torque(
             course.theta
         )
         driving = applied_torque_by_torque_error(feedback.gain, momentum)
-        # an error of the angles that the filter follows; that of the momenta as their slope averages out
+        # only errors of the filter's reference angles count; those of momenta average out
         shaken = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         inputs = np.concatenate([driving, shaken], axis=2)
     na, nx, known = len(covariance), course.rollout.state.shape[1], ns + nu
@@ -237,7 +234,7 @@ def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, wh
 
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:
-    """Residual of an episode in units of the sensors' noise, their constant errors taken off."""
+    """Residual of an episode in units of sensor noise, with constant sensor errors subtracted."""
     samples = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
     pairs = zip(samples, result.predicted_outputs, strict=True)
     return np.concatenate([own.residual_and_jacobian(y).residual for own, y in pairs])
@@ -251,10 +248,10 @@ def _whitened_episode(
     before: WhiteningFilter | None,
     keep_weights: bool = False,
 ) -> tuple[Episode, WhiteningFilter | None]:
-    """The episode with its estimated input errors, and the filter that whitens its residual at (theta, offset).
+    """Episode with estimated input errors, and the filter that whitens its residual at (theta, offset).
 
-    The filter is None without process noise, or where the rollout fails; it is about the motion that `before` smooths,
-    with weights of its own or those of `before`.
+    The filter is None without process noise or if the rollout fails. It is linearised about the motion smoothed by
+    `before`, if given. With `keep_weights` it keeps the weights of `before`.
     """
     if episode.input_errors is None:
         return episode, None
@@ -275,7 +272,7 @@ def _whitened_episode(
 def _about_smoothed(
     predictor: EpisodePredictor, episode: Episode, theta: Array, result: EpisodePrediction, before: WhiteningFilter
 ) -> Episode:
-    """The episode about its torques and, with encoders, its motion as all measurements estimate them."""
+    """Episode with smoothed torque errors and, with encoders, the smoothed motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
     found = before._smooth_input_errors(_plain(episode, result), result.torque_correction_and_sensitivity)
@@ -295,13 +292,13 @@ def _about_smoothed(
 def _behind_effects(
     predictor: EpisodePredictor, episode: Episode, theta: Array, errors: InputErrorModel
 ) -> InputErrorModel:
-    """The same errors with what of the readings is noise: by which readings are multiplied, w is divided."""
+    """The same errors with torque noise referred to the readings, which effects may multiply by a factor."""
     corrections, nu = predictor.model_functions.input_corrections, errors.torque_noise.shape[1]
     read = errors.torque_noise
     if corrections.corrects_efforts:
         readings = np.pad(episode.torque, ((0, 0), (0, episode.prescribed_path.shape[1])))
         by_reading = corrections.true_angles_and_efforts(np.zeros_like(readings), readings, theta, ())[4][:, :nu]
-        # a reading of which hardly anything acts says nothing of what is wrong with it
+        # a reading with almost no influence on the applied torque does not reveal its error
         seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
         read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
     plain = errors.torque_bias_part
@@ -315,9 +312,9 @@ def problem_whitened_at(
 ) -> EstimationProblem:
     """Whiten a problem's residuals by sensor and process noise, linearized at `x`.
 
-    It is the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened already,
+    Returns the problem itself if it has no process noise, or if the rollout fails at `x`. If it is already whitened,
     the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number of
-    relinearizations; 2 at a fit. Further searches for equilibria begin at those found there.
+    linearizations (2 at a fit). `equilibrium_guesses` are configurations from which the search for equilibria starts.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
@@ -339,10 +336,11 @@ def problem_whitened_at(
 def problem_with_whitened_held_out(
     problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
 ) -> EstimationProblem:
-    """Whiten held-out residuals by all noise at `x`, or by sensor noise if a rollout fails.
+    """Whiten held-out residuals by sensor and input noise, linearised at the unknowns `x`.
 
-    Filters are relinearized about the motion that those so far smooth, first ones about what they smooth themselves;
-    there `keep_weights` weighs once, which is enough for torque offsets.
+    Each filter is linearised again about the motion that the present filter smooths. If there is none, a filter is
+    built first. With `keep_weights`, such a first filter keeps its weights, which is sufficient for torque offsets. If
+    a rollout fails, only sensor noise is used.
     """
     x, episodes, made = np.asarray(x, float), [], []
     known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
@@ -357,7 +355,7 @@ def problem_with_whitened_held_out(
 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """Relinearize filters about the torque offsets at `x`, not at `frozen`. Weights are unchanged."""
+    """Relinearize filters at the torque offsets of `x` instead of those of `frozen`. Weights are unchanged."""
     parts = problem.theta_and_initial_state_deviation
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
@@ -367,7 +365,7 @@ def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, fr
 def problem_with_relinearized_held_out_whitening(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
-    """Relinearize held-out filters about the torque offsets at `x`, not at `frozen`."""
+    """Relinearize held-out filters at the torque offsets of `x` instead of those of `frozen`."""
     before = problem.held_out_theta(frozen)
     at = [(*own, before) for own in problem.held_out_prediction_inputs(x)]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
@@ -375,7 +373,7 @@ def problem_with_relinearized_held_out_whitening(
 
 
 def problem_whitened_by_sensor_noise(problem: EstimationProblem) -> EstimationProblem:
-    """Whiten a problem by sensor noise alone, with the torque offsets estimated so far."""
+    """Whiten a problem by sensor noise alone. Torque offsets estimated so far are kept."""
     return _with_errors(problem, lambda errors: errors.torque_bias_part)
 
 
@@ -396,7 +394,7 @@ def _with_errors(
 def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
     """Constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
 
-    None where torques are taken as exact, or where no whitening filter is set (`problem_whitened_at`).
+    The entry is None if torques are taken as exact, or without a whitening filter (see `problem_whitened_at`).
     """
     x = np.asarray(x, float)
     found: list[tuple[Array, Array] | None] = []
@@ -422,7 +420,9 @@ def _relinearized(
     known: Sequence[ProcessNoiseWhitener | None],
     at: Sequence[tuple[Episode, Array, Array, Array]],
 ) -> tuple[tuple[Episode, ...], tuple[WhiteningFilter | None, ...]]:
-    """Episodes and filters about the torque offsets at (episode, theta, offset), so far linearized at a theta."""
+    """Episodes and filters linearised at the torque offsets of (episode, theta, offset), for filters linearised at a
+    theta.
+    """
     pairs = zip(map(_own_filter, known), at, strict=True)
     made = tuple(own and _settled(predictor, own, *told) for own, told in pairs)
     both = zip(episodes, made, strict=True)
@@ -432,7 +432,7 @@ def _relinearized(
 def _settled(
     predictor: EpisodePredictor, whitening: WhiteningFilter, episode: Episode, theta: Array, start: Array, frozen: Array
 ) -> WhiteningFilter:
-    # what an effect on inputs takes from a torque, its offset no longer has to: that is known without a rollout
+    # an effect on inputs changes the torque offset by a known amount, without a rollout
     both = (predictor.theta_with_episode_values(episode, t) for t in (theta, frozen))
     now, before = (predictor.corrected_inputs(episode, own, ()).torque for own in both)
 
@@ -454,7 +454,7 @@ def _settled(
 def torque_bias_change_in_stds(
     some: Sequence[ProcessNoiseWhitener | None], others: Sequence[ProcessNoiseWhitener | None]
 ) -> float:
-    """Largest difference between two filter sets' torque offsets, in stated standard deviations."""
+    """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""
     pairs = zip(some, others, strict=True)
     return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)
 

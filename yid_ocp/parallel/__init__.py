@@ -1,4 +1,4 @@
-"""Parallel work in threads, processes and cluster clients. No other package starts any."""
+"""Parallel work in threads, processes and on cluster workers. No other package starts threads or processes."""
 
 from yid_ocp.parallel.resumable_tasks import LOCAL_WORKER_CONFIG as LOCAL_WORKER_CONFIG
 from yid_ocp.parallel.resumable_tasks import Task as Task

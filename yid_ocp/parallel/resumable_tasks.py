@@ -1,10 +1,10 @@
-"""Run tasks by local processes or a scheduler's workers, and store their results.
+"""Run tasks in local processes or on a scheduler's workers, and store their results.
 
-A task is a function at the top of a module with plain data and paths. Its result is one JSON file, written whole by
-whoever worked it out, under a name that is the hash of the function's name, the sources it depends on and the
-arguments; a path counts by its file's name and content, wherever it stands. So a task that is done is never done again,
-whatever became of the run that did it, and any `concurrent.futures.Executor` whose workers see the same files will do:
-what one of them did twice, because the first was given up as lost, is the same file.
+A task is a call of a module-level function with plain data and paths. Its result is one JSON file, which its worker
+writes in one operation. The file name is the hash of the function's name, the sources that it depends on, and the
+arguments. A path enters the hash by file name and content, not by folder. A finished task is therefore never run again,
+whatever happened to the run. Any `concurrent.futures.Executor` is suitable if its workers share the file system. A task
+that runs twice, because its first worker was considered lost, gives the same file.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Return value of a task, as read from its file, or the reason why it failed."""
+    """Return value of a task, read from its file, or the reason why it failed."""
 
     name: str
     value: Any = None
@@ -64,7 +64,9 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Workers of a run, local processes or those of a Dask scheduler (address or file). `ConfigError` for both."""
+    """Workers of a run: local processes or those of a Dask scheduler (address or file). Raises `ConfigError` if both
+    are set.
+    """
 
     n_processes: int | None = None
     scheduler_address: str = ""
@@ -78,7 +80,7 @@ class WorkerConfig:
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_scheduler_available(self) -> None:
-        """Raise `WorkerError` if the scheduler does not answer or a worker is unsuitable. Use it before long work."""
+        """Raise `WorkerError` if the scheduler does not answer or a worker is unsuitable. Call it before long work."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
                 pass
@@ -98,23 +100,24 @@ def run_tasks(
 ) -> list[TaskResult]:
     """Run a function for all tasks and return results in their order. Results stored in `folder` are reused.
 
-    A task that raises leaves `HASH.error.json` and a warning, and the others go on; the next run tries it again. An
-    interruption leaves the results that are finished. A worker of other sources than these does nothing.
+    A task that raises writes `HASH.error.json` and a warning. The other tasks continue, and the next run repeats the
+    failed one. After an interruption, finished results are kept. Workers with other sources than this process do not
+    run tasks.
 
     Parameters
     ----------
     function : callable
-        At the top of an importable module; returns what JSON can hold.
+        Module-level function; returns data that JSON can represent.
     workers : WorkerConfig or concurrent.futures.Executor
-        Processes of this machine stop at once when the run is interrupted, and one that dies takes no task with it but
-        the one that killed it. Workers of a scheduler end the task that they are at.
+        Local processes stop at once if the run is interrupted. If a process crashes, only its own task is lost. Workers
+        of a scheduler finish their current task.
     code : str, optional
-        Hash of the sources that results depend on, if that is not the whole package; see `version.folder_source_hash`.
+        Hash of the sources that results depend on; default: the whole package. See `version.folder_source_hash`.
 
     Raises
     ------
     DataError, OutputError, WorkerError
-        A task's file cannot be read, the folder cannot be made, and as `WorkerConfig.check_scheduler_available`.
+        A task's file cannot be read, the folder cannot be made, or a worker is unsuitable (see `WorkerConfig`).
     """
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
     # paths are absolute, because a worker may run in another folder
@@ -141,7 +144,9 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Get the values of all tasks, or raise an error. It is `WorkerError` or, for a foreign failure, `RuntimeError`."""
+    """Return the values of all tasks. Raises `WorkerError` for a failure that this package reports, else
+    `RuntimeError`.
+    """
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]
@@ -172,7 +177,7 @@ def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _
 
 
 def _task_input(function: _TaskFunction, task: Task, code: str) -> dict[str, Any]:
-    """All inputs of a task as plain data: function, source hash, arguments and file hashes; its hash is the key."""
+    """All inputs of a task as plain data: function, source hash, arguments, file hashes. Its hash is the key."""
     if "<" in function.__qualname__:
         raise ValueError(f"{function.__qualname__} does not stand at the top of a module")
     name = f"{function.__module__}.{function.__qualname__}"
@@ -211,7 +216,7 @@ class _Job:
         return self.folder / f"{self.key}.json"
 
     def kept(self) -> TaskResult | None:
-        """The result stored in the file; None where there is no complete result of this task."""
+        """The stored result; None if there is no complete result of this task."""
         with contextlib.suppress(DataError, LookupError, TypeError):
             held = read_input_json(self.file)
             if held["format"] == _TASK_FORMAT and json_sha256(held["input"]) == self.key:
@@ -245,7 +250,7 @@ def _perform(job: _Job) -> str:
 
 
 def _give_back() -> None:
-    """Return freed memory to the system; Linux's C library keeps it, half a gigabyte after a solve."""
+    """Return freed memory to the system; Linux's C library keeps half a gigabyte after a solve."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
@@ -295,7 +300,7 @@ def _drain(
 
 
 def _arrived(job: _Job, elsewhere: bool) -> TaskResult | None:
-    """The stored result; waits for it where another machine may have written it."""
+    """The stored result. Waits for the file if another machine may have written it."""
     until = time.monotonic() + (_RESULT_FILE_TIMEOUT if elsewhere else 0.0)
     while (found := job.kept()) is None and time.monotonic() < until:
         os.listdir(job.folder)  # makes a network's file system look again
@@ -308,7 +313,7 @@ def _in_own_processes(jobs: Sequence[_Job], finished: _TaskFinishedCallback, cou
     rest = list(jobs)
     while rest:
         suspects, rest = _with_pool(min(len(rest), count), rest, finished)
-        # one of those that ran together ended its process; alone, each shows whether it is the one
+        # one of these jobs ended its process; each is run alone to find out which
         for job in suspects:
             kept = job.kept()
             if kept is not None:
@@ -334,7 +339,7 @@ def _with_pool(workers: int, jobs: Sequence[_Job], finished: _TaskFinishedCallba
 def _dask_executor(
     scheduler: str, function: _TaskFunction | None = None, folder: Path | None = None
 ) -> Iterator[tuple[Executor, Callable[[], None]]]:
-    """Executor on a Dask scheduler's workers, and a function that warns if there are none; errors as `WorkerConfig`."""
+    """Executor on a Dask scheduler's workers, and a function that warns if there are no workers."""
     try:
         distributed = importlib.import_module("distributed")
     except ImportError as error:
@@ -366,7 +371,7 @@ def _dask_executor(
     with client:
         look()
         _refuse_unfit(client, function, folder)
-        # Dask would take a task that failed before for done where the function counted as pure
+        # if the function counted as pure, Dask would take an earlier failed task for done
         yield client.get_executor(pure=False), look
 
 
@@ -384,10 +389,7 @@ def _client(distributed: Any, where: dict[str, str]) -> Any:
 
 
 def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | None) -> None:
-    """Refuse workers with other versions, with several threads, or without access to the same files.
-
-    Tasks are sent whole: a worker without this package that reads the name of a function of it is lost.
-    """
+    """Refuse workers with other versions, with several threads, or without this package or access to the same files."""
     for address, count in client.nthreads().items():
         if count > 1:
             what = f"a worker would do {count} tasks at once in one process"
@@ -413,7 +415,7 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
 
 
 def _question(module: str, probe: str) -> Callable[[], Any]:
-    """A function that returns a worker's fingerprint, or a text where it cannot do the tasks."""
+    """A function that returns a worker's fingerprint, or a text if the worker is unsuitable."""
 
     def asked() -> Any:
         import importlib

@@ -1,6 +1,6 @@
-"""Threads and processes on this machine, with parallel maps, merged calls, shared caches and process pools.
+"""Threads and processes on this machine: parallel maps, merged calls, shared caches and process pools.
 
-Batched evaluation: items run in parallel until all wait for a function, which is then called once for all.
+Merged calls: items run in parallel until all of them wait for a function, which is then called once for all.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _Answer = TypeVar("_Answer")
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Apply a function to items in all available threads. Results are in the order of the items."""
+    """Apply a function to items in all available threads. Returns results in the order of the items."""
     entries = list(items)
     workers = min(len(entries), _max_threads())
     if workers < 2:
@@ -45,7 +45,7 @@ def available_processor_count() -> int:
 
 
 def _max_threads() -> int:
-    """Number of threads that the caller may use: the process's limit, or its share within `map_in_threads`."""
+    """Number of threads that the caller may use: the limit of the process, or a share within `map_in_threads`."""
     said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
         raise ConfigError(f"{_THREADS_VARIABLE} is '{said}'", where="environment", allowed="a whole number from 1")
@@ -57,21 +57,21 @@ def _limit_max_threads(count: int) -> None:
     _THREAD_SHARE.count = count
 
 
-# CasADi marks the nodes of expressions while it differentiates them: two threads at once on expressions that share
-# symbols give wrong derivatives. Evaluating finished functions is safe.
+# CasADi marks the nodes of expressions during differentiation: two threads that differentiate expressions with shared
+# symbols get wrong derivatives. Evaluating finished functions is safe.
 CASADI_LOCK = threading.RLock()
 """Lock to be held while shared CasADi expressions are built or differentiated."""
 
 
 class CasadiLockedCache(Generic[_Key, _Value]):
-    """Cache of values by key. `compute_value` computes each once from its key, under the CasADi lock."""
+    """Cache of values by key. `compute_value` computes each value once from its key, under the CasADi lock."""
 
     def __init__(self, compute_value: Callable[[_Key], _Value]) -> None:
         self._make = compute_value
         self._known: dict[_Key, _Value] = {}
 
     def __call__(self, key: _Key) -> _Value:
-        """The value for a key."""
+        """Return the value for a key, computed at the first call."""
         if key not in self._known:
             with CASADI_LOCK:
                 if key not in self._known:
@@ -80,12 +80,12 @@ class CasadiLockedCache(Generic[_Key, _Value]):
 
 
 class _Abandoned(BaseException):
-    """Raised in an item that waits for an answer that will not come."""
+    """Raised in an item whose answer will not come because the map was aborted."""
 
 
 @dataclass(eq=False)
 class _Request:
-    """Arguments of one item for one function, and what becomes of them."""
+    """Arguments of one item for one function, and their answers."""
 
     rank: int
     function: Callable[[list[Any]], list[Any]]
@@ -122,7 +122,7 @@ class _March:
             self.changed.notify_all()
 
     def answer_until_done(self) -> None:
-        """Answer all requests whenever all threads wait, until no thread is left."""
+        """Answer all requests whenever all threads wait, until no thread remains."""
         while True:
             with self.changed:
                 self.waiting = [request for request in self.waiting if not request.answers.done()]
@@ -158,7 +158,7 @@ def _answer(requests: Sequence[_Request]) -> None:
 def call_merged_with_other_threads(
     function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
 ) -> list[_Answer]:
-    """Answer `questions` by a function, in one call with those of concurrent `map_with_merged_calls` items."""
+    """Call `function` on `questions`, merged into one call with those of concurrent `map_with_merged_calls` items."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
@@ -167,10 +167,10 @@ def call_merged_with_other_threads(
 
 
 def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Apply a function to items concurrently. Their `call_merged_with_other_threads` become one call.
+    """Apply a function to items concurrently. Their calls of `call_merged_with_other_threads` are merged.
 
-    As many run as there are threads to use. Which questions meet depends on the items alone. No item may hold a lock
-    while it asks.
+    At most as many items run as there are threads. Which calls are merged depends only on the items. An item must not
+    hold a lock during such a call.
     """
     entries = list(items)
     if len(entries) < 2 or getattr(_THREAD_SHARE, "march", None) is not None:
@@ -229,9 +229,9 @@ class InlineExecutor(Executor):
 
 
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """Make a pool of processes that ignore interrupt signals. By default there is one per processor.
+    """Make a pool of processes that ignore interrupt signals, by default one per processor.
 
-    Together they use as many threads as this process might.
+    All processes together use at most the threads of this process.
     """
     count = workers or available_processor_count()
     context = multiprocessing.get_context("spawn")  # a fork copies the locks of threads that it does not copy
