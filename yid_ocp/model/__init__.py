@@ -1,4 +1,4 @@
-"""Mechanical model of a robot and a flexible object. New terms come through `effects`."""
+"""Mechanical model of a robot and a flexible object. Additions to it are implemented in `effects`."""
 
 from yid_ocp.model.flexible import FlexibleObject as FlexibleObject
 from yid_ocp.model.flexible import Segment as Segment

@@ -1,4 +1,4 @@
-"""Flexible branched objects such as tubes, beams and cables, as chains of rigid links with elastic joints."""
+"""Flexible branched objects (tubes, beams, cables) as chains of rigid links with elastic joints."""
 
 from __future__ import annotations
 
@@ -35,49 +35,48 @@ class Segment:
 
     name: str
     length: float
-    """[m]; ignored when `link_lengths` is given."""
+    """Length [m]; ignored if `link_lengths` is given."""
     mass: float
-    """Of the whole segment, spread along its length [kg]."""
+    """Mass of the whole segment, distributed along its length [kg]."""
     radius: float | None = None
-    """Of the solid cylinder that gives each link's inertia [m]; this or `cross_section_size`."""
+    """Radius of the solid cylinder that gives each link's inertia [m]. Alternative: `cross_section_size`."""
     links: int = 4
     link_lengths: Sequence[float] | None = None
-    """Unequal links, base to tip [m]."""
+    """Lengths of unequal links, base to tip [m]."""
     parent: str | None = None
-    """Segment on which it grows, None for the root."""
+    """Segment to which it is attached; None for the root."""
     parent_link_index: int | None = None
-    """Link of the parent at whose tip it leaves; the last when absent."""
+    """Link of the parent to whose tip it is attached; default: the last one."""
     rest_rotation: ArrayLike | None = None
-    """At rest, of its first link in the frame of the parent's link (the root's frame for the root), shape (3, 3)."""
+    """Rest rotation of its first link relative to the parent's link (for the root: the root frame), shape (3, 3)."""
     link_rest_rotations: Sequence[ArrayLike] | None = None
-    """At rest, of every later link in the frame of the one before (a measured undeformed shape)."""
+    """Rest rotation of each later link relative to the previous link (a measured undeformed shape)."""
     bend: float = 3.0
-    """Of every joint [N m/rad]; with `stiffness_given_as_rigidity` rigidities [N m^2], [N m^2 s]."""
+    """Bending stiffness of every joint [N m/rad]; N m^2 (damping: N m^2 s) if `stiffness_given_as_rigidity`."""
     twist: float = 3.0
     damping: float = 0.05
-    """Of every joint [N m s/rad]."""
+    """Damping of every joint [N m s/rad]."""
     twist_damping: float | None = None
-    """Of the twists; that of the bends when absent."""
+    """Damping of the twists; default: `damping`."""
     stiffness_given_as_rigidity: bool = False
-    """Whether a joint between links of length a and b has 2/(a + b) times the value, the first of a clamped one 2/a."""
+    """Whether stiffness = 2/(a + b) times the value, for a joint between links of lengths a and b (2/a if clamped)."""
     clamped_at_base: bool = False
-    """Whether the first joint turns about the tip of a rigid wall or clamp, not between the parent's link and the first
-    one (only matters with `stiffness_given_as_rigidity`)."""
+    """Whether it starts at a rigid wall or clamp, not a parent's link; matters if `stiffness_given_as_rigidity`."""
     joint_axes: str = "xyz"
-    """Axes of the turns at each joint, base to tip; about those left out the segment is rigid."""
+    """Rotation axes of each joint, base to tip. About the other axes the segment is rigid."""
     cross_section_size: tuple[float, float] | None = None
-    """Extents of a rectangular section along the links' x and y axes [m]."""
+    """Side lengths of a rectangular cross-section along the links' x and y axes [m]."""
     has_link_length_parameters: bool = False
-    """Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`, for
-    markers that sit elsewhere in every recording; masses do not follow them."""
+    """Whether each link has a length parameter (`SEGMENT.length_0`, ...), for markers that move between recordings.
+    Masses do not depend on them."""
     clamped_edge_length: float | None = None
-    """Length of a flexible edge that a clamp keeps straight before a root segment; with `stiffness_given_as_rigidity`
-    its first joint then counts half of it [m]."""
+    """Length of a flexible edge that a clamp keeps straight before a root segment [m]. With
+    `stiffness_given_as_rigidity`, the first joint includes half of it."""
 
 
 @dataclass(frozen=True)
 class ElasticJoint:
-    """Spring and damper on one joint of a segment. Energy: 1/2 stiffness (q - rest)^2; force: -damping v."""
+    """Spring and damper on one joint of a segment, with energy 1/2 stiffness (q - rest)^2 and force -damping v."""
 
     joint_name: str
     segment_name: str
@@ -104,8 +103,8 @@ class SegmentLayout:
 class FlexibleObject(ReprMixin):
     """A flexible object as a model of rigid links with elastic joints.
 
-    Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, the root frame `object_root`, and points by
-    arc length, independent of the number of links, as `SEGMENT:40%`.
+    Its frames are `object_root`, the segment tips `w_SEGMENT`, the link tips `SEGMENT_i_tip`, and points by arc length
+    such as `SEGMENT:40%`, which do not depend on the number of links.
     """
 
     mechanism: Mechanism
@@ -126,22 +125,22 @@ def flexible_object(
 ) -> FlexibleObject:
     """Build a flexible object as chains of rigid links, with elastic joints before each link.
 
-    Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
-    `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
+    Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`). Parameters are `SEGMENT.length` (or `.length_0`, ...), `.mass`,
+    `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` if given).
 
     Parameters
     ----------
     segments : sequence of Segment
         Parents first.
     root_placement : array_like, shape (4, 4), optional
-        Placement of the root; the origin when absent.
+        Pose of the root; default: identity.
     gravity_fraction : float
-        Part of its weight that the object has, its inertia unchanged; less than one where something else bears it.
+        Factor on the object's weight, not on its inertia; below one if something else supports it.
 
     Raises
     ------
     ModelError
-        Unknown parent, parent after child, non-positive length, mass or radius, links that do not fit.
+        Unknown parent, parent after child, non-positive length, mass or radius, or inconsistent links.
     """
     root = Placement.identity() if root_placement is None else Placement.from_matrix(root_placement)
     parts = _Parts(frames={"object_root": Frame(-1, root)})
@@ -213,11 +212,11 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 
 
 def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
-    """Compute the twist-free rotation of each edge of a polyline relative to the edge before, each (3, 3).
+    """Compute the twist-free rotation (3, 3) of each edge of a polyline relative to the previous edge.
 
-    They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take. `vertices`, shape (k, 3), are the
-    undeformed centre line [m]; `initial_frame`, shape (3, 3), is the frame before the first edge, whose z axis is the
-    direction it continues, the world's when absent. `ModelError` of vertices that are no such line.
+    They serve as `Segment.rest_rotation` and `Segment.link_rest_rotations`. `vertices` (k, 3) are the undeformed centre
+    line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line; default: the world
+    frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong.
     """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:

@@ -1,8 +1,8 @@
 """Symbolic kinematics and rigid-body mechanics of a kinematic tree in world-frame screw coordinates.
 
-A spatial velocity is (angular, linear of the body point now at the world origin), a wrench (moment about the world
-origin, force); with both in one fixed frame the derivatives of the Lagrangian take the closed forms given at
-`MultibodyLagrangianDerivatives`, which is what makes the compiled step cheap.
+A spatial velocity consists of the angular velocity and the linear velocity of the body point at the world origin. A
+wrench consists of the moment about the world origin and the force. With both in one fixed frame, the derivatives of the
+Lagrangian have the closed forms of `MultibodyLagrangianDerivatives`, which make the compiled step cheap.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Kinematics:
     joint_screws: tuple[ca.SX, ...]  # S_j, the spatial velocity per unit rate of joint j, each (6, 1)
 
     def frame_pose(self, frame: str | Frame) -> Placement:
-        """Pose of a frame in the world. The frame is a name or a `Frame`."""
+        """Pose of a frame, given by name or as a `Frame`, in the world."""
         entry = self._frame(frame)
         j, local = entry.joint_index, entry.placement
         return local if j < 0 else Placement(self.joint_rotations[j], self.joint_origins[j]) @ local
@@ -57,12 +57,13 @@ class Kinematics:
 class MultibodyLagrangianDerivatives:
     """First derivatives of the rigid-body Lagrangian, and vectors from which the second derivatives follow.
 
-    With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
+    S_j is the screw of joint j and D_j = V_parent(j) x S_j. Ic_j, H_j and W_j are the inertia, momentum and weight of
+    all bodies that joint j moves:
 
-        dL/dv_j = S_j . H_j            dL/dq_j = D_j . H_j + S_j . W_j   (W_j: weight of all that j moves)
+        dL/dv_j = S_j . H_j            dL/dq_j = D_j . H_j + S_j . W_j
 
-    and for i an ancestor of j or j itself, F_j = Ic_j S_j, B_j = Ic_j D_j + S_j x* H_j,
-    G_j the moment by which the weight changes with the posture, w_i the angular part of S_i:
+    For i an ancestor of j or j itself, F_j = Ic_j S_j, B_j = Ic_j D_j + S_j x* H_j, G_j the moment by which the weight
+    changes with the posture, and w_i the angular part of S_i:
 
         L_vv[i, j] = S_i . F_j              L_qv[j, i] = S_i . B_j   (row: q_j, column: v_i)
         L_qq[i, j] = D_i . B_j + w_i . G_j  L_qv[i, j] = D_i . F_j
@@ -114,7 +115,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 def rigid_body_lagrangian_derivatives(
     kinematics: Kinematics, v: ca.SX, gravity: ca.SX
 ) -> MultibodyLagrangianDerivatives:
-    """Compute the Lagrangian derivatives of a mechanism's bodies. Velocity v is (n, 1), gravity (3, 1)."""
+    """Compute the Lagrangian derivatives of a mechanism's bodies for velocities v (n, 1) and gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
@@ -160,11 +161,11 @@ class _Moved:
 
 
 def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) -> tuple[list[_Moved], ca.SX, ca.SX]:
-    """Mass moments and momentum of what every joint moves, and the kinetic and potential energy [J]."""
+    """Mass moments and momentum of the bodies that each joint moves, and the kinetic and potential energy [J]."""
     joints = kinematics.mechanism.joints
     moved = [_Moved() for _ in joints]
     kinetic, potential = ca.SX(0), ca.SX(0)
-    # with one body whose weight is not its mass times gravity, weight is summed apart from inertia
+    # if a body's weight is not mass times gravity, weights are summed separately from inertia
     apart = any(body.gravity_fraction is not None for joint in joints for body in joint.bodies)
     for j, joint in enumerate(joints):
         for body in joint.bodies:
@@ -189,14 +190,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 
 def mass_matrix(rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
-    """Mass matrix of the mechanism, (n, n). Its closed form is in `MultibodyLagrangianDerivatives`."""
+    """Mass matrix (n, n) of the mechanism, in the closed form of `MultibodyLagrangianDerivatives`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(
     rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Second derivatives of the bodies' Lagrangian: L_qq, L_qv, L_vv, each (n, n). Rows of L_qv belong to q."""
+    """Second derivatives L_qq, L_qv, L_vv of the bodies' Lagrangian, each (n, n). Rows of L_qv belong to q."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
     by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
     by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))
@@ -208,7 +209,7 @@ def _dot(a: ca.SX, i: int, b: ca.SX, j: int) -> ca.SX:
 
 
 def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, ca.SX]]) -> ca.SX:
-    """The matrix of (upper, lower) entries for every joint j and its ancestors i."""
+    """Matrix of (upper, lower) entries for every joint j and its ancestors i."""
     n = len(mechanism.joints)
     matrix = ca.SX(n, n)
     for j in range(n):

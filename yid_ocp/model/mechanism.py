@@ -1,4 +1,4 @@
-"""Kinematic trees of rigid bodies, their parts, and how trees are combined."""
+"""Kinematic trees of rigid bodies, their components, and operations that combine trees."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from yid_ocp.model.parameters import Parameters
 
 @dataclass(frozen=True)
 class Placement:
-    """Symbolic rigid transform from a child frame to its parent. Rotation (3, 3), translation (3, 1) [m]."""
+    """Symbolic rigid transform from a child frame to its parent: rotation (3, 3) and translation (3, 1) [m]."""
 
     rotation: ca.SX
     translation: ca.SX
@@ -33,7 +33,7 @@ class Placement:
 
     @staticmethod
     def identity() -> Placement:
-        """Make a placement without rotation and translation."""
+        """Make the identity placement."""
         return Placement.from_matrix(np.eye(4))
 
     def __matmul__(self, other: Placement) -> Placement:
@@ -48,7 +48,7 @@ class Placement:
 class Inertia:
     """Mass [kg], centre of mass [m] and inertia tensor about it [kg m^2] of a rigid body, in its joint's frame.
 
-    `gravity_fraction` multiplies the pull of gravity on the body, not its inertia; None means 1.
+    `gravity_fraction` multiplies the weight of the body, not its inertia; None means 1.
     """
 
     mass: ca.SX
@@ -89,7 +89,7 @@ class Joint:
 
     @property
     def coordinate_unit(self) -> str:
-        """Unit of the joint's coordinate, `rad` or `m`."""
+        """Unit of the joint's coordinate: `rad` or `m`."""
         return "rad" if self.kind == "revolute" else "m"
 
 
@@ -97,8 +97,9 @@ class Joint:
 class Frame:
     """A named frame fixed to a joint's moving side. `joint_index` is -1 for the world.
 
-    Of what else is fixed there, a cut at the frame leaves `proximal_bodies` (in the joint's frame) and the frames and
-    further joints named in `proximal_names` on the side of the joint; all the rest is beyond it.
+    `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and further joints) are attached to the same
+    side and stay with the joint if the mechanism is cut at this frame. Everything else attached there is beyond the
+    cut.
     """
 
     joint_index: int
@@ -115,10 +116,10 @@ class ArcLengthChain:
     length_fractions: tuple[float, ...]  # part of the nominal arc length that each link has; they sum to one
 
     def _locate(self, length_fraction: float) -> tuple[str, float]:
-        """Tip frame of the link that contains a fraction of the arc length (0 to 1), and the fraction of that link."""
+        """Tip frame of the link at a fraction of the arc length (0 to 1), and the fraction of that link."""
         before = 0.0
         for tip, own in zip(self.tip_frames, self.length_fractions, strict=True):
-            # what ends a link belongs to it, not to the next one
+            # the end of a link belongs to this link, not to the next one
             if length_fraction <= before + own * (1 + 1e-9) or tip == self.tip_frames[-1]:
                 break
             before += own
@@ -129,7 +130,8 @@ class ArcLengthChain:
 class Mechanism(ReprMixin):
     """A kinematic tree of joints with bodies, named frames and parameters. Parents precede children.
 
-    Placements and inertias depend on its `parameters`; along its `link_chains` `NAME:40%` names a point by arc length.
+    Placements and inertias depend on `parameters`. For a chain NAME of `link_chains`, the frame `NAME:40%` is a point
+    by arc length.
     """
 
     name: str
@@ -155,21 +157,21 @@ class Mechanism(ReprMixin):
         return tuple(joint.parent_index for joint in self.joints)
 
     def joint_index(self, name: str) -> int:
-        """Find the index of a joint by name. `ModelError` suggests the nearest name."""
+        """Return the index of a joint. Raises `ModelError`, with the nearest name, if there is no such joint."""
         names = self.joint_names
         if name not in names:
             raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest_name_hint(name, names))
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:
-        """Whether a frame of this name exists. For `T1:40%` the segment `T1` must exist."""
+        """Whether a frame of this name exists. `T1:40%` exists if there is a segment `T1`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
 
     def frame(self, name: str) -> Frame:
-        """Find a frame by name. `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length from the base.
+        """Return a frame by name. `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length.
 
-        Such a point lies on the straight link that reaches there and turns with it, however many links there are.
-        `ModelError` where there is no such frame (with the nearest name) or no percentage from 0 to 100.
+        Such a point is fixed to the straight link that contains it. Raises `ModelError` if there is no such frame (with
+        the nearest name), or if the percentage is not from 0 to 100.
         """
         if name in self.frames:
             return self.frames[name]
@@ -182,7 +184,7 @@ class Mechanism(ReprMixin):
         return replace(end, placement=Placement(end.placement.rotation, part * end.placement.translation))
 
     def ancestor_joint_indices(self, index: int) -> tuple[int, ...]:
-        """Indices of the joints from the root to joint `index`, inclusive. The world (-1) has none."""
+        """Indices of the joints from the root to joint `index`, inclusive. They are empty for the world (-1)."""
         chain = []
         while index >= 0:
             chain.append(index)
@@ -192,7 +194,7 @@ class Mechanism(ReprMixin):
     def with_attached_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
-        """Attach another mechanism. Its root has the pose `placement` (4, 4) in `frame` (None: world)."""
+        """Return a copy with another mechanism, whose root has the pose `placement` (4, 4) in `frame` (None: world)."""
         root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
         if frame is not None:
@@ -219,7 +221,7 @@ class Mechanism(ReprMixin):
         return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
 
     def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
-        """Add a frame `name` at a fixed pose in `frame`. The pose is (4, 4); None is the world."""
+        """Return a copy with a frame `name` at a fixed pose (4, 4) in `frame` (None: world)."""
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
@@ -227,7 +229,7 @@ class Mechanism(ReprMixin):
         return replace(self, frames={**self.frames, name: added})
 
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """Replace all parameters by numbers, from `values` or nominal. The result has no parameters."""
+        """Return a copy with numbers, from `values` or nominal, in place of all parameters."""
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)
 
         def number(expression: ca.SX) -> ca.SX:
@@ -239,9 +241,9 @@ class Mechanism(ReprMixin):
         return replace(mapped, parameters=Parameters())
 
     def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """Insert a chain of joints at `index`. No other joint or frame is attached to it yet.
+        """Return a copy with a chain of joints inserted at `index`. Other joints and frames stay attached as before.
 
-        The first joint's parent stands before `index`, every other one's is the one before it whatever it says.
+        The first joint's parent must precede `index`. The parent of each other joint is the previous one of the chain.
         """
         count = len(chain)
 
@@ -281,7 +283,7 @@ def _fraction(name: str, said: str) -> float:
 
 
 def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
-    """Combine rigidly connected bodies into one. None without bodies or with zero total mass."""
+    """Combine rigidly connected bodies into one. Returns None without bodies or with zero total mass."""
     entries = list(bodies)
     if not entries:
         return None
@@ -298,7 +300,7 @@ def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
     return Inertia(mass, com, ca.densify(inertia))
 
 
-# URDF writers round pi to a dozen digits; entries this close to 0 and 1 are meant to be exactly that.
+# URDF files contain pi rounded to a dozen digits; entries this close to 0 and 1 are set to these values.
 _SNAP_TOLERANCE = 1e-11
 
 
@@ -318,7 +320,7 @@ def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation matrix from roll, pitch, yaw [rad] as in URDF, Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3)."""
+    """Rotation matrix (3, 3) from roll, pitch, yaw [rad] as in URDF: Rz(yaw) Ry(pitch) Rx(roll)."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
     y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
@@ -326,8 +328,8 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw [rad] of a rotation matrix. This is the inverse of `rotation_from_rpy`."""
-    # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
+    """Roll, pitch and yaw [rad] of a rotation matrix (inverse of `rotation_from_rpy`)."""
+    # roll is computed after removing yaw and pitch, which also works at and near pitch = 90 degrees
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     c, s = math.cos(yaw), math.sin(yaw)
@@ -356,7 +358,7 @@ def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca
 
 
 def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
-    """Rotation matrix from symbolic roll, pitch and yaw, Rz(yaw) Ry(pitch) Rx(roll), (3, 3). Default yaw: zero."""
+    """Rotation matrix (3, 3) from symbolic roll, pitch and yaw (default 0) [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
     about_x = symbolic_rotation_from_axis_angle((1.0, 0.0, 0.0), roll)
     turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ about_x
     return ca.densify(turned if yaw is None else symbolic_rotation_from_axis_angle((0.0, 0.0, 1.0), yaw) @ turned)

@@ -1,4 +1,4 @@
-"""Read robots from MJCF files. MuJoCo compiles the file; its bodies and joints become those of a URDF file."""
+"""Read robots from MJCF files. MuJoCo compiles the file, and its bodies and joints are converted to those of URDF."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _JOINT_EQUALITY, _WELD_EQUALITY, _SITE_OBJECT, _FREE_JOINT, _WORLD = 2, 1, 6, 0,
 
 
 def parsed_mjcf(file: Path) -> SimpleNamespace:
-    """Read name, links and joints of an MJCF file in the form that `read_urdf` uses. What is left out is logged.
+    """Read name, links and joints of an MJCF file in the form that `read_urdf` uses. Omitted elements are logged.
 
-    A body is a link with its inertial, or with what MuJoCo computes from its geoms; sites are frames. Coordinates are
-    MuJoCo's, `ref` included. A joint that an equality ties to another one linearly follows it, as `mimic` does. A free
-    body that an equality welds to another one, as some grippers are, is fixed there.
-
-    `ModelError` where `mujoco` is not installed or refuses the file, or a joint is free or a ball.
+    Each body becomes a link. Its inertia is the `inertial` element or, without one, computed by MuJoCo from the geoms.
+    Each site becomes a frame. Coordinates are those of MuJoCo, including `ref`. A joint that a linear equality
+    constraint couples to another joint is treated like a URDF `mimic` joint. A free body that a weld attaches to
+    another body is fixed there. Raises `ModelError` if `mujoco` is not installed, if it cannot compile the file, or if
+    the file has a free or ball joint.
     """
     model = _compiled_file(file)
     links = [SimpleNamespace(name=_WORLD, inertial=None)]
@@ -50,10 +50,10 @@ def parsed_mjcf(file: Path) -> SimpleNamespace:
 
 
 def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
-    """Nonzero constants of an MJCF file's joints, by joint and name. Other files give none.
+    """Nonzero constants of an MJCF file's joints, by joint and name. For other files the result is empty.
 
-    They are `armature` [kg m^2], `damping` [N m s/rad], `frictionloss` [N m], and of a position actuator `servo_gain`
-    [N m/rad] and `servo_damping` [N m s/rad]. Errors as `parsed_mjcf`.
+    Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
+    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Raises the errors of `parsed_mjcf`.
     """
     if file.suffix.lower() != ".xml" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}
@@ -74,7 +74,7 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
 
 
 def _is_position_actuator(model: Any, i: int) -> bool:
-    """Whether an actuator is a position servo of a joint, its gain the same for command and measurement."""
+    """Whether an actuator is a position servo of a joint with equal gains for command and measurement."""
     alike = float(model.actuator_biasprm[i, 1]) == -float(model.actuator_gainprm[i, 0]) != 0
     return alike and int(model.actuator_trntype[i]) == 0 and float(model.actuator_gear[i, 0]) == 1.0
 
@@ -90,7 +90,7 @@ def _compiled_file(file: Path) -> Any:
 
 @functools.lru_cache(maxsize=4)
 def _compiled(file: Path, changed: int) -> Any:
-    """Compiled model of a file as it was at a time; what is not taken over of it is logged once."""
+    """Compiled model of a file version; omitted elements are logged once."""
     try:
         import mujoco
     except ImportError as error:
@@ -110,7 +110,7 @@ def _compiled(file: Path, changed: int) -> Any:
 def _body(
     model: Any, i: int, follows: dict[str, SimpleNamespace], welds: dict[int, tuple[int, Array]], where: str
 ) -> tuple[list[SimpleNamespace], list[SimpleNamespace]]:
-    """Links and joints of one body: a link for each joint but the last, and one of the body itself."""
+    """Links and joints of one body: one link for each joint but the last, and one for the body itself."""
     name, parent = _body_name(model, i), _body_name(model, model.body_parentid[i])
     mass, inertial = float(model.body_mass[i]), None
     if mass > 0:
@@ -121,7 +121,7 @@ def _body(
     if i in welds:
         carrier, at = welds[i]
         return links, [_fixed(f"{name}_weld", _body_name(model, carrier), name, at)]
-    # where the next joint's frame lies in the link before it
+    # pose of the next joint's frame in the previous link
     at, last = _pose(model.body_pos[i], model.body_quat[i]), np.zeros(3)
     first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
     for j in range(first, first + count):
@@ -154,7 +154,7 @@ def _body(
 
 
 def _limits(model: Any, j: int) -> SimpleNamespace:
-    """Bounds of a joint, and of its effort by `actuatorfrcrange` or by the forces of its actuators."""
+    """Limits of a joint. The effort limit is `actuatorfrcrange` or follows from the forces of its actuators."""
     lower, upper = model.jnt_range[j] if model.jnt_limited[j] else (None, None)
     efforts = [float(np.abs(model.jnt_actfrcrange[j]).max())] if model.jnt_actfrclimited[j] else []
     for i in range(model.nu):
@@ -169,7 +169,7 @@ def _limits(model: Any, j: int) -> SimpleNamespace:
 
 
 def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
-    """Joint that each joint follows by a linear equality, with multiplier and offset, by name."""
+    """For each joint coupled by a linear equality: the joint that it follows, multiplier and offset."""
     found = {}
     for i in range(model.neq):
         first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
@@ -183,7 +183,7 @@ def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
 
 
 def _welded_free_bodies(model: Any) -> dict[int, tuple[int, Array]]:
-    """Bodies that an active weld holds and nothing else, with the body that each is welded to and its pose there."""
+    """Free bodies held only by an active weld, with the body to which each is welded and its pose there."""
     found: dict[int, tuple[int, Array]] = {}
     for i in range(model.neq):
         if int(model.eq_type[i]) != _WELD_EQUALITY or not model.eq_active0[i]:
@@ -204,7 +204,7 @@ def _welded_free_bodies(model: Any) -> dict[int, tuple[int, Array]]:
 
 
 def _left_out(model: Any) -> Iterator[str]:
-    """Sentences on what the file holds and the mechanism does not."""
+    """Sentences on elements of the file that the mechanism omits."""
     taken = len(_followed_joints(model)) + len(_welded_free_bodies(model))
     others_than_servos = [i for i in range(model.nu) if not _is_position_actuator(model, i)]
     motors = sum(_is_motor(model, i) for i in others_than_servos)

@@ -17,7 +17,7 @@ from yid_ocp.errors import ConfigError, nearest_name_hint
 
 @dataclass(frozen=True)
 class Parameter:
-    """One physical parameter with nominal value, SI unit, physical bounds and symbol."""
+    """One physical parameter: nominal value, SI unit, physical bounds and symbol."""
 
     name: str  # `owner.quantity`, for example `T1.bend`; for an effect `kind@location.quantity`
     value: float
@@ -44,7 +44,7 @@ class Parameter:
 
 
 class Parameters(ReprMixin):
-    """A model's parameters in the order of the vector `theta`. Names are unique and the sequence is immutable."""
+    """A model's parameters in the order of the vector `theta`. Names are unique, and the sequence is immutable."""
 
     def __init__(self, entries: Iterable[Parameter] = ()) -> None:
         self._entries = tuple(entries)
@@ -82,13 +82,13 @@ class Parameters(ReprMixin):
         return self._entries[self.index(name)]
 
     def index(self, name: str) -> int:
-        """Index of a parameter in `theta`. `ConfigError` suggests the nearest name."""
+        """Index of a parameter in `theta`. Raises `ConfigError`, which suggests the nearest name, if there is none."""
         if name not in self._index:
             raise ConfigError(f"there is no parameter '{name}'", hint=nearest_name_hint(name, self._index))
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """Parameter values theta (ntheta,), nominal or from `values`. `ConfigError` if a name or value is invalid."""
+        """Values theta (ntheta,), nominal or from `values`. Raises `ConfigError` for an invalid name or value."""
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):
@@ -97,14 +97,14 @@ class Parameters(ReprMixin):
         return theta
 
     def with_nominal_values(self, values: Mapping[str, float]) -> Parameters:
-        """Replace some nominal values. Parameters and symbols stay the same."""
+        """Return a copy with some other nominal values. Symbols stay the same."""
         changed = list(self._entries)
         for name, value in values.items():
             changed[self.index(name)] = replace(self[name], value=float(value))
         return Parameters(changed)
 
     def with_added(self, *others: Iterable[Parameter]) -> Parameters:
-        """Append the parameters of `others`."""
+        """Return a copy with the parameters of `others` appended."""
         return Parameters([*self._entries, *(entry for other in others for entry in other)])
 
     def bounds(self, names: Sequence[str]) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Springs, dampers and position servos on the joints of a robot."""
+"""Springs, dampers and position servos at the joints of a robot."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FirmwareTerm = Literal["integral", "derivative", "dead_band"]
 
 @dataclass(frozen=True)
 class _MotorFrictionData:
-    """Motor and friction constants identified together under one friction law, not to be mixed with another's."""
+    """Motor and friction constants identified together for one friction law; not valid with another law."""
 
     torque_constant: float  # kt [N m/A]
     resistance: float  # R [ohm]
@@ -48,10 +48,10 @@ class _MotorFrictionData:
 
 @dataclass(frozen=True)
 class _DcMotorData:
-    """Published figures of a geared direct-current servo, starting values of what is estimated.
+    """Published data of a geared DC servo, used as initial values.
 
     From Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators,
-    arXiv:2410.08650, and the figures published with it (Rhoban/bam, Apache-2.0).
+    arXiv:2410.08650, and the data published with it (Rhoban/bam, Apache-2.0).
     """
 
     supply_voltage: float  # [V]
@@ -62,7 +62,7 @@ class _DcMotorData:
     load_dependent: _MotorFrictionData | None = None  # with friction that grows with the load, where published
 
     def servo_values(self, constants: _MotorFrictionData) -> dict[str, float]:
-        """Values of a servo's parameters by name: torque = kt/R (duty V - kt speed) [N m/rad, N m s/rad, N m]."""
+        """Servo parameters by name, from torque = kt/R (duty V - kt speed) [N m/rad, N m s/rad, N m]."""
         stall = constants.torque_constant * self.supply_voltage / constants.resistance
         drag = constants.torque_constant**2 / constants.resistance
         gain, limit = self.duty_per_gain * stall, self.duty_limit * stall
@@ -97,12 +97,12 @@ MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
     name: _DcMotorData(voltage, gain, limit, armature, *(_MotorFrictionData(*law) for law in laws))
     for name, ((voltage, gain, limit, armature), *laws) in _MOTOR_FIGURES.items()
 }
-"""Motors of desk arms by preset; `STS3215` at 7.4 V."""
+"""Motors of desk-top arms by preset name; `STS3215` at 7.4 V."""
 
 
 @dataclass(frozen=True)
 class MotorOptions:
-    """Settings of a servo's motor. Its kind is `ideal` or `dc`; a preset holds published data of a dc motor."""
+    """Settings of a servo's motor. The kind is `ideal` or `dc`; a preset holds published data of a dc motor."""
 
     kind: Annotated[
         _MotorKind,
@@ -133,7 +133,7 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class PositionServoOptions:
-    """Settings of all position servos except for their gains, which are parameters."""
+    """Settings of all position servos. Their gains are parameters, not settings."""
 
     command_interpolation: Annotated[
         _CommandInterpolation,
@@ -164,15 +164,15 @@ class PositionServoOptions:
 
 @dataclass(frozen=True)
 class PositionServo:
-    """Position servo on one joint. It turns the commanded coordinate u into a torque.
+    """Position servo on one joint. It converts the commanded coordinate u into a torque.
 
         ideal:  torque = clip(gain (e + integral z) - damping dq/dt)
         dc:     torque = clip(gain (e + integral z) - derivative dq/dt) - damping dq/dt
 
-    with e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p),
-    p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which further limits add. Of a direct-current motor
-    the limit is that of its duty, and the damping is its counter-voltage (torque = kt/R (duty V - kt dq/dt));
-    `current_limit_tightness` clips the whole. At `MOTOR_OFF_COMMAND` there is no torque at all.
+    with the error e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p), p =
+    `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p. Several limits add up in the tightness. For a DC motor the
+    limit is that of the duty cycle, and the damping is the back-EMF (torque = kt/R (duty V - kt dq/dt)).
+    `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero.
     """
 
     gain: ca.SX  # includes the firmware's where that is known [N m/rad or N/m]
@@ -188,7 +188,7 @@ class PositionServo:
     torque_constant: float | None = None  # published one of a dc motor [N m/A]
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Servo torque [N m] or force [N] at the commanded coordinate, the coordinate q and the rate v."""
+        """Servo torque [N m] or force [N] for the commanded coordinate, the coordinate q and the rate v."""
         on = command < MOTOR_OFF_COMMAND / 2
         error, drag = self.error(command, q), self.damping * v
         error = error if self.integral.is_zero() else error + self.integral
@@ -227,10 +227,10 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJoin
 def build_joint_servos(
     tree: Mechanism, joints: Sequence[str], options: PositionServoOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
-    """Build a servo for every named joint. Also return parameters such as `JOINT.servo_gain`.
+    """Build a servo for every named joint. Returns them and their parameters, such as `JOINT.servo_gain`.
 
-    They give the joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`. Of a direct-current motor
-    `JOINT.servo_gain_factor` multiplies the gain: the firmware's, which recordings may state.
+    With the initial gain, an error of `_DEFAULT_FULL_TORQUE_ERROR` gives the joint's effort limit. For a DC motor
+    `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor (the gain set in the firmware).
     """
     servos, entries = {}, []
     for joint in joints:
@@ -286,7 +286,7 @@ def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_
 
 
 def mechanism_without_gravity(tree: Mechanism) -> Mechanism:
-    """Remove gravity from the robot's bodies, as if its controller compensated its weight."""
+    """Return the robot without weight, as if its controller compensated gravity."""
     joints = tuple(
         replace(joint, bodies=tuple(replace(body, gravity_fraction=ca.SX(0)) for body in joint.bodies))
         for joint in tree.joints

@@ -1,4 +1,4 @@
-"""The mechanical system of robot and object, and the interface of effects."""
+"""The mechanical system of robot and object, and the base class of effects."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ _GRASP_EQUATION_NAMES = {
 
 @dataclass(frozen=True)
 class Grasp:
-    """A grasp that makes the origins of an object's and a holder's frame coincide. By kind it also aligns axes."""
+    """A grasp that makes the origins of an object's and a holder's frame coincide. Some kinds also align axes."""
 
     name: str
     """`left`, `right`, `gripper`, or a clamp's name."""
     holder_frame: str
     held_frame: str
     kind: _GraspKind = "point"
-    """`point` has 3 equations (positions), `axis` 5 (direction of the z axes, too), `weld` 6 (orientation, too)."""
+    """`point` has 3 equations (position), `axis` 5 (and direction of the z axes), `weld` 6 (and orientation)."""
     held_orientation: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.eye(3)))
-    """Of `held_frame` in `holder_frame` for `axis` and `weld`, shape (3, 3)."""
+    """Orientation of `held_frame` in `holder_frame` for `axis` and `weld`, shape (3, 3)."""
     holder_offset: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
-    """Where the grasped point sits in the holder's frame, shape (3, 1) [m]."""
+    """Position of the grasped point in the holder's frame, shape (3, 1) [m]."""
     axial_slip: ca.SX = field(default_factory=lambda: ca.SX(0))
-    """How far the grasped point has crept along the object's z axis [m]."""
+    """Distance by which the grasped point has slipped along the object's z axis [m]."""
     compliance: ca.SX = field(default_factory=lambda: ca.SX(0))
-    """C, zero when rigid, in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h [m/N]."""
+    """C in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h [m/N]; zero if rigid."""
     relaxation_time: ca.SX | None = None
-    """T in the same [s]."""
+    """T in the equation of `compliance` [s]."""
 
     @property
     def n_constraint_equations(self) -> int:
@@ -66,11 +66,11 @@ class Grasp:
 
     @property
     def constraint_equation_names(self) -> tuple[str, ...]:
-        """Names of the constraint equations. Positions such as `left.x` precede tilts or rotations."""
+        """Names of the constraint equations: positions such as `left.x`, then tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual phi(q), holder minus held, as a column. Position [m] precedes orientation [rad]."""
+        """Constraint residual phi(q), holder minus held, as a column: position [m], then orientation [rad]."""
         holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
         held = kinematics.frame_pose(self.held_frame)
         rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
@@ -82,7 +82,7 @@ class Grasp:
         return ca.vertcat(*rows)
 
     def holder_minus_held_axis_directions(self, kinematics: Kinematics) -> ca.SX:
-        """Holder minus held axes (0, 3 or 9 rows). Unlike `constraint_residual` nonzero for opposite axes."""
+        """Holder minus held axes (0, 3 or 9 rows). Unlike `constraint_residual` it is nonzero for opposite axes."""
         if self.kind == "point":
             return ca.SX(0, 1)
         holder, held = (kinematics.frame_pose(name).rotation for name in (self.holder_frame, self.held_frame))
@@ -92,9 +92,9 @@ class Grasp:
 
 @dataclass(frozen=True)
 class MidpointState:
-    """Symbols at the midpoint of one step. Energies and forces may depend on them.
+    """Symbols at the midpoint of one step, on which energies and forces may depend.
 
-    q, v and z, z_rate are the mean and the difference over h of coordinates and internal coordinates at both nodes.
+    q, z are the means of (internal) coordinates at both nodes; v, z_rate are their differences divided by h.
     """
 
     system: System
@@ -111,11 +111,12 @@ class MidpointState:
 
 @dataclass(frozen=True)
 class NodeState:
-    """Symbols at one node of a trajectory. Measurements may depend on them.
+    """Symbols at one node of a trajectory, on which measurements may depend.
 
-    `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node, at both ends
-    that of the one step there, half a step off; `a` their difference over h, of order two in h, at both ends that of
-    the neighbour, of order one. `load` and `lam` are of the step that begins at the node, or ends at the last one.
+    `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; `a` is their
+    difference over h, with an error of order h^2. At the first and last node, `v` is that of the adjacent step, and `a`
+    is that of the neighbouring node (error of order h). `load` and `lam` belong to the next step (at the last node: the
+    last).
     """
 
     system: System
@@ -133,10 +134,10 @@ class NodeState:
 
 @dataclass(frozen=True)
 class ForceWithDerivativeFactors:
-    """A dissipative generalized force of wrenches on bodies with its derivatives, F(q, v), (n, 1) [N m or N].
+    """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives, (n, 1) [N m or N].
 
-    With S_j and D_j as in `MultibodyLagrangianDerivatives` and the columns of A and T, shape (6, n), for i an ancestor
-    of joint j or j itself:
+    S_j and D_j are as in `MultibodyLagrangianDerivatives`. A_j and T_j are the columns of A and T (6, n). For i an
+    ancestor of joint j or j itself:
 
         dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
     """
@@ -153,11 +154,11 @@ class StepTerms:
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
     generalized_force: ca.SX | None = None  # F(q, v, u, z)
     dissipative_force: ca.SX | None = None  # its part that only takes energy out, in proportion to velocity
-    # equation (= 0) of each internal coordinate at the midpoint, and what takes its place in a static equilibrium where
-    # its own says nothing or cannot hold
+    # equation (= 0) of each internal coordinate at the midpoint, and its replacement in a static equilibrium if it is
+    # undefined or cannot hold there
     internal_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     static_equations: Mapping[str, ca.SX] = field(default_factory=dict)
-    # a dissipative force on bodies whose slopes are given, because differentiating it would cost too much
+    # a dissipative force on bodies with given derivatives, because automatic differentiation would be too expensive
     force_with_derivatives: ForceWithDerivativeFactors | None = None
 
 
@@ -165,9 +166,9 @@ class StepTerms:
 class Effect:
     """Base class of additions to the nominal model, such as friction. The base class itself changes nothing.
 
-    Whatever a subclass overrides must leave the nominal model unchanged at neutral parameters. Recorded torques drive
-    the model, recorded angles prescribe it or are followed: there the reading is known and the true value is sought by
-    `corrected_reading`, the opposite of `distorted_reading`.
+    With neutral parameters a subclass leaves the nominal model unchanged. For recorded inputs (torques that drive the
+    model, angles that are prescribed or followed) `corrected_reading` computes the true value from the reading. It is
+    the inverse of `distorted_reading`.
     """
 
     kind: str  # under which its class is registered
@@ -177,11 +178,11 @@ class Effect:
     internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def apply_to_system(self, system: System) -> System:
-        """Apply this effect to the system. It may change masses, lengths, springs, grasps, gravity or joints."""
+        """Return the system with this effect, which may change masses, lengths, springs, grasps, gravity or joints."""
         return system
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """Energy, forces and internal equations that this effect adds to a step at its midpoint state."""
+        """Return the energy, forces and internal equations that this effect adds to a step at its midpoint."""
         return StepTerms()
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
@@ -189,23 +190,23 @@ class Effect:
         return output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """Correct a recorded `joints.position.JOINT` or `joints.effort.JOINT`, given the true `effort`."""
+        """Return the true value of a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
         return reading
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """Added delay [s] of a channel, recorded minus true time of a sample. `channel` is as in `distorted_reading`.
+        """Added delay [s] of a channel: recorded minus true time of a sample. `channel` is as in `distorted_reading`.
 
-        A recorded torque that drives the model is `torque.JOINT`: it acts so much later than it was recorded.
+        For a recorded torque that drives the model, `torque.JOINT`, it is the delay from the record to the action.
         """
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
-        """Lag time constant of `torque.JOINT` behind its record, or of `joints.effort.JOINT` behind the truth [s]."""
+        """Time constant [s] of a first-order lag: `torque.JOINT` to its record, `joints.effort.JOINT` to the truth."""
         return ca.SX(0)
 
 
 class _ServoIntegral(Effect):
-    """The integral z of a position servo's error, dz/dt = error, which is zero where a recording begins."""
+    """Time integral z of a position servo's error, dz/dt = error. It is zero at the start of a recording."""
 
     @classmethod
     def of_joint(cls, joint: str) -> _ServoIntegral:
@@ -229,53 +230,53 @@ class SystemBuildArguments(TypedDict, total=False):
     """Keyword arguments of `System.build`, such as objects, grasps and driven joints."""
 
     objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]]
-    """Each with the frame of what came before on which it hangs (None: the world), and a 4x4 placement there."""
+    """Each object with its parent frame among the previous parts (None: world) and its pose (4, 4) in this frame."""
     grasps: Sequence[Grasp]
     driven: Sequence[str]
     prescribed: Sequence[str]
-    """Names of joints; none may be both."""
+    """Names of joints. A joint cannot be both driven and prescribed."""
     damping: float | Mapping[str, float]
     """Viscous damping of the robot's joints [N m s/rad]; becomes the parameters `JOINT.damping`."""
     gravity: ArrayLike
-    """Shape (3,) [m/s^2]; 9.81 along -z when absent."""
+    """Shape (3,) [m/s^2]; default: 9.81 along -z."""
     point_frames: Sequence[str] | None
-    """Frames that sensors may see, points along a segment as `T1:40%`; the segments' tips `w_*` when absent."""
+    """Frames that sensors may measure, or points of a segment such as `T1:40%`; default: the segment tips `w_*`."""
     springs: Mapping[str, RobotJointSpring]
-    """By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`."""
+    """Springs by robot joint; they become the parameters `JOINT.stiffness` and `JOINT.rest`."""
     servos: PositionServoOptions | None
-    """What the inputs of driven joints command; adds `JOINT.servo_gain`, `servo_damping`, `servo_delay`, ..."""
+    """Servos whose commands are the inputs of driven joints; adds `JOINT.servo_gain`, `JOINT.servo_damping`, ..."""
 
 
 @dataclass(frozen=True, repr=False)
 class System(ReprMixin):
-    """Complete model of robot and object, with parameters, springs, dampers, grasps, inputs and effects."""
+    """Complete model of robot and object: parameters, springs, dampers, grasps, inputs and effects."""
 
     mechanism: Mechanism
     parameters: Parameters
-    """Fixes the order of theta."""
+    """Parameters, in the order of theta."""
     elastic_joints: tuple[ElasticJoint, ...] = ()
     joint_damping: Mapping[str, ca.SX] = field(default_factory=dict)
-    """Viscous coefficients of joints that are not elastic, by joint [N m s/rad]."""
+    """Viscous coefficients by joint, for joints that are not elastic [N m s/rad]."""
     grasps: tuple[Grasp, ...] = ()
     driven: tuple[str, ...] = ()
-    """Joints with an input, in the order of u (a motor torque, or what a servo is commanded)."""
+    """Joints with an input, in the order of u (motor torques or servo commands)."""
     servos: Mapping[str, PositionServo] = field(default_factory=dict)
-    """Of all driven joints, or of none, by joint."""
+    """Servos by joint: for all driven joints, or empty."""
     prescribed: tuple[str, ...] = ()
-    """Joints whose coordinate is known, in the order of s."""
+    """Joints with a prescribed coordinate, in the order of the prescribed coordinates."""
     gravity: ca.SX = field(default_factory=lambda: ca.SX(ca.DM([0.0, 0.0, -9.81])))
-    """In the world frame, shape (3, 1) [m/s^2]."""
+    """Gravity in the world frame, shape (3, 1) [m/s^2]."""
     recorded_time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
     """Factor on the recorded time step."""
     joint_compliances: Mapping[str, ca.SX] = field(default_factory=dict)
-    """Of coordinates held by a spring, by joint, zero meaning rigid [rad/(N m)]; their equations and momentum are
-    multiplied by it so that they stay regular at zero."""
+    """Compliances of coordinates held by a spring, by joint [rad/(N m)]; zero means rigid. Their equations and momentum
+    are multiplied by them, which keeps these regular at zero."""
     joint_relaxation_times: Mapping[str, float] = field(default_factory=dict)
-    """T of some compliant coordinates in q + T dq/dt = compliance x torque [s]: a massless one needs it to forget a
-    start that does not fit its load."""
+    """T of some compliant coordinates in q + T dq/dt = compliance x torque [s]. Without mass, a coordinate needs it to
+    forget an initial value that does not fit its load."""
     segment_layouts: tuple[SegmentLayout, ...] = ()
     point_frames: tuple[str, ...] = ()
-    """Frames that a sensor may see."""
+    """Frames that a sensor may measure."""
     effects: tuple[Effect, ...] = ()
 
     @staticmethod
@@ -284,7 +285,7 @@ class System(ReprMixin):
     ) -> System:
         """Build a system from a robot, effects and `SystemBuildArguments`. Without a robot it is the object alone.
 
-        `ModelError` of a name that does not exist or is used twice, no joint, a joint both driven and prescribed.
+        Raises `ModelError` for an unknown or repeated name, no joints, or a joint both driven and prescribed.
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
@@ -322,7 +323,7 @@ class System(ReprMixin):
         return replace(system, segment_layouts=tuple(segments)).with_effects([*integrals, *effects])
 
     def with_effects(self, effects: Sequence[Effect]) -> System:
-        """Add effects to the system. Their parameters are appended to theta in the given order."""
+        """Return a copy with added effects. Their parameters are appended to theta in the given order."""
         system = self
         for effect in effects:
             system = replace(system, parameters=system.parameters.with_added(effect.parameters))
@@ -370,7 +371,7 @@ class System(ReprMixin):
         return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
     def segment_layout(self, name: str) -> SegmentLayout:
-        """Layout of a segment by name. `ModelError` suggests the nearest name."""
+        """Return the layout of a segment. Raises `ModelError`, with the nearest name, if there is no such segment."""
         found = {layout.name: layout for layout in self.segment_layouts}
         if name not in found:
             raise ModelError(f"there is no segment '{name}'", hint=nearest_name_hint(name, found))
@@ -382,11 +383,11 @@ class System(ReprMixin):
         return replace(mapped, effects=self.effects)
 
     def numeric_mechanism(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """Mechanism with numbers in place of all parameters, from `values` or nominal."""
+        """Mechanism with numbers, from `values` or nominal, in place of all parameters."""
         return replace(self.mechanism, parameters=self.parameters).with_numeric_values(values)
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
-        """Elastic energy of all elastic joints [J], the sum of 1/2 stiffness (q - rest)^2."""
+        """Elastic energy of all elastic joints [J]: the sum of 1/2 stiffness (q - rest)^2."""
         index = self.mechanism.joint_index
         terms = (0.5 * s.stiffness * (q[index(s.joint_name)] - s.rest_angle) ** 2 for s in self.elastic_joints)
         return sum(terms, ca.SX(0))
@@ -408,7 +409,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def weight_and_grasp_force_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
-        """Generalized force of weight and grasps on one coordinate, from all it moves, at midpoint [N m or N]."""
+        """Generalized force [N m or N] at one coordinate from grasps and the weight of all bodies that it moves."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)
         for j, joint in enumerate(tree.joints):
@@ -422,18 +423,18 @@ class System(ReprMixin):
         return force
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual of all grasps, phi(q), shape (m, 1)."""
+        """Constraint residual phi(q) of all grasps, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))
 
     def constraint_relaxation_times(self) -> ca.SX | None:
-        """Relaxation times T of the constraints phi + T dphi/dt = C lam / h, (m, 1) [s]. None if no grasp has one."""
+        """Relaxation times T (m, 1) [s] of the constraints phi + T dphi/dt = C lam / h. None if no grasp has one."""
         if all(grasp.relaxation_time is None for grasp in self.grasps):
             return None
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
         return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
     def grasp_compliance_diagonal(self) -> ca.SX:
-        """Constraint compliances, the diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
+        """Constraint compliances (m, 1): the diagonal of C in phi(q_{k+1}) = C lam_k / h."""
         return ca.vertcat(ca.SX(0, 1), *(g.compliance for g in self.grasps for _ in range(g.n_constraint_equations)))
 
 
@@ -456,7 +457,7 @@ def _check_names(
 
 
 def floating_joint_mechanism(name: str, frame: str | None = None) -> Mechanism:
-    """Build a massless mechanism whose six joints `NAME_x` to `NAME_rz` move a frame, `frame` or `NAME`."""
+    """Build a massless mechanism of six joints `NAME_x` to `NAME_rz` that move a frame `frame` (default `NAME`)."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)

@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 
 
 def _example_robot_urdf(robot: str) -> Path:
-    """Path of a robot in the installed example-robot-data by its file's stem (any case), or by `folder/file.urdf`."""
+    """Path of a robot in the installed example-robot-data, by file stem (any case) or by `folder/file.urdf`."""
     roots = [Path(p) / "cmeel.prefix/share/example-robot-data/robots" for p in [*sys.path, *site.getsitepackages()]]
     roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
     folder = next((root for root in roots if root.is_dir()), None)
@@ -80,10 +80,10 @@ def _example_robot_urdf(robot: str) -> Path:
 
 
 def resolve_urdf_path(robot: str | Path) -> Path:
-    """Find the path of the URDF file for a robot's name in the settings. The file need not exist.
+    """Return the URDF path for a robot's name in the settings. The file need not exist.
 
-    The name is a file, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
-    that ships with this package; `ModelError` where there is no such robot.
+    The name is a path, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
+    that ships with this package. Raises `ModelError` if there is no such robot.
     """
     scheme, _, name = str(robot).partition(":")
     if scheme == "package":
@@ -97,7 +97,7 @@ def resolve_urdf_path(robot: str | Path) -> Path:
 
 
 def _shipped() -> dict[str, Path]:
-    """URDF files of this package by name: from the repository or from the installed wheel."""
+    """URDF files of this package by name, from the repository or the installed wheel."""
     folder = Path(__file__).resolve().parents[2] / "models" / "urdf"
     if folder.is_dir():
         return {path.name: path for path in folder.glob("*.urdf")}
@@ -115,19 +115,19 @@ def read_urdf(
 ) -> Mechanism:
     """Read a mechanism from a URDF or MJCF file. Chosen joints are movable, all others are locked.
 
-    Each kept joint's bodies have the parameter `JOINT.mass` [kg] (inertia in proportion). Links without a kept joint
-    above them are fixed to the world. Every link is a frame of its name.
+    Each movable joint has the parameter `JOINT.mass` [kg], which also scales the inertia of its bodies. Links without a
+    movable joint before them are fixed to the world. Every link is a frame of the same name.
 
     Parameters
     ----------
     path : str or Path
-        As `resolve_urdf_path` takes it.
+        Path or name, as for `resolve_urdf_path`.
     joints : sequence of str, optional
-        To keep as degrees of freedom, in this order as far as parents come first; all movable ones when absent.
+        Movable joints, in this order except that parents come first; default: all movable joints of the file.
     locked : mapping of str to float, optional
-        Value at which a joint that is not kept is locked [rad or m]; zero, or the nearest bound, when absent.
+        Positions of locked joints [rad or m]; default: zero or the nearest limit.
     exclude_links : sequence of str
-        Links to leave out with all that hangs on them, such as a tool that is not mounted.
+        Links to remove together with their subtrees, such as a tool that is not mounted.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def read_urdf(
 
 
 def _proximal_links(link: str, frames: Mapping[str, tuple[_Carrier, Array, str]]) -> dict[str, None]:
-    """Links that are fixed to one, but do not hang on it."""
+    """Links fixed to the same joint as a link, but not in its subtree."""
     beyond, carrier = {link}, frames[link][0]
     for name, (own, _, parent) in frames.items():  # parents before children
         if own == carrier and parent in beyond:
@@ -192,7 +192,7 @@ def _proximal_links(link: str, frames: Mapping[str, tuple[_Carrier, Array, str]]
 
 
 def _parsed(file: Path) -> SimpleNamespace:
-    """Name, links and joints of a URDF or MJCF file, as far as a mechanism needs them."""
+    """Name, links and joints of a URDF or MJCF file that a mechanism needs."""
     try:
         robot = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot()
         if robot.tag == "mujoco":
@@ -297,7 +297,7 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
 
 
 def _check_bodies(link: str, tensor: Array, where: str) -> None:
-    """Refuse negative moments of inertia; warn of moments that no mass distribution has."""
+    """Refuse negative moments of inertia, and warn of moments that no mass distribution has."""
     least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
     if least < -_PRINCIPAL_MOMENT_RTOL * max(most, -least):
@@ -331,7 +331,7 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
 
 
 def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
-    """Name of the root link, after a check of all joints and links, and of the names of wanted joints."""
+    """Name of the root link, after a check of all joints and links and of the names of wanted joints."""
     for joint in robot.joints:
         if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
             allowed = "revolute, continuous, prismatic, fixed"
@@ -362,9 +362,9 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
 def _walk(
     robot: Any, root: str, dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
 ) -> tuple[dict[str, tuple[_Carrier, Array, Any]], dict[str, Inertia], dict[str, tuple[_Carrier, Array, str]]]:
-    """Kept joints, bodies by link, and links from the root on, each with carrier and placement (4, 4) in its frame.
+    """Kept joints, bodies by link, and links, each with its carrier (kept joint or None) and pose (4, 4) in its frame.
 
-    A carrier is a kept joint, None for the world; each link comes with the link that it is fixed to, empty for none.
+    Each link also has the name of the link to which it is fixed, empty if there is none.
     """
     links = {link.name: link.inertial for link in robot.links}
     joints: dict[str, tuple[_Carrier, Array, Any]] = {}
@@ -419,7 +419,7 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Array:
 
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:
-    """Coordinate at which a joint is locked: as given, else zero or the nearest bound."""
+    """Position at which a joint is locked: the given value, else zero or the nearest limit."""
     low = -math.inf if joint.limit.lower is None else joint.limit.lower
     high = math.inf if joint.limit.upper is None else joint.limit.upper
     if joint.type == "continuous" or low > high:
@@ -444,9 +444,9 @@ def _unit_axis(joint: Any) -> Array:
 
 
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
-    """Write a mechanism as URDF text. Each joint's bodies become one link, each named frame a link on a fixed joint.
+    """Write a mechanism as URDF text. Each joint's bodies become one link, each frame a link on a fixed joint.
 
-    Reading the text back with `read_urdf` gives the same numbers to 1e-12.
+    `read_urdf` reads the same numbers back to 1e-12.
     """
     mechanism = mechanism.with_numeric_values(values)
     robot = ElementTree.Element("robot", name=mechanism.name)

@@ -1,4 +1,4 @@
-"""Kinds of flexible objects, one file each, with settings, geometry, refinement, clamps and `init` templates."""
+"""Kinds of flexible objects, one file each: settings, geometry, refinement, clamps and `init` templates."""
 
 from importlib import import_module
 from pkgutil import iter_modules

@@ -1,4 +1,4 @@
-"""Interface of a kind of flexible object, with settings, geometry, refinement, clamps and `init` templates."""
+"""Interface of a kind of flexible object: settings, geometry, refinement, clamps and `init` templates."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Mount of an object, with the parent frame and the pose of the object's root in it."""
+    """Mount of an object: the parent frame and the pose of the object's root in it."""
 
     parent_frame: Annotated[str | None, OptionInfo("frame or clamp that carries it; the world when absent")] = None
     xyz: Annotated[_Vector3, OptionInfo("position in that frame", "m")] = (0.0, 0.0, 0.0)
@@ -45,10 +45,10 @@ class MountSettings:
 
 @dataclass(frozen=True)
 class ClampPoseDefinition:
-    """Defines a clamp's pose from two measured points. The first is the origin, the z axis points to the second.
+    """Defines a clamp's pose by two measured points. The first is the origin, and the z axis points to the second.
 
-    With `level` the third angle is zero (x axis across world y); with `transported` the clamp never turns about its own
-    z axis, from `level` at the first node on.
+    With `level` the roll angle is zero (x axis perpendicular to world y). With `transported` it starts as `level`, and
+    the clamp never rotates about its own z axis.
     """
 
     clamp_name: str
@@ -93,12 +93,12 @@ class CableTopology:
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
-        """Names of the four clamped vertices. They are the first and last two of the parent branch."""
+        """Names of the four clamped vertices: the first and last two of the parent branch."""
         return (*self.parent_branch_vertex_names[:2], *self.parent_branch_vertex_names[-2:])
 
     @property
     def free_vertex_names(self) -> tuple[str, ...]:
-        """Names of the vertices that no clamp holds. Predictions are evaluated there."""
+        """Names of the vertices that no clamp holds, at which predictions are evaluated."""
         return tuple(vertex for vertex in self.vertex_names if vertex not in self.clamped_vertex_names)
 
     @property
@@ -108,12 +108,12 @@ class CableTopology:
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of vertex names, one pair for each edge. Edges are ordered by branch."""
+        """Pairs of vertex names, one for each edge, ordered by branch."""
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
     def clamp_pose_definitions_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
-        """Pose definitions of the two clamps at the start and the end."""
+        """Pose definitions of the start clamp and the end clamp."""
         a, b, *_, y, z = self.parent_branch_vertex_names
         start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
         return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
@@ -125,7 +125,7 @@ class CableTopology:
 
 @dataclass(frozen=True)
 class InitCommandObject:
-    """An object from the command line of `init`, with start values of its free parameters."""
+    """An object from the command line of `init`, with initial values of its free parameters."""
 
     settings: ObjectKind  # without its mount
     start_values: Mapping[str, tuple[float, str]]  # where the search for each free parameter starts, with a comment
@@ -138,8 +138,8 @@ class InitCommandObject:
 class InitCommandObjectFactory:
     """Template for one word of `init --object`.
 
-    `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
-    `ConfigError` where something is missing.
+    `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
+    Raises `ConfigError` if an input is missing.
     """
 
     default_links: int  # per segment
@@ -150,7 +150,7 @@ class InitCommandObjectFactory:
 
 
 def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
-    """Get the numbers that an object requires, in the order of `meanings`. `ConfigError` if one is missing."""
+    """Return the numbers that an object requires, in the order of `meanings`. Raises `ConfigError` if one is absent."""
     for name, meaning in meanings.items():
         if name not in numbers:
             flag, value = (f"--{name}", " NUMBER") if name in SIZE_DESCRIPTIONS else ("--number", f" {name}=NUMBER")
@@ -159,7 +159,7 @@ def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Map
 
 
 def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
-    """Parse the comma-separated numbers of a flag. `ConfigError` unless there are `count` finite ones."""
+    """Parse the comma-separated numbers of a flag. Raises `ConfigError` unless there are `count` finite numbers."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -171,7 +171,7 @@ def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
 
 
 def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
-    """Start values of each segment's damping and bending rigidity, ratio x weight x length^2, with comments."""
+    """Initial bending rigidity (ratio x weight x length^2) and damping of each segment, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
@@ -184,11 +184,11 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 class ObjectKind:
     """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
-    A class overrides `kind`, and `build_segments` or `build`, and what else differs; one that is a system of its own is
-    a `ClampedObject` as well.
+    A subclass overrides `kind`, and `build_segments` or `build`. A kind that is a whole system is also a
+    `ClampedObject`.
     """
 
-    # whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition
+    # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
     default_link_refinement: ClassVar[bool] = False
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
@@ -196,37 +196,37 @@ class ObjectKind:
     kind: Annotated[str, OptionInfo("what the object is")]
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the object's segments, parents first. Each link becomes `link_division` links, at equal stiffness."""
+        """Build the object's segments, parents first. Each link is divided into `link_division` links."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """Build the flexible object, not yet placed. Each link becomes `link_division` links."""
+        """Build the flexible object without placing it. Each link is divided into `link_division` links."""
         return flexible_object(self.build_segments(damping, link_division))
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
-        """Frame that carries the object's root (None: world) and the root's pose in it (4, 4) (None: identity)."""
+        """Frame to which the object's root is attached (None: world), and the root's pose (4, 4) in it (None: zero)."""
         return None, None
 
     @property
     def is_root_fixed_in_world(self) -> bool:
-        """Whether the object's root is fixed in the world, on no robot frame or clamp."""
+        """Whether the object's root is fixed in the world instead of to a robot frame or clamp."""
         return False
 
     @property
     def n_links_per_segment_or_total(self) -> int | None:
-        """Number of links per segment, or in total if segments differ. None without such segments."""
+        """Number of links per segment, or the total if segments differ. None without such segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.build_segments()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
-        """Factor on a per-joint parameter that keeps segment stiffness when links are divided. Others: 1."""
+        """Factor on a per-joint parameter that preserves segment stiffness if links are divided; else 1."""
         owner, _, quantity = parameter.rpartition(".")
         per_joint = {segment.name for segment in self.build_segments() if not segment.stiffness_given_as_rigidity}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
-        """Paths of the input files that the object's settings name, by settings key."""
+        """Paths of the input files in the object's settings, by settings key."""
         own: Any = type(self)
         return {
             key: getattr(self, option.field_name)
@@ -235,7 +235,7 @@ class ObjectKind:
         }
 
     def with_file_names_only(self) -> ObjectKind:
-        """Replace paths by file names, so that objects of different runs can be compared."""
+        """Return a copy with file names instead of paths, to compare objects of different runs."""
         names = {key: Path(file).name for key, file in self.input_file_paths().items()}
         return replace(self, **names)
 
@@ -245,13 +245,13 @@ class ClampedObject(Protocol):
     """Interface of objects that form a whole system with clamps, such as a cable. The clamps follow measured points."""
 
     def topology(self) -> CableTopology:
-        """The object's vertices and clamps. `DataError` or `ModelError` if they are inconsistent."""
+        """Return the object's vertices and clamps. Raises `DataError` or `ModelError` if they are inconsistent."""
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
         """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Parameter values from one recording's edge lengths [m]. Empty if all recordings share lengths."""
+        """Parameter values from one recording's edge lengths [m]; empty if all recordings share the lengths."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,5 +279,5 @@ OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
 def init_command_object_factories() -> dict[str, InitCommandObjectFactory]:
-    """Templates of all object kinds, keyed by their word for `init --object`."""
+    """Templates of all object kinds, by their word for `init --object`."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_factories.items()}

@@ -1,16 +1,16 @@
 """The model of a branched cable held by two clamps, built from measured vertices.
 
-The parent runs from one clamp to the other; its first and its last edge are held. Children leave it at vertices. Every
-edge is a rigid link, before each link sits a joint that bends about x and y and twists about z:
+The parent branch runs from one clamp to the other, which hold its first and last edge. Child branches start at vertices
+of the parent. Every edge is a rigid link. The joint before each link bends about x and y and twists about z:
 
     M = rigidity x (angle - rest angle) x 2/(length before + length after)
 
-The first edge is rigid in `clamp_start`, whose six coordinates follow two measured points. The last edge is held by
-`clamp_end` in five equations (place and direction; the roll stays free) or in six.
+The first edge is fixed to `clamp_start`, whose six coordinates follow two measured points. `clamp_end` holds the last
+edge with five equations (position and direction, free roll) or six.
 
-Motion capture measures neither force nor mass, and multiplying masses, rigidities and dampings by one number changes
-no motion. The linear density is therefore fixed at a nominal value and every result is per unit of it: a bending
-rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight.
+Motion capture measures neither force nor mass: if masses, rigidities and dampings are multiplied by one factor, the
+motion does not change. The linear density is therefore fixed at a nominal value, and every result is relative to it: a
+bending rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _Vector3 = tuple[float, float, float]
 MEMORY_HALVING_SPEED_PARAMETER_NAME = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
-# Parameters of a joint whose rest angle follows from the start: its angle there [rad] and the torque it bears [N m].
+# Parameters of a joint whose rest angle follows from the start: its angle [rad] and torque [N m] there.
 START_ANGLE_AND_LOAD_SUFFIXES = ("start", "load")
 # Parameter set to the root mean square speed of the measured points at the start [m/s].
 START_SPEED_PARAMETER_NAME = "start.speed"
@@ -68,11 +68,10 @@ class CableBranchOptions:
 class CableOptions:
     """Settings of a cable's model.
 
-    By `shape_memory_fraction` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness),
-    the load being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
-    `SEGMENT.memory` and counts less for a recording that starts in motion, by the factor
-    1/(1 + (start speed/`start.speed_scale`)^2). Branches that are not named have the `default_branch`; `gravity` is in
-    [m/s^2].
+    With `shape_memory_fraction`, each joint's rest angle is (1 - memory) x undeformed + memory x (start angle -
+    load/stiffness). The load is the joint's torque in equilibrium at the start of the recording. The fraction becomes
+    the parameter `SEGMENT.memory`. For a recording that starts in motion it is multiplied by 1/(1 + (start
+    speed/`start.speed_scale`)^2). Branches without an entry have the `default_branch`. `gravity` is in m/s^2.
     """
 
     branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by name, parent and children")] = field(
@@ -110,7 +109,7 @@ class CableOptions:
 
 
 def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
-    """Read vertex positions [m] from a CSV table with columns point, x, y, z. `DataError` for another file."""
+    """Read vertex positions [m] from a CSV table with columns point, x, y, z. Raises `DataError` for another format."""
     try:
         rows = csv.DictReader(read_input_text(Path(path)).splitlines())
         return {row["point"]: np.array([float(row[axis]) for axis in "xyz"]) for row in rows}
@@ -136,9 +135,9 @@ def clamped_cable_system(
 ) -> System:
     """Build the system of a cable held by two clamps from the lengths of all its edges [m].
 
-    Prescribed are the twelve coordinates of `clamp_start` and `clamp_end`. Frames: every vertex by its name,
-    `junction_CHILD`, and `last_edge`. Parameters: those of each segment (`parent.bend`, ...), `clamp_start.length`,
-    `clamp_start.roll` and, where welded, `clamp_end.roll` [rad]. `ModelError` of a cable that does not fit together.
+    The twelve coordinates of `clamp_start` and `clamp_end` are prescribed. Frames are all vertices, `junction_CHILD`
+    and `last_edge`. Parameters are those of each segment (`parent.bend`, ...), `clamp_start.length`, `clamp_start.roll`
+    and, for a weld, `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent.
     """
     options = options or CableOptions()
     item = flexible_object(_segments(cable, lengths, options), name="cable")
@@ -202,7 +201,7 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
 def _with_vertices(
     item: FlexibleObject, cable: CableTopology, lengths: Mapping[tuple[str, str], float]
 ) -> FlexibleObject:
-    """The object with its vertices as frames, the parent's arc length measured from clamp to clamp."""
+    """The object with its vertices as frames; the parent's arc length runs from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
     for name, chain in cable.vertex_names_by_branch.items():

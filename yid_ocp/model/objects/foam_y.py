@@ -44,7 +44,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
 class FoamY(MountedObjectKind):
-    """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the default place."""
+    """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the position of that experiment."""
 
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
         "foam_y": InitCommandObjectFactory(4, _init_object)

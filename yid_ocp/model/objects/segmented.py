@@ -1,4 +1,4 @@
-"""Flexible objects described in the configuration segment by segment, such as cables, beams and trees."""
+"""Flexible objects that the settings describe segment by segment, such as cables, beams and trees."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class FlexibleSegmentSettings:
     )
 
     def segment(self, name: str, damping: float, link_division: int) -> Segment:
-        """Build the named `Segment`. Each link becomes `link_division` links at equal segment stiffness."""
+        """Build the named `Segment`. Links are divided into `link_division` links at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
             hint = "set length or link_lengths"
             raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)
@@ -88,7 +88,7 @@ class FlexibleSegmentSettings:
 
 
 def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> FlexibleSegmentSettings:
-    """A segment as `init` writes it; a flat one bends across its thinner side alone, about the other axis."""
+    """A segment for `init`. A flat one bends only across its thinner side."""
     section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
@@ -129,7 +129,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
-    # across the z axis of what holds them, the first one along its x axis
+    # perpendicular to the holder's z axis, the first one along its x axis
     turns = [(0.0, quarter, round(4 * quarter * i / count, 7)) for i in range(count)]
     branches = enumerate((_init_segment(links, length, mass, radius, rpy=turn) for turn in turns), 1)
     return _init_object("tree", {f"b{i}": branch for i, branch in branches})
@@ -143,7 +143,7 @@ def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
 
 
 def _grown(branches: Sequence[tuple[str, FlexibleSegmentSettings]]) -> dict[str, FlexibleSegmentSettings]:
-    """The branches by name, each with a name of its own and on one that comes before it."""
+    """Branches by name, after a check for unique names and for parents that precede their children."""
     made: dict[str, FlexibleSegmentSettings] = {}
     for name, branch in branches:
         if name in made:

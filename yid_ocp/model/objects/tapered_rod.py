@@ -32,10 +32,10 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 @OBJECT_KINDS.register("tapered_rod")
 @dataclass(frozen=True, kw_only=True)
 class TaperedRod(MountedObjectKind):
-    """A solid round rod whose radius changes linearly from the clamped base to the tip. The segment is called `rod`.
+    """A solid round rod whose radius changes linearly from the clamped base to the tip. The segment is named `rod`.
 
-    `rod.bend`, `rod.twist` and `rod.damping` are per curvature at the base; a section of radius r has (r/base radius)^4
-    of them. `rod.taper` is the tip's radius over the base's.
+    `rod.bend` and `rod.twist` [N m^2] and `rod.damping` [N m^2 s] are the values at the base. At radius r they are
+    multiplied by (r / base radius)^4. `rod.taper` is tip radius / base radius.
     """
 
     default_link_refinement = True
@@ -60,7 +60,7 @@ parameters:
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the rod as one segment with the base's radius. `build` then tapers its links."""
+        """Build the rod as one segment with the radius of its base. `build` then tapers the links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
         rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_given_as_rigidity=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
@@ -70,7 +70,7 @@ parameters:
 
 
 def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
-    """The object with a parameter for its taper, on which masses, inertias, springs and dampers depend."""
+    """The object with a taper parameter, on which masses, inertias, springs and dampers depend."""
     tree, [layout] = plain.mechanism, plain.segment_layouts
     text = "radius of the tip over that of the base"
     taper = Parameter(f"{_SEGMENT}.taper", ratio, "1", 1e-3, math.inf, text)
@@ -84,7 +84,7 @@ def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
         ends, sizes = (radius_at(i / n), radius_at((i + 1) / n), taper.symbol), (layout.link_lengths[i], layout.radius)
         return replace(joint, bodies=tuple(_frustum(body, *ends, *sizes) for body in joint.bodies))
 
-    # a joint represents the half links on both sides of it, the first one its own half link
+    # a joint represents half of each adjacent link, the first joint half of its own link
     factors = {name: radius_at(i / n if i else 0.25 / n) ** 4 for i, names in enumerate(links) for name in names}
     springs = tuple(
         replace(s, stiffness=s.stiffness * factors[s.joint_name], damping=s.damping * factors[s.joint_name])
@@ -95,10 +95,7 @@ def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
 
 
 def _frustum(body: Inertia, a: ca.SX, b: ca.SX, taper: ca.SX, length: ca.SX, radius: ca.SX) -> Inertia:
-    """The body of a link between sections of `a` and `b` times the base radius, in place of a cylinder's.
-
-    From exact integrals of powers of the radius, which changes linearly along the link.
-    """
+    """Body of a link between sections of `a` and `b` times the base radius, by exact integrals."""
     area, whole = (a**2 + a * b + b**2) / 3, (1 + taper + taper**2) / 3
     first = (a**2 + 2 * a * b + 3 * b**2) / 12 / area
     second = (a**2 + 3 * a * b + 6 * b**2) / 30 / area
