@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-# what is entered here is imported above as well
+# each entry is also imported above
 _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.estimation": ("solve",),
     "analysis.identifiability": ("identifiability",),

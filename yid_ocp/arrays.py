@@ -1,4 +1,4 @@
-"""Types of NumPy arrays of numbers, whole numbers or truth values."""
+"""Types of NumPy arrays: floats, integers and booleans."""
 
 from __future__ import annotations
 

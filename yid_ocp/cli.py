@@ -1,7 +1,7 @@
-"""Command-line interface with commands, their arguments and shell completion.
+"""Command-line interface: commands, their arguments and shell completion.
 
-`workflow` implements the commands. A command's module is imported when it runs, so that help needs none of the
-libraries for numbers.
+`workflow` implements the commands. A command's module is imported when it runs, so that `--help` loads no numerical
+library.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def _import(parser: argparse.ArgumentParser) -> None:
 
 
 def _importing(parser: argparse.ArgumentParser) -> None:
-    """Flags that are keys of the section `import`; a list may be split by commas, and its flag repeated."""
+    """Flags for the keys of the section `import`. A list may be separated by commas, or its flag repeated."""
     group = parser.add_argument_group("reading files of other tools")
     listed = (
         ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are merged on one clock"),
@@ -279,7 +279,7 @@ def _print_completion_script(arguments: argparse.Namespace) -> int:
 
 
 def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
-    """Print completions for the calling shell and exit; does nothing without the package argcomplete."""
+    """Print completions for the calling shell and exit. Does nothing without the package argcomplete."""
     try:
         library = import_module("argcomplete")
     except ImportError:
@@ -384,7 +384,7 @@ def build_argument_parser() -> argparse.ArgumentParser:
 
 
 class _LossyStream:
-    """Standard error that discards what it cannot write: a full disk is no reason to stop."""
+    """Standard error that discards text that it cannot write, because a full disk should not stop a command."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -402,13 +402,13 @@ class _LossyStream:
 
 
 def _discard_what_follows(stream: TextIO) -> None:
-    """Lead a stream that cannot be written to nowhere, or Python fails again when it ends."""
+    """Redirect a stream that cannot be written to the null device, because Python would fail again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextlib.contextmanager
 def _reliable_streams() -> Iterator[None]:
-    """Context manager in which standard output and error exist, show every letter, and error never fails."""
+    """Context manager in which standard output and error exist and escape unprintable text, and error never fails."""
     with contextlib.ExitStack() as held:
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:  # closed by who started the program
@@ -459,9 +459,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 done; 1 the solve failed, the run folder says why; 2 the input is wrong, or the system refused something; 3 a
-        bug; 128 and the signal's number where one ended it, as 130 for an interruption. With `--json` an error is
-        printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
+        0: done. 1: the solve failed; the run folder states why. 2: wrong input, or an error of the operating system.
+        3: a bug. 128 plus the signal number (130 for an interruption) if a signal ended the command. With `--json` an
+        error is also printed as `yid-error/1`: kind, what, where, allowed, hint and exit_code.
     """
     if "_ARGCOMPLETE" in os.environ:
         _print_shell_completions(build_argument_parser())
@@ -494,7 +494,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     except OSError as error:
         what = f"the working directory is not there: {error.strerror or error}"
         return _wrong(OutputError(what, hint="cd to one that is"), as_json)
-    # matrices are small: threads of the linear algebra library cost more than they give, in workers as well
+    # matrices are small: threads of the linear algebra library cost more than they gain, in workers as well
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         run, arguments.begin_time = arguments.run, time.monotonic()
@@ -532,7 +532,7 @@ def _failed(error: Exception, as_json: bool) -> int:
     if isinstance(error, MemoryError):
         what = f"there is not enough memory: {error}"
         return _wrong(InsufficientMemoryError(what, hint="shorten the run, or take fewer links"), as_json)
-    # whatever else comes up here is a mistake of ours
+    # any other exception is a bug of this package
     with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
         traceback.print_exception(error, file=file)
     what = f"{type(error).__name__}: {error}"

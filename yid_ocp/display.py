@@ -1,4 +1,4 @@
-"""Show objects in one line and in notebooks, and report progress of long computations."""
+"""Text and notebook representations of objects, and progress reports of long computations."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows
 
 @dataclass(frozen=True)
 class ReprLineAndTableRows:
-    """Texts that represent an object: a line without class name, and rows of a notebook table, header first."""
+    """Texts that represent an object: one line without the class name, and rows of a notebook table, header first."""
 
     one_line: str
     table_rows: Sequence[Sequence[str]] = ()
 
 
 class ReprMixin:
-    """Mixin that makes `__repr__` and a notebook table from `_summary`. A dataclass requires `repr=False`."""
+    """Mixin that makes `__repr__` and a notebook table from `_summary`. A dataclass with it needs `repr=False`."""
 
     def _summary(self) -> ReprLineAndTableRows:
         raise NotImplementedError
@@ -56,18 +56,19 @@ class Progress:
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Report that a new stage of the work begins.
 
-        `work` is the time that it usually takes, `ahead` that of all stages after it, on one scale [s]. A stage whose
-        time says nothing of those after it (it may compile) is a part of `ahead`; absent, that falls by `work`.
+        `work` is the expected time of the stage, `ahead` the expected time of all later stages [s]. If `ahead` is
+        absent, the remaining time is reduced by `work`. A stage whose duration does not predict later stages (such as
+        compilation) is included in `ahead`.
         """
 
     def report_iterate(self, entry: Any) -> None:
-        """Report the iterate that a search accepted, a `solvers.base.Iterate`."""
+        """Report an accepted iterate of a search (`solvers.base.Iterate`)."""
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """Report that `done` of `total` parts of the stage are finished. `text` names the last or next one."""
+        """Report that `done` of `total` parts of the stage are finished. `text` names the last or next part."""
 
     def report_table(self, rows: Sequence[Sequence[str]]) -> None:
-        """Report a table of all results so far, header and best result first. It replaces the previous table."""
+        """Report a table of all results so far: header first, then the best result. It replaces the previous table."""
 
 
 NULL_PROGRESS = Progress()
@@ -89,7 +90,7 @@ class LoggingProgress(Progress):
 
 
 class PartsDoneCounter:
-    """Thread-safe counter of a stage's `total` parallel parts. It reports every count, the first one with `first`."""
+    """Thread-safe counter of a stage's `total` parallel parts. It reports every count, the initial one with `first`."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 class YidError(Exception):
     """An error that the user can correct. It states what is wrong, where, what is allowed and what to do next.
 
-    As text it has all four parts, at most 600 characters together, with control characters as escapes.
+    Its text has all four parts, at most 600 characters in total, with control characters escaped.
     """
 
     _usual_allowed = "what the documents describe"
@@ -20,7 +20,7 @@ class YidError(Exception):
         super().__init__(what)
 
     def four_parts(self) -> dict[str, str]:
-        """What, where, allowed and hint of the error as the user sees them. Missing parts have general texts."""
+        """The keys what, where, allowed and hint as the user sees them. Missing parts have general texts."""
         said = {
             "what": self.what,
             "where": self.where or "the command as it was given",
@@ -40,7 +40,7 @@ class YidError(Exception):
 
 
 class ConfigError(YidError):
-    """Raised when the configuration file, or a value set on top of it, is invalid."""
+    """Raised when the configuration file, or a value that overrides it, is invalid."""
 
     _usual_allowed = "keys and values as docs/reference/settings.md lists them"
 
@@ -60,7 +60,7 @@ class ModelError(YidError):
 
 
 class SolverError(YidError):
-    """A solver cannot do the task: the method does not support it, or no usable solution was found."""
+    """Raised when a method does not support the task, or when a solver finds no usable solution."""
 
 
 class OutputError(YidError):
@@ -71,7 +71,7 @@ class OutputError(YidError):
 
 
 class WorkerError(YidError):
-    """Raised when workers cannot be reached or cannot do their tasks."""
+    """Raised when workers cannot be reached or are unsuitable for their tasks."""
 
 
 class InsufficientMemoryError(YidError):
@@ -82,12 +82,12 @@ _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
 
 
 def _printable(text: str) -> str:
-    """A text on one line whose control characters, which a terminal would obey, are escapes."""
+    """A text on one line, in which control characters are escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def _shortened(text: str, length: int) -> str:
-    """A text whose middle is left out where it is longer than allowed."""
+    """A text of at most `length` characters, without its middle if it is longer."""
     half = (length - 5) // 2
     return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"
 
@@ -96,9 +96,9 @@ _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none i
 
 
 def nearest_name_hint(name: str, known: Iterable[str]) -> str:
-    """Hint for an error about an unknown name. It is the most similar known name, or a list of known names.
+    """Hint for an error about an unknown name: the most similar known name, or a list of known names.
 
-    It is for errors that do not say what is allowed; beside a list, see `unknown_name_error_arguments`.
+    For an error that also lists what is allowed, use `unknown_name_error_arguments`.
     """
     names = [str(entry) for entry in known]
     return _meant(name, names) or f"known: {_listed(name, sorted(names)) or 'none'}"

@@ -24,16 +24,16 @@ from yid_ocp.errors import DataError, OutputError
 _DataclassType = TypeVar("_DataclassType")
 
 MAX_INPUT_NUMBERS = 50_000_000
-"""Largest count of numbers of one file from outside: as float64 with copies, 40 bytes each, they are 2 GB."""
+"""Largest count of numbers in one input file; as float64 with copies (40 bytes each) they take 2 GB."""
 MAX_TEXT_BYTES = 1 << 26  # of a file that is read as one text
 _MEMORY_OF_READING = 7 << 28  # address space that a library may take to read a file [bytes]
 
 
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
-    """Check an input file and return its path. `DataError` unless it is a regular file of at most `max_bytes` bytes.
+    """Check an input file and return its path. Raises `DataError` unless it is a regular file of at most `max_bytes`.
 
-    Pipes, devices and what never ends are refused before anything is read. Every file that the package did not write or
-    ship is opened after this check.
+    Pipes and devices are thus refused before anything is read. Every file that this package did not write or ship is
+    checked in this way.
     """
     allowed = "a regular file"
     try:
@@ -58,9 +58,9 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 @contextlib.contextmanager
 def limited_memory() -> Iterator[None]:
-    """Limit this process to 1.75 GiB beyond its present memory use. This context manager works on Linux only.
+    """Limit this process to 1.75 GiB beyond its present memory use (context manager; effective on Linux only).
 
-    It is for libraries that unpack what a file from outside holds; what is more becomes a MemoryError.
+    It protects against libraries that unpack input files: a larger request raises MemoryError.
     """
     before = None
     with contextlib.suppress(ImportError, OSError):
@@ -79,7 +79,7 @@ def limited_memory() -> Iterator[None]:
 
 
 def check_max_input_numbers(count: int, where: str) -> None:
-    """Raise `DataError` if an input file holds or declares more than `MAX_INPUT_NUMBERS` numbers."""
+    """Raise `DataError` if an input file contains or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
         allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
         what = f"the file holds {count / 1e6:.0f} million numbers, more than allowed"
@@ -87,7 +87,7 @@ def check_max_input_numbers(count: int, where: str) -> None:
 
 
 def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Read an input file as text. `DataError` as in `check_input_file`, or if it is not UTF-8 text."""
+    """Read an input file as text. Raises the errors of `check_input_file`, and `DataError` if it is not UTF-8."""
     check_input_file(path, max_bytes)
     try:
         return path.read_text(encoding="utf-8")
@@ -98,7 +98,7 @@ def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_input_json(path: Path) -> Any:
-    """Read a JSON input file. `DataError` as in `read_input_text`, or if it is not valid JSON."""
+    """Read a JSON input file. Raises the errors of `read_input_text`, and `DataError` if it is not valid JSON."""
     text = read_input_text(path)
     try:
         return json.loads(text)
@@ -111,7 +111,7 @@ def read_input_json(path: Path) -> Any:
 def atomic_write(path: Path) -> Iterator[Path]:
     """Write a file atomically (context manager). The yielded temporary file replaces `path` on success.
 
-    `OutputError` where the folder is missing or the file cannot be written.
+    Raises `OutputError` if the folder is missing or the file cannot be written.
     """
     if path.is_dir() or not path.parent.is_dir():
         what = "the name of the file is that of a folder" if path.is_dir() else "the folder to write to does not exist"
@@ -132,18 +132,18 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically. Errors are as in `atomic_write`."""
+    """Write a UTF-8 text file atomically. Raises the errors of `atomic_write`."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_strict_json(path: Path, data: Any) -> None:
-    """Write plain data as JSON atomically. ValueError for infinity and NaN, else errors as in `atomic_write`."""
+    """Write plain data as JSON atomically. Raises ValueError for infinity and NaN, and the errors of `atomic_write`."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Path:
-    """Make a folder with its missing parents. `OutputError` if that fails."""
+    """Make a folder with its missing parents. Raises `OutputError` if that fails."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -153,12 +153,12 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
 
 
 def is_file(path: Path) -> bool:
-    """Whether the path is an existing file. False also for names that are too long or invalid."""
+    """Whether the path is an existing file. Also False for names that are too long or invalid."""
     return os.path.isfile(path)
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, or of a folder's files by name, in hexadecimal digits. `DataError` if unreadable."""
+    """SHA-256 (hexadecimal) of a file, or of all files of a folder. Raises `DataError` if a file is unreadable."""
     digest = hashlib.sha256()
     for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
         with check_input_file(entry).open("rb") as file:
@@ -168,7 +168,7 @@ def file_sha256(path: Path) -> str:
 
 
 def json_sha256(data: Any) -> str:
-    """SHA-256 of plain data as JSON, 64 hexadecimal digits. The order of keys does not matter."""
+    """SHA-256 of plain data as JSON, 64 hexadecimal digits. The order of keys has no influence."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -203,18 +203,18 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 
 def named_attributes(value: Any, names: str) -> dict[str, Any]:
-    """Collect the attributes in the blank-separated list `names`. `key=name` stores one under `key`."""
+    """Return the attributes in the blank-separated list `names`, by name. `key=name` stores one under `key`."""
     pairs = [name.partition("=") for name in names.split()]
     return {key: getattr(value, name or key) for key, _, name in pairs}
 
 
 def object_attributes_to_json_dict(value: Any, names: str) -> dict[str, Any]:
-    """Collect an object's attributes as JSON data. `names` is as for `named_attributes`."""
+    """Return an object's attributes as JSON data, by name. `names` is as in `named_attributes`."""
     return dict(to_json_types(named_attributes(value, names)))
 
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
-    """Restore a dataclass instance from the data that `to_lossless_plain_data` returned."""
+    """Restore a dataclass instance from data of `to_lossless_plain_data`."""
     return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})
 
 
@@ -244,6 +244,6 @@ def _value(hint: Any, value: Any) -> Any:
 
 
 def os_error_reason(error: Exception) -> str:
-    """Text of the reason of an operating system's or HDF5 error."""
+    """Reason text of an operating system or HDF5 error."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error).strip("'\"")

@@ -1,4 +1,4 @@
-"""Handle signals that end a command. Those that libraries suppress are re-raised; finally the process is killed."""
+"""Handle signals that end a command. Suppressed signals are raised again; finally the process is killed."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ _STATE = _State()
 
 
 def received_signal_number() -> int | None:
-    """Number of the signal that requested the command's end. None if there was none."""
+    """Number of the signal that requested the end of the command, or None."""
     return _STATE.asked
 
 
 def raise_if_requested() -> None:
-    """Raise `InterruptedBySignal` if a signal requested the command's end but a library suppressed it."""
+    """Raise `InterruptedBySignal` if a signal has requested the end of the command but a library suppressed it."""
     if _STATE.asked is not None:
         raise InterruptedBySignal(_STATE.asked)
 
@@ -76,11 +76,10 @@ def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
 def raise_on_signals() -> Iterator[None]:
     """Raise `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during a block (context manager).
 
-    An exception can get lost: in what collects garbage, in callbacks of libraries, in a call that does not come back.
-    So it is raised again every `_RERAISE_INTERVAL` seconds, and after `_FORCED_EXIT_DELAY` seconds the process is ended
-    with the exit code that shells expect, when nothing but the folders of `remove_folder_on_forced_exit` has to be
-    cleared away. Signals that the parent had ignored stay so, as under `nohup`. Outside the main thread nothing is
-    changed.
+    An exception can be lost: in garbage collection, in callbacks of libraries, in a call that does not return. It is
+    therefore raised again every `_RERAISE_INTERVAL` seconds. After `_FORCED_EXIT_DELAY` seconds the process is ended
+    with the exit code that shells expect; only the folders of `remove_folder_on_forced_exit` are removed before.
+    Signals that the parent process ignores (`nohup`) stay ignored. Outside the main thread the block has no effect.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,6 +1,6 @@
 """Levenberg-Marquardt method for dense least-squares problems of some dozen coordinates, such as chain shapes.
 
-Measured against SciPy's: docs/design/solvers.md.
+docs/design/solvers.md compares it with SciPy's method.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ _MAX_STEP = 0.5  # by which a component moves at most in one step
 
 @dataclass(frozen=True)
 class LocalQuadraticModel:
-    """Quadratic model of a cost about one point, with value, gradient (n,) and positive definite Hessian (n, n)."""
+    """Quadratic model of a cost about one point: value, gradient (n,) and positive definite Hessian (n, n)."""
 
     cost: float
     gradient: Array
     hessian: Array
 
     def damped_step(self, damping: float) -> Array:
-        """Step that minimises the model with Levenberg-Marquardt damping, shape (n,)."""
+        """Step (n,) that minimises the model with Levenberg-Marquardt damping."""
         damped = self.hessian + damping * np.diag(np.diag(self.hessian))
         return np.asarray(-np.linalg.solve(damped, self.gradient))
 
@@ -49,7 +49,7 @@ _Model = TypeVar("_Model", LocalQuadraticModel, _SumOfSquares)
 
 @dataclass(frozen=True)
 class _Minimum(Generic[_Model]):
-    """The minimiser `x` (n,), the local model there, iterations used, and whether the search converged."""
+    """The minimiser `x` (n,), the local model at `x`, iterations used, and whether the search converged."""
 
     x: Array
     final_model: _Model
@@ -62,10 +62,10 @@ def levenberg_marquardt(
     initial_guess: Array,
     projection: Callable[[Array], Array] = lambda x: x,
 ) -> _Minimum[_SumOfSquares]:
-    """Minimise |r(x)|^2 by Gauss-Newton steps. The damping is scaled by the Jacobian's column norms.
+    """Minimise |r(x)|^2 by Gauss-Newton steps, with damping scaled by the Jacobian's column norms.
 
-    The residual function gives r (m,) and its Jacobian (m, n); a projection brings a trial point back to where it may
-    be.
+    The residual function returns r (m,) and its Jacobian (m, n). The projection maps a trial point to an admissible
+    one.
 
     References
     ----------
@@ -90,9 +90,9 @@ def minimize_by_damped_newton(
 ) -> _Minimum[_Model]:
     """Minimise a cost by damped Newton steps on the local models that `model_at` returns.
 
-    It has converged when no component would move by more than `step_tolerance`, or when the cost falls by less than the
-    part `cost_tolerance`. No step is damped less than `min_damping`: some damping keeps a search on a robust cost from
-    leaving its local minimum.
+    The search converges if no component would move by more than `step_tolerance`, or if the cost decreases by less than
+    the fraction `cost_tolerance`. `min_damping` keeps a search on a robust cost in its local minimum. The projection
+    maps a trial point to an admissible one.
     """
     x = np.array(initial_guess, float)
     model, damping = model_at(x), _FIRST_DAMPING

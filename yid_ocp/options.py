@@ -1,10 +1,11 @@
-"""Annotations of options that users may set. Keys, descriptions and checks follow from them.
+"""Annotations of options that users may set.
 
 An option is a field of a frozen dataclass, annotated with its bounds and with `OptionInfo`:
 
     time_step: Annotated[float, Gt(0), Le(0.1), OptionInfo("of the integrator", "s")] = 0.01
 
-Reader, `--set`, checks and JSON Schema follow from it. A field without `OptionInfo` is set by code alone.
+Reader, `--set`, checks and JSON Schema are derived from the annotation. A field without `OptionInfo` can only be set in
+Python.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _TYPE_WORDS = {float: "a number", int: "a whole number", bool: "true or false", 
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """Meaning and SI unit of an option, as its annotation. `is_path` is for files, relative to the configuration."""
+    """Meaning and SI unit of an option. `is_path` marks a file path relative to the configuration."""
 
     description: str = ""
     unit: str = ""
@@ -44,7 +45,7 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """Annotation of a type whose setting names a registered class, under `selector_key` or as a mapping entry's key."""
+    """Annotation of a type whose setting names a registered class, by `selector_key` or by a mapping entry's key."""
 
     registry: Registry[Any]
     default_name: str = ""
@@ -53,7 +54,7 @@ class RegistryChoice:
 
 @dataclass(frozen=True)
 class Option:
-    """Annotated type, default and dataclass field name of an option. The default is `MISSING` where there is none."""
+    """Annotated type, default and dataclass field name of an option. The default `MISSING` means that there is none."""
 
     type_hint: Any
     default_value: Any
@@ -62,7 +63,7 @@ class Option:
 
 @functools.cache
 def dataclass_options(kind: type) -> Mapping[str, Option]:
-    """Options of a dataclass by key. A key is the field's name without a trailing `_`."""
+    """Options of a dataclass by key. A key is the field name without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
     found = {}
     for entry in dataclasses.fields(kind):
@@ -74,7 +75,7 @@ def dataclass_options(kind: type) -> Mapping[str, Option]:
 
 
 def split_annotated(hint: Any) -> tuple[Any, list[Any]]:
-    """Split a type into the type without `Annotated` metadata and the metadata."""
+    """Split a type into the bare type and its `Annotated` metadata."""
     markers: list[Any] = []
     while get_origin(hint) is Annotated:
         markers += hint.__metadata__
@@ -83,7 +84,7 @@ def split_annotated(hint: Any) -> tuple[Any, list[Any]]:
 
 
 def union_members(hint: Any) -> tuple[Any, ...]:
-    """Member types of a union, without None. Another type is its own only member."""
+    """Member types of a union, without None. For another type, the type itself."""
     bare, _ = split_annotated(hint)
     if get_origin(bare) in (Union, types.UnionType):
         return tuple(member for member in get_args(bare) if member is not type(None))
@@ -91,13 +92,13 @@ def union_members(hint: Any) -> tuple[Any, ...]:
 
 
 def mapping_value_type(hint: Any) -> Any:
-    """Value type of a mapping. None for other types."""
+    """Value type of a mapping type; None for other types."""
     found = (split_annotated(member)[0] for member in union_members(hint))
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
 def variadic_tuple_entry_type(hint: Any) -> Any:
-    """Entry type of a tuple of any length. None for other types."""
+    """Entry type of a tuple type of any length; None for other types."""
     bare, _ = split_annotated(hint)
     arguments = get_args(bare)
     return arguments[0] if get_origin(bare) is tuple and arguments[-1] is Ellipsis else None
@@ -136,7 +137,7 @@ def _words(hint: Any) -> str:
 
 
 def check_option_bounds(options: Any, where: str) -> None:
-    """Raise `ConfigError` if a number in an options dataclass is out of its annotated bounds."""
+    """Raise `ConfigError` if a number in an options dataclass is outside its annotated bounds."""
     kind: Any = type(options)
     for name, option in dataclass_options(kind).items():
         value = getattr(options, option.field_name)
@@ -145,7 +146,7 @@ def check_option_bounds(options: Any, where: str) -> None:
 
 
 def _within(hint: Any, value: Any) -> bool:
-    """Whether every number of a value is within the bounds of its type; True for other values."""
+    """Whether every number of a value is within the bounds of its type. True for other values."""
     if isinstance(value, tuple):
         entries = variadic_tuple_entry_type(hint)
         return entries is None or all(_within(entries, entry) for entry in value)

@@ -1,4 +1,4 @@
-"""Tables of named implementations (effects, sensors, readers, solvers, report sections)."""
+"""Tables of named implementations, such as effects, sensors, readers, solvers and report sections."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Registry(Generic[_Entry]):
         self._entries: dict[str, _Entry] = {}
 
     def register(self, name: str) -> Callable[[_Entry], _Entry]:
-        """Make a decorator that registers its argument under `name`."""
+        """Return a decorator that registers its argument under `name`."""
 
         def enter(entry: _Entry) -> _Entry:
             if name in self._entries:

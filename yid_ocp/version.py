@@ -14,7 +14,7 @@ _NUMERICAL_PACKAGES = ("casadi", "numpy", "scipy", "h5py")  # whose versions are
 
 
 def package_version() -> str:
-    """Version of this package. It is `0+unknown` where the package is not installed."""
+    """Version of this package, or `0+unknown` if it is not installed."""
     return _version("yid-ocp", "0+unknown")
 
 
@@ -40,7 +40,7 @@ def package_source_hash() -> str:
 
 
 def software_fingerprint() -> dict[str, str]:
-    """Versions and source hash that two processes must share to produce the same numbers."""
+    """Versions and source hash that two processes must share to compute the same numbers."""
     python = ".".join(platform.python_version_tuple()[:2])
     own = {name: text for name, text in installed_versions().items() if name in ("yid-ocp", *_NUMERICAL_PACKAGES)}
     return {"python": python, **own, "code": package_source_hash()}

@@ -1,1 +1,1 @@
-"""Configuration files, with the settings of a run, a checking reader, and a schema for editors."""
+"""Configuration files: settings of a run, a reader with checks, and a schema for editors."""

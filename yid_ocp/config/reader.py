@@ -42,14 +42,14 @@ def load_config(
 ) -> RunSettings:
     """Read and check the settings of a configuration file. Without `path`, the embedded file `default` is read.
 
-    Overrides are `a.b=c` each: the key and a value in YAML that replaces or adds to the file's. A section merges with
-    the one that stands there, key by key, unless it chooses another kind or method, or is empty.
+    Each override is `a.b=c`, a key and a value in YAML, which replaces or adds to the file's value. An overriding
+    section is merged key by key with the section of the file, unless it selects another kind or method, or is empty.
 
     Raises
     ------
     ConfigError
-        No such file, not YAML, an unknown or missing key, a value of the wrong kind or outside its range; it names
-        file, line and key, what is allowed and the nearest known key.
+        Missing file, invalid YAML, an unknown or missing key, a value of the wrong type or outside its range. The error
+        states file, line and key, what is allowed and the nearest known key.
     """
     embedded = Path(str(resources.files("yid_ocp.data").joinpath("defaults", default)))
     file, origin = (embedded, "embedded default") if path is None else (Path(path), str(path))
@@ -61,7 +61,7 @@ def load_config(
 
 
 def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
-    """List dotted setting keys that begin with `prefix`, with those of file `path`. `ConfigError` if unreadable."""
+    """List dotted setting keys that begin with `prefix`. Raises `ConfigError` if the file `path` is unreadable."""
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
     return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
 
@@ -116,7 +116,7 @@ def _loaded(text: str, origin: str) -> Any:
         hint = "check indentation, brackets, colons and duplicated keys"
         raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED_YAML, hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
-        # the reader's own mistakes on odd text: numbers of thousands of digits, keys that are lists
+        # errors of the YAML library on unusual text: numbers of thousands of digits, keys that are lists
         problem = next(iter(str(error).splitlines()), type(error).__name__)
         hint = "look for very long numbers and for keys that are lists"
         what = f"the file is not valid YAML: {problem}"
@@ -124,7 +124,7 @@ def _loaded(text: str, origin: str) -> Any:
 
 
 def _yaml() -> YAML:
-    """A reader that keeps lines and does without comments, whose places it does not always understand."""
+    """A YAML reader that keeps line numbers and ignores comments, whose positions it sometimes gets wrong."""
     yaml = YAML(typ="rt")
     yaml.Scanner, yaml.Parser = Scanner, Parser
     return yaml
@@ -136,7 +136,7 @@ def _odd(what: str, origin: str, event: Any) -> ConfigError:
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
-    """Plain Python values in place of the YAML reader's own; their lines go into `places`."""
+    """Plain Python values instead of the YAML reader's types. Their lines are stored in `places`."""
     if len(path) > _MAX_DEPTH:
         raise ConfigError("an alias refers to itself", where=origin, hint="replace the aliases by their content")
     if isinstance(node, CommentedMap):
@@ -192,7 +192,7 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
 
 
 def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
-    """Value of a key after setting it: sections of one kind merge, other values are replaced."""
+    """Value of a key after an override: sections of one kind are merged, other values are replaced."""
     sections = schema.section_variants_from_annotation(hint)
     merges = bool(value) and isinstance(before, dict) and isinstance(value, dict)
     if merges and sections is not None and sections.selector_key in value:
@@ -209,7 +209,7 @@ def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_Ke
 
 
 def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple[str, ...], Any]:
-    """Split a dotted key by the settings' types, and say which type stands there; names such as T1.bend keep dots."""
+    """Split a dotted key by the types of the settings (names such as T1.bend keep dots), and return the last type."""
     if not parts:
         return (), hint
     name, rest = parts[0], parts[1:]
@@ -236,7 +236,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
 
 @dataclass(frozen=True)
 class _Reader:
-    """Builds settings from plain data and says where something is wrong."""
+    """Builds settings from plain data, with the location of each value for errors."""
 
     places: Mapping[_KeyPath, str]
     origin: str
@@ -318,7 +318,7 @@ class _Reader:
 
 
 def _key_meant(name: str, keys: Sequence[str]) -> str:
-    """The key that may be missing at the end of a name, or misspelt there: names of users may have dots as well."""
+    """Suggested key for a name whose last part is missing or misspelt. Names chosen by users may contain dots."""
     within, _, last = name.rpartition(".")
     close = difflib.get_close_matches(last, keys, n=1, cutoff=0.65)
     return f"did you mean '{within}.{close[0]}'?" if close else f"add a key, as in {name}.{keys[0]}"

@@ -1,4 +1,4 @@
-"""Derive the allowed keys of configuration sections from settings classes, for reader, `--set` and JSON Schema."""
+"""Allowed keys of configuration sections, derived from settings classes, for reader, `--set` and JSON Schema."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class SectionVariants:
     is_nullable: bool = False
 
     def selected_variant_name(self, raw: Any) -> Any:
-        """Value of the selector key in an unchecked section. Without the key it is `default_variant`."""
+        """Value of the selector key in an unchecked section, or `default_variant` without the key."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
     def variant_options(self, word: Any = "") -> Mapping[str, options.Option]:
-        """Options of the settings class that `word` selects, by key. Default: the first class."""
+        """Options, by key, of the settings class that `word` selects (default: the first class)."""
         known = isinstance(word, str) and word in self.classes
         own = options.dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
         if self.selector_key in ("", *own):
@@ -39,7 +39,7 @@ class SectionVariants:
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
     def variants_for_mapping_key(self, name: str, where: str) -> SectionVariants:
-        """Settings classes for a mapping's entry `name`. They are the class of that name, or all classes."""
+        """Settings classes for a mapping's entry `name`: the class of that name, or all classes."""
         if self.selector_key != "name":
             return self
         if name not in self.classes:
@@ -47,7 +47,7 @@ class SectionVariants:
         return SectionVariants({"": self.classes[name]})
 
     def unknown_variant_error(self, word: object, where: str) -> ConfigError:
-        """Make the error for a missing or unknown value of the selector key."""
+        """Return the error for a missing or unknown value of the selector key."""
         if not word:
             what = f"the key '{self.selector_key}' is missing"
             return ConfigError(what, where=where, allowed=", ".join(self.classes))
@@ -56,7 +56,7 @@ class SectionVariants:
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
-    """Alternative settings classes that a type annotation allows. None for other types."""
+    """Alternative settings classes that a type annotation allows; None if it allows no settings class."""
     bare, markers = options.split_annotated(hint)
     nullable = type(None) in get_args(bare)
     among = next((marker for marker in markers if isinstance(marker, options.RegistryChoice)), None)
@@ -71,7 +71,7 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
 
 
 def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
-    """Make the error for an unknown key, with the nearest allowed key and the sections that have this key."""
+    """Return the error for an unknown key, with the nearest allowed key and the sections that have this key."""
     said = unknown_name_error_arguments(name, known)
     homes = list(dict.fromkeys(_sections_with_key(RunSettings, name)))
     hints = [said["hint"]] if said["hint"] else []
@@ -84,10 +84,10 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
 
 
 def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
-    """Yield completions of a dotted key prefix, up to the next dot or to `=` where a value follows.
+    """Yield completions of a dotted key prefix, up to the next dot or, before a value, to `=`.
 
-    `hint` is the type of what stands behind the keys `at`, each with its dot, and `raw` what a file says there: its
-    names count where users choose them.
+    `hint` is the type of the value at the key `at`, which ends with a dot. `raw` is the file's value at this key; it
+    supplies names that users choose.
     """
     sections, values = section_variants_from_annotation(hint), options.mapping_value_type(hint)
     named = section_variants_from_annotation(values)
@@ -110,7 +110,7 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
 
 
 def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
-    """Yield descriptions of the sections that have a key; NAME represents a user-chosen name."""
+    """Yield descriptions of the sections that have a key. NAME represents a name chosen by the user."""
     for inner, step in ((options.mapping_value_type(hint), ".NAME"), (options.variadic_tuple_entry_type(hint), "")):
         if inner is not None:
             yield from _sections_with_key(inner, name, at + step)
@@ -178,6 +178,6 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
 
 
 def option_info_from_annotation(hint: Any) -> options.OptionInfo:
-    """Find the meaning and unit of an option (`OptionInfo`) in a type annotation. Without one it is empty."""
+    """Return the `OptionInfo` (meaning and unit) in a type annotation, or an empty one."""
     markers = reversed(options.split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())

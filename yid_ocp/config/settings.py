@@ -1,7 +1,7 @@
-"""Settings of one run, with a dataclass for each section of a configuration file.
+"""Settings of one run: a frozen dataclass for each section of a configuration file, filled by `reader`.
 
-Plain frozen dataclasses, filled by `reader`. Options of solvers, problem, sensors, cables, tracking and diagnosis are
-defined where they are used (`yid_ocp.options`); the sections here hold those classes.
+Options of solvers, problem, sensors, cables, tracking and diagnosis are defined in their own modules (see
+`yid_ocp.options`). The sections here contain these classes.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class _MeasuredClampSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class GraspSettings:
-    """A grasp, which constrains a frame of the object to a frame of the robot."""
+    """A grasp: a constraint between a frame of the object and a frame of the robot."""
 
     holder_frame: Annotated[str, OptionInfo("frame of the robot, or a clamp")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
@@ -107,7 +107,7 @@ class EffectSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class JointActuationSettings:
-    """Moving joints of the robot and how each is driven."""
+    """Moving joints of the robot, and how each is driven."""
 
     joints: Annotated[_Names | None, OptionInfo("in configuration order; all movable ones when absent")] = None
     mode: Annotated[
@@ -164,7 +164,7 @@ class FrictionLawSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings:
-    """Mechanical model of robot and flexible object, with grasps, clamps, frames and effects."""
+    """Mechanical model of robot and flexible object: grasps, clamps, frames and effects."""
 
     robot: Annotated[
         _FilePath | None,
@@ -303,7 +303,7 @@ class ParameterSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSettings(ProblemOptions):
-    """Settings of the estimation problem for residuals, initial state and time discretisation."""
+    """Settings of the estimation problem: residuals, initial state and time discretisation."""
 
     time_step: Annotated[
         Annotated[float, Gt(0), Le(0.1)] | Literal["auto"],
@@ -317,7 +317,7 @@ class ProblemSettings(ProblemOptions):
 
     @property
     def time_step_or_default(self) -> float:
-        """Configured time step [s]. It is 10 ms for `auto` without a recording to choose by."""
+        """Configured time step [s], or 10 ms for `auto`, which needs a recording to choose the step."""
         return 0.01 if self.time_step == "auto" else self.time_step
 
 
@@ -378,7 +378,7 @@ class _CompareSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class _VirtualFramesSettings:
-    """A MuJoCo experiment and its virtual depth camera, used when no recorded frames are given."""
+    """A MuJoCo experiment with a virtual depth camera, used if there are no recorded frames."""
 
     seed: Annotated[int, Ge(0), OptionInfo("of motion, noise and camera")] = 0
     duration: Annotated[float, Gt(0), Le(600), OptionInfo("of the experiment", "s")] = 5.0
@@ -461,7 +461,7 @@ class OutputSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """Resolved settings of one run, with all sections of its configuration file."""
+    """Settings of one run: all sections of its configuration file."""
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
     plugins: Annotated[
@@ -495,7 +495,7 @@ class RunSettings:
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def describe_location(self, *path: str | int) -> str:
-        """Describe where a setting stands by file, line and key, for the `where` of an error."""
+        """Location of a setting (file, line and key), for the `where` of an error."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
             if path[:count] in self.key_locations:
@@ -503,12 +503,12 @@ class RunSettings:
         return f"{self.config_file}: {key}" if self.config_file else key
 
     def config_error(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
-        """Make a `ConfigError` that names file, line and key of a setting. It is not raised here."""
+        """Return a `ConfigError` with file, line and key of a setting, for the caller to raise."""
         return ConfigError(what, where=self.describe_location(*path), allowed=allowed, hint=hint)
 
 
 def config_yaml_with_defaults(run: RunSettings) -> str:
-    """Write a run's settings as YAML with every default. `load_config` reads the same run back from it."""
+    """Return a run's settings as YAML text with all defaults. `load_config` reads the same run from it."""
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 120

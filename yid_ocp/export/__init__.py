@@ -1,1 +1,1 @@
-"""Export models, equations and signals."""
+"""Export of models, equations and signals."""

@@ -1,4 +1,4 @@
-"""Export a step's equations as CasADi functions with C code, and as a LaTeX document."""
+"""Export of a step's equations as CasADi functions with C code, and as a LaTeX document."""
 
 from __future__ import annotations
 
@@ -52,10 +52,9 @@ _FORCE_AND_CONSTRAINT_TERMS = {
 def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, ...]:
     """The CasADi functions that `export_step_functions` writes.
 
-    `rows` (del, internal, constraint, p1) and `rows_by_theta` of `_ARGUMENT_NAMES`, `rows_by_unknowns` (by q1, z1, lam)
-    where it is not too large, `points` (q, theta) to the places of the sensors' points [m], and `mechanics` (q, v,
-    theta) to mass matrix, dL/dq and dL/dv of the bodies. Placements and masses that depend on internal coordinates take
-    them at zero in the last two.
+    `rows` (del, internal, constraint, p1), `rows_by_theta` and, if not too large, `rows_by_unknowns` (q1, z1, lam) take
+    `_ARGUMENT_NAMES`. `points` maps (q, theta) to positions of the sensors' points [m]. `mechanics` maps (q, v, theta)
+    to mass matrix, dL/dq and dL/dv of the bodies. The last two set internal coordinates to zero.
     """
     e, system = symbols.equations, symbols.equations.system
     names, blocks = zip(*((block.name, block.expressions) for block in symbols.row_blocks), strict=True)
@@ -85,8 +84,8 @@ def export_step_functions(
 ) -> tuple[Path, ...]:
     """Write a step's CasADi functions as `NAME.casadi` files and as `equations.c`, with `names.json`.
 
-    `names.json` gives the values of theta beside the parameters' names, and the time step [s]. Returns the files
-    written; `OutputError` where the folder, made if absent, or a file cannot be written.
+    `names.json` contains the parameters' names and values `theta`, and the time step [s]. `folder` is made if absent.
+    Returns the written files. Raises `OutputError` if the folder or a file cannot be written.
     """
     folder, functions, written = make_folder(folder), _exported_step_functions(symbols), []
     for function in functions:
@@ -111,9 +110,10 @@ def export_step_functions(
 def write_equation_sheet(
     path: Path, symbols: NamedStepEquations, theta: Array, free: Sequence[str], time_step: float
 ) -> None:
-    """Write a step's equations as a LaTeX document. `OutputError` if the file cannot be written.
+    """Write a step's equations as a LaTeX document. Raises `OutputError` if the file cannot be written.
 
-    Values `theta` are filled in for all parameters but the `free` ones, which stay symbols; a table lists their values.
+    Parameters in `free` stay symbols, and a table lists their values. The other parameters are replaced by their values
+    from `theta`.
     """
     system = symbols.equations.system
     values = dict(zip(system.parameters.names, map(float, theta), strict=True))
@@ -151,7 +151,7 @@ def _rules(symbols: NamedStepEquations, time_step: float) -> list[str]:
 
 
 def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
-    """Joints with their placements, and bodies with their masses, all in numbers."""
+    """Joints with their placements, and bodies with their masses, as numbers."""
     built = system_with_numeric_parameters(system, system.parameters.vector(values))
     mechanism = built.mechanism
     roles = dict.fromkeys(system.driven, "driven") | dict.fromkeys(system.prescribed, "prescribed")
@@ -163,7 +163,7 @@ def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
         turned = "" if np.allclose(rotation, np.eye(3)) else _matrix(rotation)
         axis, place = _vector(joint.axis), _vector(joint.placement.translation)
         joints.append((name, joint.kind, parent, roles.get(joint.name, "free"), axis, place, turned))
-        # what gravity pulls at may differ from the mass; only inertia is listed
+        # weight may differ from mass times gravity; only inertia is listed
         body = merge_bodies(replace(b, gravity_fraction=None) for b in joint.bodies)
         if body is not None:
             tensor = _matrix(np.array(ca.DM(body.inertia_about_com)))
@@ -178,7 +178,7 @@ def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
 
 
 def _rows(symbols: NamedStepEquations, block: SymbolBlock, values: dict[str, float], free: Sequence[str]) -> list[str]:
-    """Every row of a block: whole where it is short, else with the bodies' part, or all of it, as a letter."""
+    """Every row of a block: in full if it is short, else with the bodies' part, or all of it, as a symbol."""
     e, system = symbols.equations, symbols.equations.system
     fixed = [p for p in system.parameters if p.name not in free]
     old = ca.vertcat(*(p.symbol for p in fixed)) if fixed else ca.SX(0, 1)

@@ -1,4 +1,4 @@
-"""Export a system's tree as URDF or SDF, and list the parameters and effects that a format can express."""
+"""Export of a system's tree as URDF or SDF, and of which parameters and effects a format can express."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ _MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
 
 
 def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
-    """Convert a system to URDF text, with damping, friction and inertias. Springs and grasps are left out.
+    """Convert a system to URDF text with damping, friction and inertias. Springs and grasps are omitted.
 
-    A `mujoco` element gives MuJoCo the least masses that it asks for; others read over it.
+    A `mujoco` element sets the minimum masses that MuJoCo requires. Other readers ignore it.
     """
     tree, terms = _tree(system, values)
     root = ElementTree.fromstring(mechanism_to_urdf(tree))
@@ -53,7 +53,7 @@ def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
 
 
 def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
-    """Convert a system to an SDF 1.10 world. Joints have springs, damping and friction; grasps are left out."""
+    """Convert a system to an SDF 1.10 world. Joints have springs, damping and friction. Grasps are omitted."""
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
@@ -63,7 +63,7 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
         _sdf_link(model, tree, i)
         _sdf_joint(model, tree, joint, terms.get(joint.name, JointDynamicsTerms()))
     for name, frame in tree.frames.items():
-        # what stands in the world is placed from the model, which stands at its origin
+        # frames of the world are placed in the model frame, which is at the world's origin
         attached = {} if frame.joint_index < 0 else {"attached_to": f"{tree.joints[frame.joint_index].name}_link"}
         _sdf_pose(SubElement(model, "frame", {"name": f"frame_{name}", **attached}), frame.placement)
     return _xml_text(root)
@@ -75,7 +75,7 @@ def _xml_text(root: Element) -> str:
 
 
 def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, JointDynamicsTerms]]:
-    """The tree in numbers, its bodies without weights of their own, and what its joints have."""
+    """The tree with numbers and without separate weights of bodies, and the dynamics of its joints."""
     tree = system.numeric_mechanism(values)
     joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
     return replace(tree, joints=joints), system_joint_dynamics_terms(system, ParameterEvaluator(system, values))
@@ -125,24 +125,24 @@ def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class FeatureExportSupport:
-    """Ability of an export format to express a parameter or effect. It names the element or the obstacle."""
+    """How an export format expresses a parameter or effect: the element that holds it, or the obstacle."""
 
     status: _SupportStatus
     how: str
 
     @property
     def is_lost(self) -> bool:
-        """Whether the format leaves out something that moves or holds. Effects on sensors alone do not count."""
+        """Whether the format omits a feature that changes motion or forces. Effects on sensors alone do not count."""
         return self.status == "not representable" and self != _READING
 
 
 def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
-    """The worst status of several parts that belong together, with the explanations of those that have it."""
+    """The worst status of several parts, with the explanations of the parts that have it."""
     status = max((part.status for part in parts), key=get_args(_SupportStatus).index)
     return FeatureExportSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
 
 
-# what each format calls the aspects that it has; others it has not
+# each format's elements for the aspects that it supports
 _MJCF = {
     "stiffness": "stiffness of joints",
     "rest": "springref of joints",
@@ -195,7 +195,7 @@ _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 
 def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
-    """Support of an export format for each effect of a system. Formats: `mjcf`, `urdf`, `sdf`."""
+    """Support of an export format (`mjcf`, `urdf` or `sdf`) for each effect of a system."""
     value, found = ParameterEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
@@ -213,7 +213,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
 def format_support_by_parameter(
     system: System, effects: Mapping[str, FeatureExportSupport], form: str
 ) -> dict[str, FeatureExportSupport]:
-    """Support of an export format for each parameter. Parameters of an effect have its effect's support."""
+    """Support of an export format for each parameter. Parameters of an effect have the support of this effect."""
     found = {}
     for entry in system.parameters:
         owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_depending_on_symbols(system, entry.symbol))

@@ -1,4 +1,4 @@
-"""Export signals as CSV tables, ROS 2 messages in an MCAP file, and ROS joint trajectories."""
+"""Export of signals as CSV tables, ROS 2 messages in an MCAP file, and ROS joint trajectories."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _WORLD_FRAME = "world"
 
 @dataclass(frozen=True)
 class RosTopicTimeSeries:
-    """Time series of one ROS topic at times t (M,) [s]. Times without any finite value get no message.
+    """Time series of one ROS topic at times t (M,) [s]. A time without any finite value gets no message.
 
-    `values` are each (M, n): of joints `position`, `velocity` and `effort`, with as many columns as there are `names`;
-    of all else `xyz`, n = 3, the forces of a wrench.
+    For joints, `values` holds `position`, `velocity` and `effort`, each (M, len(names)). For other kinds it holds `xyz`
+    (M, 3), for a wrench the forces.
     """
 
     topic: str
@@ -47,8 +47,8 @@ class RosTopicTimeSeries:
 def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[str]) -> float:
     """Write ROS time series to one MCAP file with message definitions, sorted by time.
 
-    Returns the shift added to all times because stamps cannot be negative: whole seconds, usually zero [s]. Raises
-    `OutputError` when `rosbags` is not installed, there is nothing to write, or the file cannot be written.
+    Returns a shift [s] of whole seconds that was added to all times, because stamps cannot be negative; it is usually
+    zero. Raises `OutputError` if `rosbags` is not installed, there is nothing to write, or the file cannot be written.
     """
     path = Path(path)
     try:
@@ -66,7 +66,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
     made.sort(key=lambda entry: entry[:2])
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # a bag is a folder; its one file is all that is wanted
+        # a bag is a folder; only its one file is needed
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             bag = Path(folder) / "bag"
             with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -109,7 +109,7 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
 
     def content(i: int) -> list[Any]:
         if signal.kind == "joints":
-            # none at all of what is not known
+            # an unknown quantity has an empty array
             known = (signal.values.get(name) for name in ("position", "velocity", "effort"))
             rows = (np.zeros(0) if values is None else np.ascontiguousarray(values[i], float) for values in known)
             return [list(signal.names), *rows]
@@ -126,10 +126,10 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
 
 
 def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write each group as a table `<group>.csv`, with all digits and the columns that `read_csv` knows.
+    """Write each group as a table `<group>.csv`, with all digits and the column names that `read_csv` reads.
 
-    Standard deviations, the kind of effort, sensor, frame, pose and clock are not in the tables; a point not seen is an
-    empty cell. Returns the files, joints first; `OutputError` where the folder or a file cannot be written.
+    The tables omit standard deviations, the kind of effort, sensor, frame, pose and clock. The cells of an unseen point
+    are empty. Returns the files, joints first. Raises `OutputError` if the folder or a file cannot be written.
     """
     folder = make_folder(folder)
     written = []
@@ -154,7 +154,7 @@ def joint_trajectory_message(
 ) -> dict[str, Any]:
     """Build a ROS trajectory_msgs/JointTrajectory message of nj joints as a dict.
 
-    Times t (N,) count from the start [s]; all others are (N, nj). See
+    Times t (N,) [s] count from the start; the other arrays are (N, nj). See
     https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html
     """
     points = []

@@ -190,7 +190,7 @@ class Effect:
         return output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """Return the true value of a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
+        """Return the true value of a recorded `joints.position.JOINT` or `joints.effort.JOINT`, given `effort`."""
         return reading
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
