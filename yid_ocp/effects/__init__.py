@@ -1,6 +1,7 @@
 """The library of unmodelled effects and their possible locations. A new kind is one file.
 
-A kind's equation, quantities, units, bounds and ranges stand at its class; `docs/howto/extending.md` shows a new one.
+The class of a kind states its equation, quantities, units, bounds and ranges. `docs/howto/extending.md` shows how to
+add a kind.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from yid_ocp.effects.base import ReportedParameterValue as ReportedParameterValu
 from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 
-# kinds of recorded signals on which candidates depend; `nominal_clock` is a sample index times a nominal period
+# kinds of recorded signals on which candidates depend; `nominal_clock` means times computed as sample index x period
 _SENSOR_KINDS = ("joints.position", "joints.effort", "camera", "nominal_clock")
 
 # every file of this folder registers its kinds when it is imported
@@ -28,12 +29,12 @@ for _family in iter_modules(__path__):
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
     """Make an effect of the given kind at a location. `System.with_effects` adds it to a system.
 
-    Its parameters are named `kind@location.parameter`. `values` holds what is not neutral, by parameter; a compliance
-    may be given as its `stiffness`. `ConfigError` of no such kind or parameter or a value outside its bounds,
-    `ModelError` where the system has no such place for it.
+    Its parameters are named `kind@location.parameter`. `values` holds non-neutral values by parameter; a compliance may
+    be given as its `stiffness`. Raises `ConfigError` for an unknown kind or parameter, or a value outside its bounds.
+    Raises `ModelError` if the kind cannot act at this location of the system.
     """
     places = EFFECTS[kind].possible_locations(system)
-    # points may be of any frame, those of the arm included, which are not among `system.point_frames`
+    # a payload or point mass may be at any frame, including frames of the arm that are not in `system.point_frames`
     if location not in places and not (EFFECTS[kind].is_at_point_groups and location.partition("_")[0] == "points"):
         said = {"allowed": "nothing in this system", "hint": "leave it out"}
         said = unknown_name_error_arguments(location, places) if places else said
@@ -49,9 +50,9 @@ def signal_kinds_required_by_any_effect() -> frozenset[str]:
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """List all effect kinds and locations that the system allows and the recorded signals can reveal.
 
-    The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`, or a
-    sensor on a frame such as `wrist:FRAME`, or `points:GROUP`, points with a clock of their own. What works only on
-    prescribed joints is left out where no effort was recorded, for there nothing would show it. `ModelError` of
+    `system` does not contain the candidate effects. Signals are those of `signal_kinds_required_by_any_effect`, a
+    sensor on a frame such as `wrist:FRAME`, or `points:GROUP` for points with a separate clock. Effects on prescribed
+    joints are omitted if no effort was recorded, because they would change no measurement. Raises `ModelError` for
     another signal.
     """
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()

@@ -1,8 +1,8 @@
 """Effects between a motor and its recorded signals, such as backlash, encoder offsets and delays.
 
-Recorded torques drive the model and recorded angles prescribe or guide it, so that these effects reach a driven joint,
-or the angle of a prescribed one, through `corrected_reading`; the effort that a prescribed joint needs is compared with
-the recorded one through `distorted_reading`.
+For inputs of the model (torques and angles of driven joints, angles of prescribed joints) an effect acts through
+`corrected_reading`. For the effort of a prescribed joint, which is compared with the record, it acts through
+`distorted_reading`.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ def _published_motor_joints(system: System) -> tuple[str, ...]:
 
 
 def _geared_joints(system: System) -> tuple[str, ...]:
-    """Names of arm joints whose effort is known; of joints with a servo where there are none."""
+    """Names of arm joints with known effort or, if there are none, of joints with a servo."""
     return _effort_joints(system) or base.servo_joint_names(system)
 
 
 def _limit_definition(lowest: float, unit: str, text: str) -> ParameterDefinition:
-    """Definition of tightness = limit^-16, reported as limit in `unit` from `lowest` on."""
+    """Definition of tightness = limit^-16, reported as limit in `unit`, at least `lowest`."""
     highest, inverse = lowest**-TORQUE_SATURATION_EXPONENT, f"({unit})^-16"
     words = f"{text}, to the power -16"
     tightness = ParameterDefinition("tightness", inverse, 0.0, 0.0, highest, (0.0, highest), words)
@@ -60,14 +60,14 @@ def _effort_arms(system: System) -> tuple[str, ...]:
 
 
 class _DistortedReading(EffectBase):
-    """An error that is added to the reading of one joint."""
+    """An additive error of the reading of one joint."""
 
     quantity: ClassVar[str] = "joints.position"
     required_sensors = frozenset({"joints.position"})
     possible_locations = _effort_joints
 
     def _error(self, effort: ca.SX) -> ca.SX:
-        """Measured less true value at an effort, the joint's own where the model knows it, else the recorded one."""
+        """Measured minus true value at an effort: the joint's modelled effort if available, else the recorded one."""
         raise NotImplementedError
 
     def _is_own(self, channel: str) -> bool:
@@ -84,7 +84,7 @@ class _DistortedReading(EffectBase):
 
 @EFFECTS.register("encoder_offset")
 class EncoderOffset(_DistortedReading):
-    """Constant offset of the measured from the true angle. Path, start and tracked angles are corrected for it."""
+    """Constant offset of the measured angle. Prescribed path, initial state and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
     required_excitation = "its orientation to gravity"
@@ -116,8 +116,8 @@ class SeriesElasticity(_DistortedReading):
 class Backlash(_DistortedReading):
     """Gear backlash with the encoder on the motor side. The measured angle is q + width/2 tanh(effort/`_PLAY_TORQUE`).
 
-    A servo acts on what its encoder reads: there the play z that is taken up solves z = width/2 tanh(torque(q + z)/
-    `_PLAY_TORQUE`) in every step, an internal coordinate without a memory.
+    A servo acts on the reading of its encoder. For a joint with a servo, the present play z is therefore an internal
+    coordinate without memory, which solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every step.
     """
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
@@ -127,7 +127,7 @@ class Backlash(_DistortedReading):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """The taken-up backlash `play` of a joint with a servo. Other joints have none."""
+        """Name `play` (present backlash) for a joint with a servo. Other joints have no internal coordinate."""
         return ("play",) if location in system.servos else ()
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -135,7 +135,7 @@ class Backlash(_DistortedReading):
             return StepTerms()
         [name] = self.internal_coordinate_symbols
         row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
-        # its value after the step: a mean over the step would have it ring
+        # value after the step, because a mean over the step would oscillate
         play = state.z[row] + state.h / 2 * state.z_rate[row]
         if self.location not in state.system.servos:  # the joint is held for a while, and nothing takes the play up
             return StepTerms(internal_equations={name: play})
@@ -156,7 +156,7 @@ class Backlash(_DistortedReading):
         return super().distorted_reading(channel, output, state)
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        # a servo's coordinate follows from the motion, and its command is of the motor's side
+        # a servo's joint angle is not an input, and its command refers to the motor side
         return reading if self.internal_coordinate_symbols else super().corrected_reading(channel, reading, effort)
 
 
@@ -170,9 +170,9 @@ class _DistortedEffort(_DistortedReading):
 
 @EFFECTS.register("effort_gain")
 class _EffortGain(_DistortedEffort):
-    """Scale error of a joint's effort: measured effort = scale x true effort; a negative scale is a flipped sign.
+    """Scale error of a joint's effort: measured effort = scale x true effort. A negative scale is a flipped sign.
 
-    Kept inside as 1/scale, by which a recorded torque is multiplied, so that a driven joint's may go through zero.
+    The internal parameter is 1/scale, which multiplies a recorded torque, so that a driven joint's value can pass zero.
     """
 
     equation = "measured effort = scale x true"
@@ -184,7 +184,8 @@ class _EffortGain(_DistortedEffort):
     )
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        # compared efforts are linear in scale, torques that drive in 1/scale: a flipped sign is two away either way
+        # compared efforts are linear in scale, driving torques in 1/scale: in both cases a flipped sign is a distance
+        # of two
         [name] = self.parameters.names
         value = start.get(name, 1.0)
         if abs(value - 1) < 1:
@@ -216,13 +217,13 @@ class EffortOffset(_DistortedEffort):
 
 
 class _LateTorque(EffectBase):
-    """Torque that acts after its record; the measured effort of a prescribed joint is early by as much."""
+    """Torque that acts after its record. For a prescribed joint, the measured effort is early by the same time."""
 
     required_excitation = "when it is read"
     required_sensors = frozenset({"joints.effort"})
 
     def _lateness(self, channel: str, joints: tuple[str, ...], size: ca.SX) -> ca.SX:
-        """`size` for a torque that drives one of the joints, its negative for their measured efforts, else zero."""
+        """`size` for a driving torque of one of the joints, -`size` for their measured efforts, else zero."""
         signs = {f"{name}.{joint}": sign for name, sign in (("torque", 1), ("joints.effort", -1)) for joint in joints}
         return signs.get(channel, 0) * size
 
@@ -231,8 +232,8 @@ class _LateTorque(EffectBase):
 class EffortDelay(_LateTorque):
     """Delay of a joint's torque. The torque that acts at t was recorded at t - delay.
 
-    For a prescribed arm the recorded effort at t is what the motion needs at t + delay; a negative delay means that the
-    effort is recorded late.
+    For a prescribed arm, the effort recorded at t is the effort of the motion at t + delay. A negative delay means that
+    the effort is recorded late.
     """
 
     equation = "the torque that acts at t was recorded at t - delay"
@@ -247,11 +248,11 @@ class EffortDelay(_LateTorque):
 
 @EFFECTS.register("effort_lag")
 class EffortLag(_LateTorque):
-    """First-order lag of a joint's torque z behind its command. The equation is time_constant dz/dt = command - z.
+    """First-order lag of a joint's torque z after its command, time_constant dz/dt = command - z.
 
-    The recorded torque is the command, of a prescribed joint too: the effort that its motion needs follows the recorded
-    one. A negative time constant there means that the recorded effort follows the one that is needed, as one behind a
-    sensor's filter does. Before a recording begins both are what they are at its start.
+    The recorded torque is the command. For a prescribed joint, the required effort follows the recorded effort; with a
+    negative time constant, the recorded effort follows the required one, as with a filtered sensor. Before the start of
+    a recording, both are constant at their initial values.
     """
 
     equation = "time_constant dz/dt = command - z"
@@ -268,7 +269,7 @@ class EffortLag(_LateTorque):
 
 
 class _ServoChange(EffectBase):
-    """A position servo that deviates from its data sheet."""
+    """A position servo that differs from its data sheet."""
 
     required_excitation = "how hard it accelerates"
     required_sensors = frozenset({"joints.position"})
@@ -284,7 +285,7 @@ class _ServoChange(EffectBase):
 
 @EFFECTS.register("servo_gain")
 class ServoGain(_ServoChange):
-    """Scale factor on the torque that a servo demands. Gain, supply voltage or motor may differ from the model's."""
+    """Scale factor on a servo's requested torque, for a gain, supply voltage or motor other than in the model."""
 
     equation = "demand = scale (gain (u - q) - damping v)"
     declared_parameters = (
@@ -293,13 +294,13 @@ class ServoGain(_ServoChange):
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         changed = {"gain": servo.gain * self["scale"]}
-        # a counter-voltage is the motor's, whatever its gain
+        # back-EMF depends on the motor, not on the gain
         return changed if servo.motor_kind == "dc" else changed | {"damping": servo.damping * self["scale"]}
 
 
 @EFFECTS.register("supply_voltage")
 class SupplyVoltage(_ServoChange):
-    """Scale factor on a dc motor's supply voltage. It scales the torque per duty cycle and its limit."""
+    """Scale factor on a DC motor's supply voltage. It scales the torque per duty cycle and the torque limit."""
 
     equation = "torque = clip(scale gain (u - q), scale limit) - damping v"
     possible_locations = _dc_motor_joints
@@ -315,7 +316,7 @@ class SupplyVoltage(_ServoChange):
 
 @EFFECTS.register("back_emf")
 class _BackEmf(_ServoChange):
-    """Scale factor on a direct-current motor's back-EMF damping kt^2/R, its braking torque per speed."""
+    """Scale factor on a DC motor's back-EMF damping kt^2/R, its braking torque per speed."""
 
     equation = "torque = clip(gain (u - q)) - scale damping v"
     required_excitation = "how fast it moves"
@@ -330,9 +331,9 @@ class _BackEmf(_ServoChange):
 
 @EFFECTS.register("current_limit")
 class CurrentLimit(_ServoChange):
-    """Current limit of a dc motor. The current is motor torque / published torque constant kt.
+    """Current limit of a DC motor. The current is motor torque / published torque constant kt.
 
-    Kept inside as limit^-16, as `ServoSaturation` has it; beyond the duty's limit it also takes from braking.
+    The internal parameter is limit^-16, as in `ServoSaturation`. Unlike the duty limit, it also limits braking torque.
     """
 
     equation = "torque = kt clip(torque/kt, limit)"
@@ -365,14 +366,15 @@ class ServoDelay(_ServoChange):
 class ServoSaturation(_ServoChange):
     """Additional smooth torque limit of a servo. The torque is demand / (1 + |demand/limit|^16)^(1/16).
 
-    Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there.
+    The internal parameter is limit^-16. It adds to the model's own limit, is neutral at zero, and has a nonzero
+    derivative at zero.
     """
 
     equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of limit^-16. Reports show `limit`, at least `_MIN_LIMIT_FRACTION` x effort limit."""
+        """Definition of limit^-16. Reports show `limit`, at least `_MIN_LIMIT_FRACTION` x effort limit of the joint."""
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
         torque = "N m" if joint.coordinate_unit == "rad" else "N"

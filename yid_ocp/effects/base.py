@@ -1,4 +1,4 @@
-"""Base class of all effects, their parameter definitions, and the places in a system where effects can act."""
+"""Base class of all effects, their parameter definitions, and the locations in a system where effects can act."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ORDERED_EXCITATION_DESCRIPTIONS = (
     *("its orientation to gravity", "how hard it pulls at its ends", "when it is read", "the camera's pose"),
     "how long it is",
 )
-"""What a motion has to vary to excite an effect of the library, in the order in which messages list it."""
+"""What a motion must vary to excite an effect of the library, in the order in which messages list it."""
 _BAXTER_EFFORT_LIMIT = 50.0  # on which the ranges of arm effects are based; they scale with the limit [N m]
 _SAME_POINT_DISTANCE = 1e-6  # nearer points of arms, in all configurations, count as one [m]
 _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -32,7 +32,7 @@ _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class ParameterDefinition:
-    """Definition of one effect parameter with unit, neutral value, bounds, prior range and reported form."""
+    """Definition of one effect parameter: unit, neutral value, bounds, prior range and reported form."""
 
     name: str
     unit: str
@@ -42,15 +42,15 @@ class ParameterDefinition:
     prior_range: tuple[float, float]  # range (low, high) that an engineer would expect
     description: str
     is_shape_parameter: bool = False  # no influence while the others are neutral (a relaxation time, a yield angle)
-    # `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
-    # goes through infinity when it changes its sign; p in value = reported value^-p
+    # `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or for a factor that
+    # is infinite where its sign changes; p in value = reported value^-p
     reported_reciprocal: str = ""
     reciprocal_power: int = 1
-    # what bounds and range are multiples of at a location; 1 where it is absent
+    # factor on bounds and range at a location; 1 if absent
     range_scale: Callable[[System, str], float] | None = None
 
     def _at_location(self, system: System, location: str) -> ParameterDefinition:
-        """The definition with the bounds and the range that hold at a location."""
+        """The definition with bounds and range scaled for a location."""
         if self.range_scale is None:
             return self
         scale, (low, high) = self.range_scale(system, location), self.prior_range
@@ -59,12 +59,12 @@ class ParameterDefinition:
 
     @property
     def reported_name_and_unit(self) -> tuple[str, str]:
-        """Name and unit of the parameter in reports. A compliance has those of its stiffness."""
+        """Name and unit of the parameter in reports. For a compliance they are those of the stiffness."""
         name, _, unit = self.reported_reciprocal.partition(" ")
         return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
 
     def to_internal(self, value: float) -> float:
-        """Convert a nonzero reported value to the internal value. It is a reciprocal power if reports invert it."""
+        """Convert a nonzero reported value to the internal value, which may be a reciprocal power of it."""
         return value**-self.reciprocal_power if self.reported_reciprocal else value
 
 
@@ -79,38 +79,37 @@ class ReportedParameterValue:
 
 @dataclass(frozen=True)
 class EffectBase(Effect):
-    """Base class of all effects. A subclass overrides methods for what it changes."""
+    """Base class of all effects. A subclass overrides the methods for what it changes."""
 
     definitions: tuple[ParameterDefinition, ...] = ()  # definitions of `parameters`, scaled for the location
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
     equation: ClassVar[str] = ""  # equation that the kind adds, as text
-    # what a motion has to vary to distinguish the kind from others: one of `ORDERED_EXCITATION_DESCRIPTIONS`, or words
-    # that continue "vary ..."
+    # what a motion must vary to distinguish the kind from others: one of `ORDERED_EXCITATION_DESCRIPTIONS`, or text
+    # that continues "vary ..."
     required_excitation: ClassVar[str] = ""
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
-    # whether its presence at one location says nothing about others, as for a mass; not so for friction
+    # whether the effect at one location implies nothing about other locations, as for a mass (unlike friction)
     is_local: ClassVar[bool] = False
-    # whether it is a recorded torque's constant error, whose size recordings state
+    # whether it is a constant error of a recorded torque, whose size recordings state
     is_torque_offset: ClassVar[bool] = False
-    # whether a location is a sensor, `GROUP:FRAME`, which a diagnosis tries where recordings hold it
+    # whether a location is a sensor `GROUP:FRAME`, which a diagnosis tries if recordings contain it
     is_at_recorded_sensor: ClassVar[bool] = False
-    # whether a group of points, by its name, is a location too, which a diagnosis tries where recordings hold it
+    # whether a location may also be the name of a point group, which a diagnosis tries if recordings contain it
     is_at_point_groups: ClassVar[bool] = False
-    # names of all places where the effect can act, as a function of this module gives them, and of those that a
-    # diagnosis tries: all where absent
+    # names of all locations where the effect can act, and of those that a diagnosis tries (default: all)
     possible_locations: ClassVar[Callable[[System], Collection[str]]]
     candidate_locations: ClassVar[Callable[[System], Collection[str]] | None] = None
     declared_parameters: ClassVar[tuple[ParameterDefinition, ...]] = ()  # put at a location by `parameter_definitions`
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Define the effect's parameters, with bounds and prior ranges scaled for the location."""
+        """Return the definitions of the effect's parameters, with bounds and prior ranges scaled for the location."""
         return tuple(definition._at_location(system, location) for definition in cls.declared_parameters)
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Names of the effect's own states besides the joints' motion. There are none by default."""
+        """Names of the effect's own states, in addition to the joints' motion. There are none by default."""
         return ()
 
     @property
@@ -119,7 +118,7 @@ class EffectBase(Effect):
         return {}
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Parameter values of a second starting point, in addition to `start`. None if one start is enough."""
+        """Parameter values of a second starting point, in addition to `start`. None if one start is sufficient."""
         return None
 
     def __getitem__(self, parameter: str) -> ca.SX:
@@ -137,17 +136,18 @@ class EffectBase(Effect):
 
     @property
     def amplitude_names(self) -> tuple[str, ...]:
-        """Names of the amplitude parameters. The effect vanishes when they are neutral."""
+        """Names of the amplitude parameters. The effect vanishes if they are neutral."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if not q.is_shape_parameter)
 
     @property
     def shape_parameter_names(self) -> tuple[str, ...]:
-        """Names of shape parameters, such as a relaxation time. Neutral amplitudes make them irrelevant."""
+        """Names of shape parameters, such as a relaxation time, which have no influence while the amplitudes are
+        neutral."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
     @property
     def prior_ranges(self) -> dict[str, tuple[float, float]]:
-        """Expected low and high value of every parameter in its unit."""
+        """Expected low and high value of every parameter, by name, in its unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
     def parameters_as_reported(
@@ -155,7 +155,8 @@ class EffectBase(Effect):
     ) -> dict[str, ReportedParameterValue]:
         """Convert the parameters to their reported form. For example, a compliance is reported as a stiffness.
 
-        Values and standard deviations are nominal and NaN where absent; that of C^(-1/p) is C^(-1/p) std(C)/(p C).
+        Missing `values` are nominal, missing `stds` are NaN. The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p
+        C).
         """
         result = {}
         for definition, entry in zip(self.definitions, self.parameters, strict=True):
@@ -170,7 +171,7 @@ class EffectBase(Effect):
         return result
 
     def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> EffectBase:
-        """Adapt prior ranges to the largest joint angle of each segment in the data [rad]."""
+        """Return the effect with prior ranges adapted to the largest joint angle of each segment in the data [rad]."""
         return self
 
 
@@ -239,7 +240,7 @@ def grasp_names(system: System) -> tuple[str, ...]:
 
 
 def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
-    """Joint names by arm. An arm is named by its grasp, else its joints' prefix (left, right), else `gripper`."""
+    """Joint names by arm. An arm is named after its grasp, else its joints' prefix (left, right), else `gripper`."""
     joints, tree = arm_joint_names(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
@@ -259,7 +260,7 @@ def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
 
 
 def _arm_tip_frames(system: System) -> tuple[str, ...]:
-    """Names of one frame at the end of every arm without a grasp, a gripper's or hand's where there is one."""
+    """Names of one frame at the end of every arm without a grasp, preferably that of a gripper or hand."""
     tree = system.mechanism
     tips = []
     for name, joints in joint_names_by_arm(system).items():
@@ -273,18 +274,18 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
 
 
 def effort_limit_over_baxter(system: System, joint: str) -> float:
-    """Ratio of a joint's effort limit to that of Baxter's joints, at least 1. Unlimited joints have 1."""
+    """Effort limit of a joint relative to that of Baxter's joints, at least 1. It is 1 for unlimited joints."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
 
 
 def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
-    """Names of frames at the ends of the arms' links, except fixed or coincident points."""
+    """Names of frames at the ends of the arms' links, without fixed or coincident points."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
     if not own:
         return ()
-    # a link's own frame is where the link before it ends
+    # the frame of a link is at the end of the previous link
     first = {f.joint_index: name for name, f in list(tree.frames.items())[::-1] if f.joint_index in own}
     names = (*_arm_tip_frames(system), *(first[joint] for joint in sorted(first)))
     held = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
@@ -301,9 +302,9 @@ def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
 
 
 def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
-    """Choose one frame for every arm link with mass. Grasps go first, then grippers, then the link's first frame.
+    """Choose one frame for every arm link with mass: that of a grasp, else of a gripper, else the link's first frame.
 
-    A finger, what slides on a link and carries nothing else, counts as part of that link.
+    A finger (a prismatic joint without child joints) counts as part of the link that carries it.
     """
     tree = system.mechanism
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
@@ -331,7 +332,7 @@ def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def segment_name_of_frame(system: System, frame: str) -> str | None:
-    """Name of the segment whose link carries the frame. None if no segment does."""
+    """Name of the segment that contains the frame, or None."""
     index = system.mechanism.frame(frame).joint_index
     if index < 0:
         return None
@@ -347,7 +348,7 @@ def elastic_joints_within_segment(system: System, segment: str) -> tuple[Elastic
 def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
-    """Define an arm joint's parameter, neutral at zero. Bound and range grow with the effort limit."""
+    """Define an arm joint's parameter, neutral at zero. Bound and range are scaled by the effort limit."""
     prior, scale = (0.0, expected), effort_limit_over_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
@@ -355,13 +356,13 @@ def effort_limit_scaled_parameter_definition(
 def compliance_parameter_definition(
     unit: str, upper: float, prior: tuple[float, float], place: str, reported: str
 ) -> ParameterDefinition:
-    """Define a compliance parameter, neutral at zero. `reported` is the stiffness unit in reports."""
+    """Define a compliance parameter, neutral at zero. `reported` is the unit of its stiffness in reports."""
     text, said = f"compliance of the {place}", f"stiffness {reported}"
     return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 
 
 def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
-    """Generalized force with one nonzero entry, `value` at the joint, shape (n, 1)."""
+    """Generalized force (n, 1) with one nonzero entry, `value` at the joint."""
     force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force
@@ -370,7 +371,7 @@ def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.S
 def with_changed_joint_bodies(
     system: System, joints: Collection[str], change: Callable[[tuple[Inertia, ...]], Iterable[Inertia]]
 ) -> System:
-    """Apply `change` to the rigid bodies of the named joints."""
+    """Return the system with `change` applied to the rigid bodies of the named joints."""
     tree = system.mechanism
     changed = tuple(replace(j, bodies=tuple(change(j.bodies))) if j.name in joints else j for j in tree.joints)
     return replace(system, mechanism=replace(tree, joints=changed))

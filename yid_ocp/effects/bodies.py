@@ -35,7 +35,7 @@ class _CarriedBody(NamedTuple):
 
 
 def _carried_body(system: System, joint: int) -> _CarriedBody:
-    """Nominal mass properties of one joint's child bodies, in its frame; at its origin where it carries none."""
+    """Nominal mass properties of one joint's child bodies in its frame; zero mass at its origin without bodies."""
     whole = merge_bodies([replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies])
     if whole is None:
         return _CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
@@ -92,7 +92,7 @@ class _LinkMass(_ScaledBodies):
 
 
 def with_link_mass_parameters(system: System, name: str) -> System:
-    """The system with a factor `JOINT.name` on mass and inertia of every arm link, beside the effect `link_mass`."""
+    """The system with a factor `JOINT.name` on mass and inertia of every arm link, besides the effect `link_mass`."""
     tree, text = system.mechanism, "mass and inertia of the link on {} over those of the URDF"
     factors = {j: Parameter(f"{j}.{name}", 1.0, "1", 0.2, 3.0, text.format(j)) for j in _joints_with_mass(system)}
     joints = tuple(
@@ -125,7 +125,7 @@ class PointMass(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of `mass` [kg]. Its upper bound is the object's mass, or on an arm the arm's payload."""
+        """Definition of `mass` [kg]. The upper bound is the object's mass or, on an arm, the arm's payload limit."""
         upper, expected = _bearable(system, location)
         return (ParameterDefinition("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
 
@@ -140,19 +140,18 @@ class PointMass(EffectBase):
 class Payload(EffectBase):
     """Payload fixed to a frame, with its centre at (mx, my, mz)/mass. A negative mass removes excess mass of the model.
 
-    The place is within `_MAX_PAYLOAD_DISTANCE` of the frame: moments beyond L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 +
-    (`_MAX_COM_SHIFT` M)^2) do not grow any more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is
-    reported. M, C and Sigma are mass, centre and integral of r r' dm about the centre of what the joint carries (M at
-    least 1 kg in L). With e = s + mass (frame - C) the link gets `mass`, the first moment e about C, and the second
-    moment
+    First moments are limited to L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 + (`_MAX_COM_SHIFT` M)^2). The limited and
+    reported moments are s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8). M, C and Sigma are the mass, the centre and
+    the integral of r r' dm about the centre of all bodies of the joint (M is at least 1 kg in L). With e = s + mass
+    (frame - C), the payload adds to the link `mass`, the first moment e about C, and the second moment about C
 
         K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),
-        w(mass) = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4)
+        w(mass) = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4).
 
-    about C. w is 1/mass, and K = e e'/mass that of a point, but for a place further off than `_POINT_INERTIA_DISTANCE`
-    and next to neutral, where all goes smoothly to nothing. About its own centre the link then has Sigma + c h e e',
-    where h is 1 for a mass that is added and (1 + a^4)^(-1/4), a = c e' Sigma^-1 e, for one that is taken away: almost
-    1 while what is taken away was there, and never so large that the link would be left without inertia.
+    Usually w is 1/mass, and K = e e'/mass is the second moment of a point. Only for a location further than
+    `_POINT_INERTIA_DISTANCE`, and near mass zero, w goes smoothly to zero. The second moment of the link about its new
+    centre is Sigma + c h e e'. h is 1 for an added mass. For a removed mass h = (1 + a^4)^(-1/4) with a = c e' Sigma^-1
+    e, which keeps the link's inertia positive and is almost 1 if the removed mass was part of the link.
     """
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
@@ -176,7 +175,7 @@ class Payload(EffectBase):
         return (mass, *moments)
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        # near zero mass no second moment distinguishes the two signs
+        # near zero mass, no second moment distinguishes the two signs
         mass, *moments = (start.get(f"{self.label}.{quantity.name}", 0.0) for quantity in self.definitions)
         opposite = -math.copysign(np.linalg.norm(moments) / _MAX_PAYLOAD_DISTANCE, mass)
         other = float(np.clip(opposite, self.definitions[0].lower, self.definitions[0].upper))
@@ -185,7 +184,7 @@ class Payload(EffectBase):
     def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
-        """Reported mass and acting first moments of the payload. Limited moments have no standard deviation."""
+        """Reported mass and limited first moments of the payload. Moments at their limit have no standard deviation."""
         found = super().parameters_as_reported(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
@@ -204,20 +203,20 @@ class Payload(EffectBase):
         first += mass * (frame.placement.translation - centre)
         second = ca.densify(first @ first.T) * _spread(mass, first, link) - first @ first.T
         tensor = (second[0, 0] + second[1, 1] + second[2, 2]) * ca.SX.eye(3) - second
-        # two bodies, of which one weighs 1 kg, so that nothing is divided by the mass
+        # two bodies, one of 1 kg, to avoid a division by the mass
         one = Inertia(ca.SX(1), centre + first, ca.densify(tensor))
         other = Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3)))
         return base.with_changed_joint_bodies(system, [joint.name], lambda bodies: (*bodies, one, other))
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
-    """Fraction of the first moments that acts; see `Payload`."""
+    """Ratio of limited to given first moments; see `Payload`."""
     most = (_MAX_PAYLOAD_DISTANCE * mass) ** 2 + (_MAX_COM_SHIFT * max(own, 1.0)) ** 2
     return (1 + (ca.dot(moment, moment) / most) ** 4) ** (-1 / 8)
 
 
 def _spread(mass: ca.SX, first: ca.SX, link: _CarriedBody) -> ca.SX:
-    """The factor of e e' in K, 1/mass for a point; see `Payload`."""
+    """Factor of e e' in K, 1/mass for a point; see `Payload`."""
     far = ca.dot(first, first) / _POINT_INERTIA_DISTANCE**2
     inverse = mass**3 / (mass**4 + far**2 + _POINT_INERTIA_MIN_MASS**4)
     if link.mass == 0:
@@ -287,8 +286,8 @@ class RotorInertia(EffectBase):
 class AerodynamicDrag(EffectBase):
     """Quadratic air drag on a segment's links. The force is F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
-    v_n is the velocity of a link's centre normal to the link, r its radius, l its length; |v_n| is rounded off below
-    `_ABS_SMOOTHING_SPEED`.
+    v_n is the velocity of a link's centre normal to the link, with |v_n| smoothed below `_ABS_SMOOTHING_SPEED`. r and l
+    are the link's radius and length. J_c is the Jacobian of its centre.
     """
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
@@ -375,13 +374,11 @@ def _on_bodies(
 ) -> ForceWithDerivativeFactors:
     """Generalized force of wrenches that depend only on their body's motion, with its derivatives.
 
-    With W_j and K_j the sum of wrenches, and of their slopes by the bodies' spatial velocity, over all that joint j
-    moves, S_j its screw and D_j = V_parent(j) x S_j, F_j = S_j . W_j, the columns of `ForceWithDerivativeFactors` are
-    A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because turning a joint i above turns a body and its wrench together,
-    up to the velocity D_i that the turn adds.
-
-    By joint index, `wrenches`, shape (6, 1), are about the world origin and must turn with the body and its velocity;
-    `slopes`, shape (6, 6), are symmetric.
+    `wrenches` (6, 1), by joint index, are about the world origin and must rotate with the body and its velocity.
+    `slopes` (6, 6) are their symmetric derivatives by the spatial velocity. W_j and K_j are the sums of both over all
+    bodies that joint j moves. S_j is its screw, D_j = V_parent(j) x S_j and F_j = S_j . W_j. The columns of
+    `ForceWithDerivativeFactors` are A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because a rotation of joint i rotates
+    body and wrench together, except for the velocity D_i that it adds.
     """
     tree = kinematics.mechanism
     n, screws = len(tree.joints), kinematics.joint_screws

@@ -29,7 +29,7 @@ EFFECT_KINDS_BY_FRICTION_LAW: Mapping[FrictionLawName, tuple[str, ...]] = {
     "load": ("joint_coulomb", "joint_load_friction"),
     "load_stribeck": ("joint_coulomb", "joint_load_friction", "joint_stribeck"),
 }
-"""The ladder of friction laws, each with its effects at a joint in addition to the viscous `JOINT.damping`."""
+"""Friction laws in order of complexity, each with its effects at a joint in addition to `JOINT.damping`."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class _JointFriction(EffectBase):
         return ca.tanh(v / self.sign_smoothing_speed)
 
     def _friction(self, v: ca.SX) -> ca.SX:
-        """The torque that works against the speed v."""
+        """Torque opposite to the speed v."""
         raise NotImplementedError
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -56,7 +56,7 @@ class _JointFriction(EffectBase):
 
 
 def with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
-    """A dry friction whose sign is rounded off below another speed [rad/s]; anything else, or None, as it is."""
+    """The effect with another smoothing speed [rad/s] if it is a joint friction and a speed is given."""
     if speed is None or not isinstance(effect, _JointFriction):
         return effect
     return replace(effect, sign_smoothing_speed=speed)
@@ -108,9 +108,9 @@ class _JointStribeck(_JointFriction):
 class _JointLoadFriction(_JointFriction):
     """Friction that grows with the torque through a gear: F = -share |motor torque - external torque| sgn(v).
 
-    The torque from outside is that of weights and grasps beyond the joint. Both signs are rounded off: that of the
-    speed below `_LOAD_SIGN_SMOOTHING_SPEED`, that of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al.
-    (2024), Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
+    The external torque is that of weights and grasps beyond the joint. The sign of the speed is smoothed below
+    `_LOAD_SIGN_SMOOTHING_SPEED`, the magnitude of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al. (2024),
+    Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
     """
 
     equation = "F = -share |tau_motor - tau_outside| tanh(v/v_s)"
@@ -132,25 +132,24 @@ class _JointLoadFriction(_JointFriction):
         size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
         v = state.v[state.system.mechanism.joint_index(self.location)]
         friction = self["share"] * size * ca.tanh(v / _LOAD_SIGN_SMOOTHING_SPEED)
-        # beside weight and motor it takes energy out, and its size follows both
+        # it dissipates energy, but is not a dissipative force of the speed alone: its size depends on weight and motor
         return StepTerms(generalized_force=base.generalized_force_at_joint(state.system, self.location, -friction))
 
 
 @EFFECTS.register("joint_presliding")
 class _JointPresliding(EffectBase):
-    """Dahl friction, which also holds at rest: F = -tau_c s with the state ds/dt = (v - |v| s) / yield_angle.
+    """Dahl friction, which includes stiction: F = -tau_c s with the state ds/dt = (v - |v| s) / yield_angle.
 
-    s follows the angle, not time: over a step of d = h v
+    s depends on the path of the angle, not on time. Over a step of d = h v
 
         s_{k+1} = sgn(d) (1 - e) + s_k e,  F = -tau_c (sgn(d) (1 - m) + s_k m),  e = exp(-x), m = (1 - e)/x
 
-    at x = |d|/yield_angle is its solution and its mean for a motion that does not turn round within the step. It stays
-    within -1 and 1 and takes energy out whatever the step is, where a midpoint rule would ring at steps longer than the
-    yield angle. The |d| beside s_k is rounded off below `_ABS_SMOOTHING_ANGLE`. A loaded joint whose arm rings on the
-    friction's own stiffness, tau_c/yield_angle, faster than the steps follow creeps a little instead of resting, as
-    Dahl's law has it of anything that is shaken: shorter steps hold it. What s was before a recording begins is not
-    known: it is estimated with every recording. From Dahl (1968), A solid friction model, Aerospace Corporation
-    TOR-158(3107-18).
+    at x = |d|/yield_angle is the exact solution and its mean, for a motion that does not reverse within the step. s
+    stays within -1 and 1, and the friction dissipates energy for any step; a midpoint rule would oscillate at steps
+    longer than the yield angle. |d| in the terms with s_k is smoothed below `_ABS_SMOOTHING_ANGLE`. A loaded joint
+    creeps slightly instead of resting if its arm vibrates on the friction's stiffness tau_c/yield_angle faster than the
+    steps resolve, like any vibrated Dahl friction; shorter steps prevent it. The initial s of every recording is
+    unknown and estimated. From Dahl (1968), A solid friction model, Aerospace Corporation TOR-158(3107-18).
     """
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
@@ -179,7 +178,7 @@ class _JointPresliding(EffectBase):
         before = s - state.h / 2 * rate
         x = ca.fabs(turned) / width
         rounded = (ca.sqrt(turned**2 + _ABS_SMOOTHING_ANGLE**2) - _ABS_SMOOTHING_ANGLE) / width
-        # e^-x by what is left over x^2, so that nothing is lost next to zero, where an arm that rests stays
+        # e^-x by its remainder over x^2, to avoid cancellation near zero, where an arm at rest stays
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
         force = base.generalized_force_at_joint(state.system, self.location, -self["tau_c"] * mean)
@@ -189,7 +188,7 @@ class _JointPresliding(EffectBase):
 
 
 def _left(x: ca.SX) -> ca.SX:
-    """(exp(-x) - 1 + x)/x^2 for x >= 0."""
+    """Series remainder (exp(-x) - 1 + x)/x^2 for x >= 0."""
     far = ca.fmax(x, _SERIES_MAX_ANGLE_RATIO)
     series = 1 / 2 - x / 6 + x**2 / 24 - x**3 / 120
     return ca.if_else(x < _SERIES_MAX_ANGLE_RATIO, series, (ca.exp(-far) - 1 + far) / far**2)
@@ -197,7 +196,7 @@ def _left(x: ca.SX) -> ca.SX:
 
 @EFFECTS.register("joint_spring")
 class _JointSpring(EffectBase):
-    """Spring across an arm joint; it adds elastic energy V += 1/2 stiffness (q - rest_angle)^2."""
+    """Spring on an arm joint. It adds the elastic energy V += 1/2 stiffness (q - rest_angle)^2."""
 
     equation = "V += 1/2 stiffness (q - rest_angle)^2"
     required_excitation = "how far it bends"

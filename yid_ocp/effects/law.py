@@ -1,4 +1,4 @@
-"""Laws for effects without a name: a torque at a joint or segment as a smooth function of known quantities."""
+"""Laws: torques at a joint or segment as smooth functions of known quantities, for effects that no kind describes."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
 LawDependence = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
-"""What a law's torque depends on: one quantity, or a sum of functions of two."""
+"""Quantities on which a law's torque depends: one, or two with a sum of functions."""
 LAW_QUANTITY_UNITS: Mapping[str, str] = {"angle": "rad", "speed": "rad/s", "load": "N m", "command": "N m", "time": "s"}
-"""Unit of each quantity that a law may depend on, of revolute joints."""
+"""Unit of each quantity on which a law may depend, for revolute joints."""
 _TABLE_COLUMNS = ("quantity", "unit", "at", "torque", "std")
 _SPACING_RTOL = 1e-3  # by which knots that are read may be apart unevenly
 
 
 @dataclass(frozen=True)
 class LawTable:
-    """Torque as a function of one quantity, with values and their standard deviations at equally spaced knots (k,).
+    """Torque as a function of one quantity: values and standard deviations at equally spaced knots (k,).
 
-    Between the knots runs the natural cubic spline through them, beyond them the torque stays what it is at the end.
+    A natural cubic spline interpolates the values. Beyond the knots the torque is constant.
     """
 
     quantity: str  # one of `LAW_QUANTITY_UNITS`
@@ -49,7 +49,7 @@ class LawTable:
     torque_std: Array  # [N m]; NaN where it is not known
 
     def interpolated_torque(self, x: Array) -> Array:
-        """Torque at values of the quantity, shape (m,) [N m]."""
+        """Torque (m,) [N m] at the values `x` of the quantity."""
         spline = scipy.interpolate.CubicSpline(self.knots, self.torque, bc_type="natural")
         return np.asarray(spline(np.clip(x, self.knots[0], self.knots[-1])), float)
 
@@ -58,13 +58,11 @@ class LawTable:
 class Law(EffectBase):
     """Torque as a smooth function F = f(x) on an arm joint, or on every joint that bends a segment.
 
-    x is that joint's own angle, speed, load or command: the torque that its servo asks of the motor within its
-    limit, of a direct-current motor the duty's, before the counter-voltage takes its part.
-
-    f is the natural cubic spline through values at equally spaced knots, which are the parameters, and a sum of such
-    where it depends on two quantities. Beyond the knots it is constant, and zero of the command while the motor is off.
-    `time` is that since the recording began, the internal coordinate s with ds/dt = 1. Of a segment, the load of a
-    joint is that of its spring.
+    x is the joint's own angle, speed, load or command, or the time since the start of the recording (an internal
+    coordinate s with ds/dt = 1). The command is the torque that the servo requests, after saturation; for a DC motor it
+    is the torque of the duty cycle without back-EMF. At a segment, the load of a joint is the torque of its spring. f
+    is a natural cubic spline through values at equally spaced knots, which are the parameters; for two quantities it is
+    a sum of two splines. Beyond the knots f is constant. A law of the command is zero while the motor is off.
     """
 
     knots: Mapping[str, Array] | None = None  # of every quantity
@@ -78,7 +76,7 @@ class Law(EffectBase):
         return tuple(self.knots or ())
 
     def restricted_to(self, quantities: Sequence[str]) -> Law:
-        """Restrict the law to some quantities. The others' parameters are removed."""
+        """Return a copy of the law for some of its quantities, without the parameters of the other quantities."""
         kept = {name: own for name, own in (self.knots or {}).items() if name in quantities}
         definitions = [d for d in self.definitions if d.name.rstrip("0123456789") in kept]
         entries = Parameters(self.parameters[f"{self.label}.{d.name}"] for d in definitions)
@@ -104,7 +102,7 @@ class Law(EffectBase):
         return StepTerms(generalized_force=force, internal_equations=equations, static_equations=at_rest)
 
     def _torque(self, quantity: str, x: ca.SX) -> ca.SX:
-        """f(x) by cubic B-splines, of which four are not zero anywhere."""
+        """f(x) by cubic B-splines, of which four are nonzero at any x."""
         knots = (self.knots or {})[quantity]
         values = ca.vertcat(*(self.parameters[name].symbol for name in self.parameter_names_of(quantity)))
         weights = ca.SX(ca.DM(_spline_weights(len(knots)))) @ values
@@ -127,7 +125,7 @@ def _spline_weights(count: int) -> Array:
 
 
 def _coordinates_and_springs(system: System, location: str) -> list[tuple[int, ElasticJoint | None]]:
-    """Indices of the coordinates on which a law at a location acts, each with its spring where it has one."""
+    """Indices of the coordinates on which a law at a location acts, each with its spring or None."""
     index = system.mechanism.joint_index
     if location in segment_names(system):
         springs = elastic_joints_within_segment(system, location)
@@ -160,9 +158,9 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
 
 
 def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
-    """Quantities on which a law at a location may depend. Load needs a drive, command a servo.
+    """Quantities on which a law at a location may depend, empty if no law is possible.
 
-    Empty where no law is possible.
+    `load` needs a driven joint, `command` a servo.
     """
     if location in segment_names(system):
         return ("angle", "speed", "time")
@@ -175,7 +173,7 @@ def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]
 def quantity_values_along(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
-    """Values of a quantity at a location at all midpoints of a rollout, shape (N, joints). NaN for no command.
+    """Values (N, joints) of a quantity at a location at all midpoints of a rollout. NaN without a command.
 
     `nodes` holds `state` (N + 1, nx), `torque` (N, nu), `multipliers` (N, m) and the `time_step` [s] as an array.
     """
@@ -221,7 +219,7 @@ def quantity_values_along(
 def make_law(location: str, system: System, tables: Sequence[LawTable], torque_scale: float = math.inf) -> Law:
     """Make a law at a joint or segment from its tables. `torque_scale` is its expected size [N m].
 
-    `ConfigError` where no law is possible at the location, or not of the quantities.
+    Raises `ConfigError` if no law, or no law of these quantities, is possible at the location.
     """
     label, possible = f"law@{location}", allowed_law_quantity_names(system, location)
     if not possible:
@@ -245,10 +243,10 @@ def make_law(location: str, system: System, tables: Sequence[LawTable], torque_s
 
 
 def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ...]:
-    """Read a law's tables from a CSV file with text from `law_tables_csv`.
+    """Read a law's tables from a CSV file in the format of `law_tables_csv`.
 
-    `DataError` where the file cannot be read as such, its knots are not evenly spaced and increasing, or it is not of
-    the quantities of `depends_on`.
+    Raises `DataError` if the file is malformed, its knots are not evenly spaced and increasing, or its quantities
+    differ from `depends_on`.
     """
     hint = f"the header is {','.join(_TABLE_COLUMNS)}, as in the file law.csv that `diagnose` writes"
     lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]
@@ -280,7 +278,7 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
 
 
 def law_tables_csv(tables: Sequence[LawTable]) -> str:
-    """Write a law's tables as CSV text that `read_law_tables` reads."""
+    """Return a law's tables as CSV text, which `read_law_tables` reads."""
     lines = [",".join(_TABLE_COLUMNS)]
     for table in tables:
         unit = LAW_QUANTITY_UNITS[table.quantity]

@@ -50,7 +50,7 @@ class _SegmentMemory(_SegmentEffect):
 
 
 class _SpringChange(_SegmentEffect):
-    """An effect that changes the segment's springs."""
+    """An effect that changes the springs of a segment."""
 
     required_excitation = "how far it bends"
 
@@ -64,7 +64,7 @@ class _SpringChange(_SegmentEffect):
 
 @EFFECTS.register("kelvin_voigt")
 class _KelvinVoigt(_SegmentEffect):
-    """Kelvin-Voigt damping on all joints of a segment. F = -tau kappa v with stiffness kappa."""
+    """Kelvin-Voigt damping on all joints of a segment, F = -tau kappa v with the joint stiffness kappa."""
 
     equation = "F = -tau kappa v"
     required_excitation = "how fast it moves"
@@ -81,7 +81,7 @@ class _KelvinVoigt(_SegmentEffect):
 class _StandardLinearSolid(_SegmentMemory):
     """Standard linear solid of a segment. A spring and a damper in series are parallel to every bend and twist spring.
 
-    V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt.
+    V += 1/2 ratio kappa (q - z)^2, where the massless coordinate z follows q: (q - z) = relaxation_time dz/dt.
     """
 
     equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
@@ -107,8 +107,8 @@ class _StandardLinearSolid(_SegmentMemory):
 class _Hysteresis(_SegmentMemory):
     """Hysteresis of a segment. A Dahl friction element is parallel to every bend and twist spring.
 
-    F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start
-    of a recording z = 0: what came before is not known. From Dahl (1968), as in `joint_presliding`.
+    F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| smoothed below `_ABS_SMOOTHING_SPEED`. The unknown
+    history is ignored: z = 0 at the start of a recording. From Dahl (1968), as in `joint_presliding`.
     """
 
     equation = "F = -stiffness z, dz/dt = v - |v| z / yield_angle"
@@ -141,10 +141,10 @@ class _Hysteresis(_SegmentMemory):
 
 @EFFECTS.register("cubic_stiffness")
 class _CubicStiffness(_SegmentEffect):
-    """Springs of a segment that stiffen or soften with angle, by the sign of k3. Each joint adds V += 1/4 k3 q^4.
+    """Springs of a segment that stiffen or soften with the angle, by the sign of k3. Each joint adds V += 1/4 k3 q^4.
 
-    k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
-    `with_prior_ranges_scaled_to_angles` is given the one in the data.
+    The prior range of k3 is -0.5 to 1 times stiffness / (largest angle)^2. The largest angle is `_REFERENCE_ANGLE`
+    until `with_prior_ranges_scaled_to_angles` sets the one of the data.
     """
 
     equation = "V += 1/4 k3 q^4"
@@ -157,7 +157,7 @@ class _CubicStiffness(_SegmentEffect):
     )
 
     def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> _CubicStiffness:
-        """Scale the prior range of k3 to the segment's largest joint angle in the data."""
+        """Return the effect with a prior range of k3 for the segment's largest joint angle in the data."""
         if self.location not in largest:
             return self
         factor = (_REFERENCE_ANGLE / max(largest[self.location], _MIN_LARGEST_ANGLE)) ** 2
@@ -171,13 +171,13 @@ class _CubicStiffness(_SegmentEffect):
 
 @EFFECTS.register("rest_curvature")
 class _RestCurvature(_SpringChange):
-    """Rest curvature of a segment, with equal rest angles at all joints. V = 1/2 kappa (q - q_rest)^2."""
+    """Rest curvature of a segment, with equal rest angles at all joints: V = 1/2 kappa (q - q_rest)^2."""
 
     equation = "V = 1/2 kappa (q - q_rest)^2"
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of qx and qy [rad]. They add to the rest angles of bends about x and y."""
+        """Definitions of qx and qy [rad], which add to the rest angles of bends about x and y."""
         axes = {spring.axis for spring in elastic_joints_within_segment(system, location)}
         text = "rest angle of every joint about"
         return tuple(

@@ -17,7 +17,7 @@ _SPRING_RELAXATION_TIME = 5e-3  # of mount and junction springs: too short to da
 
 
 def _root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
-    """First joints of all segments without a parent, by what carries them: a clamp's name, else `base`."""
+    """First joints of all segments without a parent, by their carrier: the name of a clamp, or `base`."""
     tree, clamps = system.mechanism, base.clamp_names(system)
     found: dict[str, tuple[str, ...]] = {}
     for first in (s.link_joints[0][0] for s in system.segment_layouts if s.parent_segment is None):
@@ -40,7 +40,7 @@ def _branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
 
 
 class _JointInsertion(EffectBase):
-    """A massless two-axis rotational spring, relaxing in `_SPRING_RELAXATION_TIME`, in what is rigid in the model."""
+    """A massless two-axis rotational spring, relaxing in `_SPRING_RELAXATION_TIME`, at a rigid connection."""
 
     required_excitation = "how hard it pulls at its ends"
     declared_parameters = (
@@ -48,7 +48,7 @@ class _JointInsertion(EffectBase):
     )
 
     def _sprung(self, system: System, hung: tuple[str, ...], at: Placement | None, label: str) -> System:
-        """The system with joints `LABEL_x` and `LABEL_y` under some others, at a placement of what they hang on."""
+        """The system with joints `LABEL_x` and `LABEL_y` inserted before some joints, at a placement in the parent."""
         tree = system.mechanism
         first = min(tree.joint_index(joint) for joint in hung)
         carrier = tree.joints[first].parent_index
@@ -75,7 +75,7 @@ class _JointInsertion(EffectBase):
 
 @EFFECTS.register("mount_compliance")
 class _MountCompliance(_JointInsertion):
-    """Massless rotational spring under the object's foot or clamp, about x and y of the first link."""
+    """Massless rotational spring between the object and its base or clamp, about x and y of the first link."""
 
     equation = "two joints with V = 1/2 stiffness q^2 before the first link"
     possible_locations = _root_joints_by_base
@@ -90,8 +90,8 @@ class _MountCompliance(_JointInsertion):
 class _JunctionCompliance(_JointInsertion):
     """Massless two-axis rotational spring between a segment and the branches that leave it at a junction.
 
-    At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
-    about its own.
+    At `w_PARENT` all branches rotate together about x and y of the parent's last link. At `junction_BRANCH` one branch
+    rotates about its own axes.
     """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the branches"
@@ -118,7 +118,7 @@ class _GraspChange(EffectBase):
 
 @EFFECTS.register("grasp_offset")
 class _GraspOffset(_GraspChange):
-    """Displacement of the grasped point from its nominal position. It is (dx, dy, dz) in the gripper's frame."""
+    """Displacement (dx, dy, dz) of the grasped point from its nominal position, in the gripper's frame."""
 
     equation = "phi = (holder + R (dx, dy, dz)) - held"
     declared_parameters = tuple(
@@ -132,11 +132,11 @@ class _GraspOffset(_GraspChange):
 
 @EFFECTS.register("grasp_compliance")
 class _GraspCompliance(_GraspChange):
-    """Spring-damper in place of a rigid grasp. f = phi/C + damping dphi/dt with phi = gripper - object.
+    """Spring-damper instead of a rigid grasp: f = phi/C + damping dphi/dt with phi = gripper - object.
 
-    In a step: phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, regular at C = 0, where it is the rigid
-    grasp. The stretch is taken at the end of the step, which by itself damps what is fast against it. Every row of the
-    grasp has the same C; in rows of orientation it counts in rad/(N m).
+    A step solves phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, which is the rigid grasp at C = 0.
+    phi is evaluated at the end of the step, which numerically damps fast motions. Every row of the grasp has the same
+    C; in rows of orientation its unit is rad/(N m).
     """
 
     equation = "phi + C damping dphi/dt = C force"
@@ -155,8 +155,8 @@ class _GraspCompliance(_GraspChange):
 class _GraspSlip(_GraspChange):
     """Slip of a grasp along a tube. The grasped point creeps in the direction in which the gripper pulls.
 
-    d(offset)/dt = slip_per_load x axial load, both along the object's z axis; `Grasp.axial_slip` counts the other way.
-    At the start of a recording nothing has slipped.
+    d(offset)/dt = slip_per_load x axial load, both along the object's z axis (`Grasp.axial_slip` has the opposite
+    sign). The offset is zero at the start of a recording.
     """
 
     equation = "d(offset)/dt = slip_per_load x axial load"

@@ -1,7 +1,7 @@
 """Errors of cameras, clocks, wrist sensors and inertial units.
 
-A group of points is a camera's when its sensor has a pose. Points stand in the world frame in a recording, and so do
-offsets and turns here; only the camera's place and where it looks matter of its pose.
+A group of points belongs to a camera if its sensor has a pose. Recorded points are in the world frame, and so are the
+offsets and rotations here. Of the camera's pose, only position and viewing direction matter.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _clock(system: System) -> tuple[str, ...]:
 
 
 class _CameraEffect(EffectBase):
-    """An error of what cameras see; other sensors' readings are unchanged."""
+    """An error of the points that cameras see. Other sensors' readings are unchanged."""
 
     required_excitation = "the camera's pose"
     required_sensors = frozenset({"camera"})
@@ -43,7 +43,7 @@ class _CameraEffect(EffectBase):
 
 @EFFECTS.register("camera_translation")
 class _CameraTranslation(_CameraEffect):
-    """Constant offset of seen points: seen = true + (x, y, z), along the world's axes."""
+    """Constant offset of seen points along the world's axes: seen = true + (x, y, z)."""
 
     equation = "seen point = true + (x, y, z)"
     declared_parameters = tuple(
@@ -56,7 +56,7 @@ class _CameraTranslation(_CameraEffect):
 
 @EFFECTS.register("camera_rotation")
 class _CameraRotation(_CameraEffect):
-    """Seen points rotated about the camera's origin by Rz(rz) Ry(ry) Rx(rx), in the world's axes."""
+    """Seen points rotated about the camera's origin by Rz(rz) Ry(ry) Rx(rx) in world axes."""
 
     equation = "seen point = c + R (true - c)"
     declared_parameters = tuple(
@@ -70,7 +70,7 @@ class _CameraRotation(_CameraEffect):
 
 @EFFECTS.register("camera_scale")
 class _CameraScale(_CameraEffect):
-    """Depth error: the vector from the camera to the seen point is scaled, so that its pixel stays."""
+    """Depth error: the vector from the camera to the seen point is scaled, so that its pixel does not change."""
 
     equation = "seen point = c + scale (true - c)"
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "seen over true depth"),)
@@ -81,7 +81,7 @@ class _CameraScale(_CameraEffect):
 
 @EFFECTS.register("surface_offset")
 class _SurfaceOffset(_CameraEffect):
-    """The camera sees the near surface: a fraction of the tube's radius from its axis towards the camera."""
+    """The camera sees the near surface: the seen point is a fraction of the tube's radius nearer than the axis."""
 
     equation = "seen point = true + fraction r (c - true)/|c - true|"
     possible_locations = _camera_of_tubes
@@ -99,9 +99,9 @@ class _SurfaceOffset(_CameraEffect):
 
 @EFFECTS.register("camera_latency")
 class _CameraLatency(_CameraEffect):
-    """Seen points are late: seen(t) = true(t - delay), of all cameras or of one group of points, by its name.
+    """Latency of seen points, seen(t) = true(t - delay), of all cameras or of one group of points (by name).
 
-    A negative delay of a group means that the clock of the joints is the late one.
+    A negative delay of a group means that the joints' clock is late.
     """
 
     equation = "seen point(t) = true point(t - delay)"
@@ -124,7 +124,7 @@ class _CameraLatency(_CameraEffect):
 
 @EFFECTS.register("clock_scale")
 class _ClockScale(EffectBase):
-    """Recorded time = true time x scale, for a recording with a nominal clock."""
+    """Scale error of a nominal clock: recorded time = true time x scale."""
 
     equation = "recorded time = true x scale"
     required_excitation = "when it is read"
@@ -149,7 +149,7 @@ def _mounted(system: System) -> tuple[str, ...]:
 
 
 class _MountedSensorEffect(EffectBase):
-    """An error of a wrist sensor or an inertial unit, whose location is `wrist:FRAME` or `imu:FRAME`."""
+    """An error of a wrist sensor or an inertial unit, with the location `wrist:FRAME` or `imu:FRAME`."""
 
     required_excitation = "its orientation to gravity"
     is_at_recorded_sensor = True
@@ -175,7 +175,7 @@ class _SensorBias(_MountedSensorEffect):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Bias of each component, such as `force_x` [N] or `specific_force_x` [m/s^2]."""
+        """Definitions of the bias of each component, such as `force_x` [N] or `specific_force_x` [m/s^2]."""
         return tuple(
             ParameterDefinition(f"{quantity}_{axis}", unit, 0.0, -most, most, (-usual, usual), "measured less true")
             for quantity, unit, most, usual in _MOUNTED_COMPONENTS[location.partition(":")[0]]
@@ -188,7 +188,7 @@ class _SensorBias(_MountedSensorEffect):
 
 @EFFECTS.register("sensor_scale")
 class _SensorScale(_MountedSensorEffect):
-    """All readings of a wrist sensor or an inertial unit multiplied by a factor."""
+    """Scale factor on all readings of a wrist sensor or an inertial unit."""
 
     equation = "measured = scale x true"
     required_excitation = "how hard it pulls at its ends"
