@@ -1,4 +1,4 @@
-"""Recordings in memory and on disk. A new file format is one file in `readers/` and touches nothing else."""
+"""Recordings in memory and on disk. A new file format is one file in `readers/`; other modules do not change."""
 
 from yid_ocp.data.readers import READERS as READERS
 from yid_ocp.data.readers import preview_file as preview_file

@@ -1,4 +1,4 @@
-"""Find repeated values, quantization, noise and saturation in single channels of a recording."""
+"""Checks of single channels of a recording for repeated values, quantization, noise and saturation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_SAMPLE_PERIOD = 0.02  # at which arm motion counts as slow [s]
 
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
-    """Group, channel, times and values (N,) or (N, 3) of what was measured."""
+    """Group, channel, times and values (N,) or (N, 3) of the measured channels of some quantities."""
     joints = recording.joints
     if joints is not None:
         for quantity, values in joints.values_by_channel.items():
@@ -37,7 +37,7 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
 
 
 def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
-    """Find channels stuck at one value, although they are noisy elsewhere or their velocity is not zero."""
+    """Find channels stuck at one value although they are noisy elsewhere or their velocity is not zero."""
     joints = recording.joints
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) <= QUALITY_LIMITS.min_stuck_samples:
@@ -60,7 +60,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         count = end - begin
         elsewhere = np.delete(same, np.concatenate([np.arange(*run[:2]) for run in (longest, *rests)]))
         usual = float(np.mean(elsewhere)) if len(elsewhere) >= count // 4 else 1.0
-        # of a channel that changes from sample to sample in nine of ten, so long a run is no chance
+        # if the channel changes in nine of ten samples, a repetition of this length is not chance
         evidence = (count / QUALITY_LIMITS.min_stuck_samples) if usual < 0.1 else 0.0
         stated = joints is not None and quantity == "position" and bool(np.all(joints.position_std or 0))
         if count == len(same) and stated:
@@ -78,7 +78,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
 
 
 def _comes_to_rest(values: Array, begin: int, end: int) -> bool:
-    """Whether a channel slows down to a value and leaves it slowly, as the rounded angle of a joint at rest does."""
+    """Whether a channel approaches a value and leaves it slowly, like the rounded angle of a joint at rest."""
     moves = np.abs(np.diff(values, axis=0))
     moves = moves[moves > 0]
     if values.ndim > 1 or not len(moves):
@@ -89,13 +89,13 @@ def _comes_to_rest(values: Array, begin: int, end: int) -> bool:
 
 
 def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
-    """First and last index of every stretch of samples that are all the same."""
+    """First and last index of every stretch of equal samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def white_noise_std(t: Array, values: Array) -> float:
-    """Robust standard deviation of a channel's white noise. Zero if the clock is uneven or the channel rests long."""
+    """Robust standard deviation of a channel's white noise; zero if the clock is uneven or the channel rests long."""
     if len(t) < NOISE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
@@ -107,7 +107,7 @@ def white_noise_std(t: Array, values: Array) -> float:
 
 
 def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, channel: str) -> float:
-    """Standard deviation that settings or recording give to a channel, zero where nobody says."""
+    """Standard deviation of a channel from settings or recording, or zero if neither states it."""
     joints = recording.joints
     quantity, _, name = channel.partition(".")
     if group == "joints" and joints is not None:
@@ -138,7 +138,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
         columns = values.reshape(len(t), -1).T
         step = max(quantization_step(column) for column in columns)
         size, wide = step / math.sqrt(12), float(np.ptp(values))
-        # an angle that hardly moves has few levels by nature
+        # an angle that hardly moves always has few levels
         least = 5 * QUALITY_LIMITS.min_joint_motion if channel.startswith("position") else 0.0
         few = step > wide / 16 and wide > least
         setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
@@ -151,7 +151,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
             continue
         seen = max(white_noise_std(t, column) for column in columns)
         if next(entry.clock for entry in recording.joint_and_point_groups if entry.name == group) == "nominal":
-            # when a sample was taken is known to half a period, which looks like noise wherever something moves
+            # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
             what = f"{channel} has noise of {seen:.2g} from sample to sample; {stated:.2g} is stated"
@@ -163,9 +163,9 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
 def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
     """Find channels with noise far below the stated noise. Channels of equal stated noise are pooled.
 
-    Noise in settings may represent model error; only a fit shows whether it is too large. Noise need not
-    be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so
-    do steps. What has no noise at all was computed, as commands are.
+    Noise stated in the settings is not checked, because it may represent model error. As noise need not be white, the
+    largest estimate from all samples, every second sample, and so on up to `_MAX_SAMPLE_PERIOD` counts; quantization
+    counts as well. Channels without noise are skipped because they were computed, as commands are.
     """
     found: dict[str, list[tuple[str, float, float]]] = {}
     commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
@@ -205,7 +205,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
 
 
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
-    """Find joints whose recorded effort saturates. It then repeatedly equals its extreme value exactly."""
+    """Find joints with saturated effort, which repeatedly equals its extreme value exactly."""
     if recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command":
         return  # what a controller asks for ends at its own bound
     for group, channel, t, values in _channels(recording, "effort"):
@@ -213,7 +213,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             levels, counts = np.unique(sign * values, return_counts=True)
             near = (levels > levels[-1] - 0.05 * np.ptp(levels)) & (levels < levels[-1])
             at = sign * values == levels[-1]
-            # a value that many samples share while none of its neighbours has a fifth as many, held again and again
+            # a value of many samples, whose neighbouring values have less than a fifth as many, held several times
             steps, least = np.diff(np.flatnonzero(at)), QUALITY_LIMITS.min_clipped_samples
             alone = at.sum() >= least and at.sum() > 5 * np.max(counts[near], initial=0)
             again = np.sum(steps == 1) >= least / 2 and np.any(steps > 1)
@@ -229,10 +229,10 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
 def typical_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
-    """Distance between the two points of every edge [m], mean over frames and median over recordings.
+    """Distance between the two points of every edge [m]: mean over frames, median over recordings.
 
-    Only so many `frames` from the start of each count, where that is given. `DataError` where there is no recording, or
-    an edge that none of them ever shows.
+    If `frames` is given, only the first `frames` frames of each recording count. Raises `DataError` without a
+    recording, or if an edge is never seen.
     """
     result: dict[tuple[str, str], float] = {}
     for edge in edges:
@@ -267,7 +267,7 @@ MIN_DIFFERENCES_FOR_NOISE_STD = 30
 
 @dataclass(frozen=True)
 class _QualityLimits:
-    """Limits beyond which a check of a recording reports an issue."""
+    """Limits above which a check of a recording reports an issue."""
 
     max_joint_period: float = 0.5
     max_point_period: float = 30.0
@@ -292,19 +292,19 @@ QUALITY_LIMITS = _QualityLimits()
 
 @dataclass(frozen=True)
 class Issue:
-    """One data quality issue of a recording, with cause, severity, evidence and advice."""
+    """One data quality issue of a recording: cause, severity, evidence and advice."""
 
     cause: str  # what is wrong, in one word of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # the same in one sentence, with numbers
-    # whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops
+    # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
     weight: Severity
     evidence_ratio: float  # observed value over the detection limit, 1 to `MAX_EVIDENCE_RATIO`
     advice: str  # what to do
-    # where; empty for all of them
+    # location; empty means all
     recording: str
     group: str = ""
     channel: str = ""
-    # stretch of time on the group's clock [s]; all of it when absent
+    # time interval on the group's clock [s]; None means the whole recording
     begin: float | None = None
     end: float | None = None
     setting: str = ""  # line of configuration that repairs or describes it, where there is one
@@ -316,12 +316,12 @@ class Issue:
 
     @property
     def certainty_word(self) -> str:
-        """Certainty of the issue in one word, `perhaps`, `likely` or `certain`."""
+        """Certainty of the issue: `perhaps`, `likely` or `certain`."""
         return "perhaps" if self.evidence_ratio < 1.5 else "likely" if self.evidence_ratio < 3 else "certain"
 
     @property
     def where(self) -> str:
-        """Location of the issue as text, with recording, group, channel and time."""
+        """Location of the issue as text: recording, group, channel and time."""
         place = "/".join(part for part in (self.recording, self.group, self.channel) if part)
         span = "" if self.begin is None or self.end is None else f", {self.begin:.4g} to {self.end:.4g} s"
         return place + span
@@ -373,5 +373,5 @@ SensorOptionsLookup = Callable[[str], SensorOptions]
 
 
 def median_sample_period(t: Array) -> float:
-    """Median time between samples at the times `t` [s]. Zero for fewer than two samples."""
+    """Median time between samples at the times `t` [s], or zero for fewer than two samples."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0

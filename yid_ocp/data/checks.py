@@ -1,4 +1,4 @@
-"""Check clocks, gaps, motion, channels and duplicated data of a recording without a model.
+"""Checks of a recording without a model: clocks, gaps, motion, channels and duplicated data.
 
 Checks against a model are in `analysis.data_quality`. Limits come from physics or statistics.
 """
@@ -46,9 +46,9 @@ class _RecordingParts(NamedTuple):
 
 
 def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
-    """Split a recording at gaps in its joints, or without joints in the `driving` points.
+    """Split a recording at gaps of its joints or, without joints, of the `driving` points.
 
-    Where a rollout may not start `anywhere`, in motion too, later parts are kept only where they start at rest.
+    Unless a rollout may start `anywhere`, also in motion, only later parts that start at rest are kept.
     """
     t = _times(recording, driving)
     steps = np.diff(t)
@@ -72,7 +72,7 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
 
 
 def _times(recording: Recording, driving: Sequence[str]) -> Array:
-    """Times at which all that drives the model was seen."""
+    """Times at which all inputs of the model were measured."""
     if recording.joints is not None:
         return recording.joints.t
     for group in recording.points:
@@ -111,11 +111,11 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
 def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
     """Find data quality issues of one recording by all checks that need no model.
 
-    `choice` says how a group is used, its stated noise above all; `driving`, whether joints drive the model, so that
-    what lies between their samples matters.
+    `choice` returns the sensor options of a group, such as its stated noise. `driving` states whether joints drive the
+    model, so that gaps between their samples matter.
     """
     recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_sampling_kind)
-    # only the number of samples can be said in times that are not seconds
+    # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(
         _common_clock(recording),
         _dropped(recording, driving),
@@ -178,7 +178,7 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
 
 
 def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
-    """Samples missing from an otherwise even clock of what drives the model."""
+    """Samples missing from an otherwise even clock of the model's inputs."""
     joints = recording.joints
     if joints is None or not driving or len(joints.t) < 20:
         return
@@ -248,7 +248,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
 
 
 def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Issue]:
-    """Two angles that turn as each other's velocity says."""
+    """Pairs of joints whose angles change as the velocity of the other joint indicates."""
     off = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5]
     for i, j in combinations(off, 2):
         across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
@@ -277,7 +277,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
 
 
 def _transitions(one: JointGroup | PointGroup, other: JointGroup | PointGroup) -> tuple[IntArray, IntArray]:
-    """Numbers of the changes of two groups' samples, equal where what changes, and after how long, is; no rests."""
+    """Numbers for the changes between samples of two groups; equal numbers mean equal change after equal time."""
     changes = []
     for group in (one, other):
         rows = np.nan_to_num(group.position.reshape(len(group.t), -1))
@@ -297,7 +297,7 @@ def _longest_shared_run(one: IntArray, other: IntArray) -> int:
     if not np.intersect1d(one, other).size:
         return 0
     least, most, size = 0, min(len(one), len(other)), max(len(one), len(other))
-    # a stretch's hash is a difference of two sums of the powers of an odd number, modulo 2^64
+    # the hash of a stretch is a difference of two sums of powers of an odd number, modulo 2^64
     powers = np.cumprod(np.full(size + 1, _HASH_BASE))
     terms = [(own.astype(np.uint64) + np.uint64(1)) * powers[: len(own)] for own in (one, other)]
     sums = [np.concatenate([np.zeros(1, np.uint64), np.cumsum(own)]) for own in terms]
@@ -309,7 +309,7 @@ def _longest_shared_run(one: IntArray, other: IntArray) -> int:
 
 
 def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
-    """Logarithm of how often two unrelated recordings share a run, from how often each meets its own samples again."""
+    """Logarithm of the expected number of shared runs of unrelated recordings, from repetitions within each."""
     again = again_twice = pairs = 0.0
     for values in (one, other):
         follow = np.unique(np.column_stack([values[:-1], values[1:]]), axis=0, return_counts=True)[1]
@@ -323,7 +323,7 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
 
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
-    """Make an issue of the second recording if it shares samples with the first. Otherwise None."""
+    """Return an issue of the second recording if it shares samples with the first, else None."""
     others = {group.name: group for group in other.joint_and_point_groups}
     count = 0
     for group in one.joint_and_point_groups if one.joints is None else (one.joints,):

@@ -1,4 +1,4 @@
-"""Interpret columns, tables and messages of loggers, motion capture exports and robot drivers."""
+"""Interpretation of columns, tables and messages of loggers, motion capture exports and robot drivers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from yid_ocp.errors import DataError, unknown_name_error_arguments
 
 _AXES = ("x", "y", "z")
 _Meaning = tuple[str, str] | None
-"""Of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None where it is left out."""
+"""Meaning of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None if it is omitted."""
 _EXACT_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
 _TIME_WORDS = "t time times timestamp timestamps time_stamp stamp header_stamp sec secs seconds elapsed elapsed_time"
 _CHANNEL_WORDS: Mapping[str, str] = {
@@ -28,7 +28,7 @@ _CHANNEL_WORDS: Mapping[str, str] = {
     "velocity_command": "dq_cmd dq_des dq_d qd_d vel_cmd cmd_vel velocity_command target_qd desired_velocity",
     "torque_enable": "torque_enable",
 }
-"""Words of loggers: Franka's, UR's, Isaac Sim's, LeRobot's, of ROS and of PlotJuggler."""
+"""Column names of loggers: Franka's, UR's, Isaac Sim's, LeRobot's, of ROS and of PlotJuggler."""
 _CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
 _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
@@ -44,9 +44,9 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS
 
 
 def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
-    """Interpret every column by its name, and read units from the names. An unclear column has None.
+    """Interpret every column by its name. Returns the meanings (None if unclear) and the units in the names.
 
-    `sensor_components` are components of vectors that sensors on a link read, such as `force_x`.
+    `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
     """
     split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
@@ -63,7 +63,7 @@ def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> 
 
 
 def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str]:
-    """Name and unit of a column such as `time [ms]` or `q1_deg`; an empty unit where the name has none."""
+    """Name and unit of a column such as `time [ms]` or `q1_deg`. The unit is empty if the name has none."""
     if (bracketed := _BRACKETED_UNIT.fullmatch(column)) and (unit := _UNIT_WORDS.get(bracketed[2].lower())):
         return bracketed[1], unit
     if _exact_meaning(column, sensor_components) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
@@ -74,7 +74,7 @@ def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str
 
 
 def _exact_meaning(column: str, sensor_components: Sequence[str]) -> _Meaning:
-    """Meaning in this package's own spelling, of which a joint, point or sensor keeps its name as it stands."""
+    """Meaning in this package's own spelling, in which joints, points and sensors keep their names."""
     if column.lower() in _TIME_WORDS.split():
         return "t", ""
     for prefix in sorted(_EXACT_PREFIXES, key=len, reverse=True):
@@ -88,7 +88,7 @@ def _exact_meaning(column: str, sensor_components: Sequence[str]) -> _Meaning:
 
 
 def _spelled_meaning(column: str) -> _Meaning:
-    """Meaning of what other tools write: `pos_elbow`, `elbow.vel`, `tau1`, `tau_J[0]`, `/joint_states/elbow/effort`."""
+    """Meaning in the spelling of other tools: `pos_elbow`, `elbow.vel`, `tau_J[0]`, `/joint_states/elbow/effort`."""
     plain = re.sub(r"[\s./:\-\[\]%]+", "_", column).strip("_")
     if plain.lower() in _TIME_WORDS.split() or plain.lower() in ("field_header_stamp", "header_stamp_sec"):
         return "t", ""
@@ -111,11 +111,11 @@ _ALLOWED = "an export with its header as the program writes it"
 
 
 _MocapTable = tuple[PointGroup, str, tuple[str, ...]]
-"""Points of a motion capture export in its own unit, that unit (mm, cm or m), and what a user should know."""
+"""Points of a motion capture export in its own unit, this unit (mm, cm or m), and notes for the user."""
 
 
 def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
-    """Choose a reader of a motion capture export by the table's first row. None for other tables."""
+    """Choose a reader of a motion capture export by the table's first row. Returns None for other tables."""
     first = first_row[0].strip() if first_row else ""
     if first == "Format Version":
         return _read_motive
@@ -125,7 +125,7 @@ def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _Moca
 
 
 def _read_motive(rows: _Rows, where: str) -> _MocapTable:
-    """Positions of rigid bodies and markers; rotations and errors of fits are left out."""
+    """Read positions of rigid bodies and markers. Rotations and fit errors are omitted."""
     head: list[list[str]] = []
     body: list[list[str]] = []
     for _, cells in rows:
@@ -173,7 +173,7 @@ def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
 
 
 def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
-    """Markers; three zeros mean that one was not seen."""
+    """Read markers. Three zeros mean that a marker was not seen."""
     said: dict[str, list[str]] = {}
     body: list[list[str]] = []
     head: list[str] = []
@@ -213,7 +213,7 @@ def _made(
 
 
 def _numbers(rows: Sequence[Sequence[str]], n_columns: int, where: str) -> Array:
-    """Numbers of rows, NaN where a cell is empty or missing."""
+    """Numbers of rows, NaN for an empty or missing cell."""
     table = np.full((len(rows), n_columns), math.nan)
     for i, row in enumerate(rows):
         for j, cell in enumerate(row[:n_columns]):
@@ -244,18 +244,18 @@ JOINT_MESSAGE_TYPES = (
     "control_msgs/msg/JointTrajectoryControllerState",
     "ur_msgs/msg/RobotStateRTMsg",
 )
-"""Types of messages, beside JointState, whose joint values are understood."""
+"""Message types with joint values that can be read, in addition to JointState."""
 
 
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ESTIMATED_WRENCH_GROUP = "wrist_estimated"
-"""Group of a recording with the wrench that a driver computes from joint torques, at the frame where it acts."""
+"""Group of a recording with the wrench that a driver estimates from joint torques, at the frame where it acts."""
 
 
 def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
-    """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are left out.
+    """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are omitted.
 
-    If the driver states an external wrench, `wrench` has its frame and its `values` by quantity.
+    If the driver estimates an external wrench, `wrench` has its frame and its `values` by quantity.
     """
     if kind == JOINT_MESSAGE_TYPES[0]:
         return _franka_state(content)
@@ -273,9 +273,10 @@ def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
 
 
 def joint_values_of_fields(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
-    """Read joint values from any message, with the path of an array for each channel.
+    """Read joint values from a decoded message of any type. `paths` maps each channel to the path of an array.
 
-    Joints are called 1, 2 and so on. `DataError` where a channel or a path is not known, or holds no numbers.
+    Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or if a path does not exist or is not
+    numeric.
     """
     found: dict[str, Any] = {}
     for channel, path in paths.items():
@@ -299,7 +300,7 @@ def joint_values_of_fields(content: Any, paths: Mapping[str, str], where: str) -
 
 
 def _franka_state(content: Any) -> SimpleNamespace:
-    """Of the driver for ROS 1, whose messages do not name joints."""
+    """Joint values of the ROS 1 driver, whose messages do not name joints."""
     torque = content.tau_J if hasattr(content, "tau_J") else content.tau_j
     own = {"position": content.q, "velocity": content.dq, "effort": torque, "position_command": content.q_d}
     own["external_effort"] = content.tau_ext_hat_filtered
@@ -310,7 +311,7 @@ def _franka_state(content: Any) -> SimpleNamespace:
 
 
 def _franka_robot_state(content: Any) -> SimpleNamespace:
-    """Of the driver for ROS 2."""
+    """Joint values of the ROS 2 driver."""
     measured, external = content.measured_joint_state, content.tau_ext_hat_filtered
     own = {"position": measured.position, "velocity": measured.velocity, "effort": measured.effort}
     own["external_effort"] = getattr(external, "effort", external)
@@ -324,7 +325,7 @@ def _franka_robot_state(content: Any) -> SimpleNamespace:
 
 
 def _dynamic_joint_state(content: Any) -> SimpleNamespace:
-    """Of the broadcaster of ros2_control: named interfaces of every joint, of which some have no position."""
+    """Joint values of the ros2_control broadcaster: named interfaces of joints that have a position."""
     by_joint = {
         str(name): dict(zip(map(str, entry.interface_names), map(float, entry.values), strict=True))
         for name, entry in zip(content.joint_names, content.interface_values, strict=True)

@@ -1,4 +1,4 @@
-"""Merge recordings of one run by several devices, such as a robot and a motion capture system."""
+"""Merging of recordings of one run by several devices, such as a robot and a motion capture system."""
 
 from __future__ import annotations
 
@@ -34,16 +34,12 @@ class _MotionLag(NamedTuple):
 def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str, float] | None = None) -> Recording:
     """Merge recordings of one run into one named after the first. Notes report clocks, offsets and interpolation.
 
-    Clocks that overlap are one clock, and nothing is shifted; if points then move later or earlier than the joints, a
-    note says by how much. Clocks that have nothing in common are aligned by the motion, where the angles explain the
-    positions. Joints of several recordings come to the fastest clock; points and other sensors keep theirs.
-
-    Parameters
-    ----------
-    clock_offsets : mapping of recording name to float, optional
-        What is added to its times [s]; such a recording is not aligned by anything else.
-
-    `DataError` where two recordings have a joint in common, clocks cannot be aligned, or an offset names no recording.
+    Recordings whose time ranges overlap are assumed to share one clock and are not shifted; a note reports a remaining
+    lag between points and joints. Recordings without overlap are aligned by the motion: the lag at which joint angles
+    explain the points best. Joints of several recordings are interpolated to the fastest clock; points and other
+    sensors keep their clocks. `clock_offsets` are seconds added to the times of a recording (by name), which is then
+    not aligned. Raises `DataError` if two recordings have a joint in common, if clocks cannot be aligned, or if an
+    offset names no recording.
     """
     offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
     where = ", ".join(names)
@@ -86,7 +82,7 @@ def _span(recording: Recording) -> tuple[float, float]:
 
 
 def _shift(first: Recording, other: Recording) -> tuple[float, str]:
-    """What to add to the times of `other`, and why; `DataError` where nothing says."""
+    """Seconds to add to the times of `other`, and the reason. Raises `DataError` if the shift is unknown."""
     (begin, end), (start, stop) = _span(first), _span(other)
     overlap = min(end, stop) - max(begin, start)
     shared = overlap >= _MIN_SHARED_FRACTION * min(end - begin, stop - start)
@@ -121,10 +117,9 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
 def _motion_lag(
     joints: JointGroup, t: Array, path: Array, period: float, around: float, reach: float = _LAG_SEARCH
 ) -> _MotionLag | None:
-    """Lag near `around` at which positions (M, columns) at times t fit a linear function of the angles best.
+    """Lag within `reach` [s] of `around` at which a linear function of the angles fits positions (M, columns) best.
 
-    None for little data. `reach` is how near [s]. Kinematics are not linear, but more terms would fit a periodic motion
-    at any lag.
+    None for little data. More terms than linear ones would fit a periodic motion at any lag.
     """
     moving = joints.position[:, np.ptp(joints.position, axis=0) > _MIN_TURN]
     lags = around + period * np.arange(-round(reach / period), round(reach / period) + 1)
@@ -143,7 +138,7 @@ def _motion_lag(
 
 
 def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
-    """Times and coordinates (M, columns) of the points that were seen most of the time, where all of these were."""
+    """Times and coordinates (M, columns) of the points seen most of the time, at times when all of them are seen."""
     for group in recording.points:
         whole = group.position.reshape(len(group.t), -1)
         whole = whole[:, np.isfinite(whole).mean(axis=0) > _MIN_SEEN_FRACTION]
@@ -154,7 +149,7 @@ def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
 
 
 def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) -> float:
-    """Delay of one speed relative to another on an even clock [s], from values and times of the first samples."""
+    """Delay of one speed relative to another on an even clock [s]; each has values and the time of the first sample."""
     (x, x_start), (y, y_start) = a, b
     lags = signal.correlation_lags(len(y), len(x))
     ones_x, ones_y = np.ones(len(x)), np.ones(len(y))
@@ -170,7 +165,7 @@ def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) ->
 
 
 def _speed(t: Array, values: Array, period: float) -> tuple[Array, float]:
-    """Speed of all columns together on an even clock, smoothed over 50 ms, and the time at which it begins."""
+    """Speed of all columns together on an even clock, smoothed over 50 ms, and its first time."""
     even = np.arange(t[0], t[-1], period)
     path = np.stack([np.interp(even, t, column) for column in values.T], axis=1)
     width = max(1, round(0.05 / period))
@@ -204,7 +199,7 @@ def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tupl
 
 
 def _with_unique_names(recordings: Sequence[Recording], groups: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
-    """Groups of all recordings; those of one name get that of their recording too."""
+    """Groups of all recordings. Groups of equal names are suffixed with the recording's name."""
     names = [group.name for group in chain.from_iterable(groups)]
     made: list[PointGroup | SensorChannelGroup] = []
     for recording, own in zip(recordings, groups, strict=True):

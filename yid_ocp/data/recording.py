@@ -1,4 +1,4 @@
-"""Recordings in memory with joint groups and point groups, and their validation."""
+"""Recordings in memory: joint groups, point groups, other sensors, and their validation."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 
 _STD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 JOINT_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
-"""Constants that a joint group may have, not negative, of all joints or one for each."""
+"""Constants of a joint group that may be given, nonnegative, one for all joints or one for each."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
 _CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # what terminals obey and HDF5 cannot store
 
 _LARGEST = {"1": 1.0, "rad": 50.0, "rad/s": 1e6, "N m": 1e9}
-"""What no joint does: eight turns, which a posture in degrees nearly always exceeds, or beyond any machine."""
+"""Limits that no joint exceeds: eight turns (angles in degrees nearly always exceed them), or beyond any machine."""
 _LARGEST_SPREAD = 1e9  # its square is a number still
 _LARGEST_DISTANCE = 50.0  # beyond any motion capture volume, whereas an object in millimetres is always larger
 _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its end is seldom exactly the number asked for
@@ -46,29 +46,28 @@ _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its en
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointGroup(ReprMixin):
-    """Joint measurements of a robot, N samples of nj joints with a common clock. Arrays are copied and read-only.
+    """Joint measurements of a robot: N samples of nj joints with a common clock. Arrays are copied and read-only.
 
     Attributes
     ----------
     names : tuple of str, length nj
-        As in the URDF.
+        Joint names as in the URDF.
     t : ndarray, shape (N,)
         Strictly increasing time [s].
     position, velocity, effort : ndarray, shape (N, nj)
-        Measured [rad], [rad/s], [N m].
+        Measured values [rad], [rad/s], [N m].
     position_command, velocity_command : ndarray, shape (N, nj), or None
-        What the controller asked for [rad], [rad/s].
+        Commands of the controller [rad], [rad/s].
     external_effort : ndarray, shape (N, nj), or None
-        Effort left when the robot's own model is taken away [N m].
+        Effort minus the prediction of the robot's own model [N m].
     position_std, velocity_std, effort_std, effort_bias_std : float or ndarray, shape (nj,), or None
-        Standard deviations of noise, white from sample to sample, and of a constant error of a joint's effort, where
-        known [rad], [rad/s], [N m].
+        Standard deviations of white noise, and of a constant error of a joint's effort [rad], [rad/s], [N m].
     torque_enable : ndarray, shape (N, nj), or None
-        One where a servo's motor is on, zero where it is off.
+        One if a servo's motor is on, zero if it is off.
     position_resolution, proportional_gain : float or ndarray, shape (nj,), or None
-        Step of the encoder [rad]; proportional gain of a servo's firmware, in a unit of its own.
+        Step of the encoder [rad]; proportional gain set in a servo's firmware, in the firmware's unit.
     effort_kind : {'sample', 'mean', 'command'} or None
-        What `effort[k]` is of the true one: its value at t_k, its mean from t_k to t_{k+1}, or held until then.
+        Meaning of `effort[k]`: value at t_k, mean from t_k to t_{k+1}, or value held from t_k to t_{k+1}.
     clock : {'recorded', 'nominal'}
         Whether `t` was measured or is a sample index times a nominal period.
     """
@@ -102,12 +101,12 @@ class JointGroup(ReprMixin):
 
     @property
     def values_by_channel(self) -> dict[str, Array]:
-        """Recorded arrays by channel name, such as `position`, each (N, nj). Units: `JOINT_CHANNEL_UNITS`."""
+        """Recorded arrays (N, nj) by channel name, such as `position`. Units are in `JOINT_CHANNEL_UNITS`."""
         return {name: getattr(self, name) for name in JOINT_CHANNEL_UNITS if getattr(self, name) is not None}
 
     @property
     def effort_sampling_kind_or_default(self) -> EffortSamplingKind:
-        """Recorded `effort_kind`. The default is `sample`, as robot drivers publish."""
+        """Recorded `effort_kind`. The default is `sample`, which is what robot drivers publish."""
         return self.effort_kind or "sample"
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -127,18 +126,19 @@ class PointGroup(ReprMixin):
     Attributes
     ----------
     name : str
-        `points`, or `points_` and a word of one's own (`points_camera`, `points_arm`).
+        `points`, or `points_` and a word chosen by the user (`points_camera`, `points_arm`).
     t : ndarray, shape (M,)
         Strictly increasing time [s].
     position : ndarray, shape (M, np, 3)
-        Position in `frame` [m], NaN (all three coordinates) where a point was not seen.
+        Position in `frame` [m]; three NaN if a point was not seen.
     std : ndarray, shape (M, np, 3), or None
-        Standard deviation of the noise [m]; a number given for it is spread over the shape.
+        Standard deviation of the noise [m]; a single number is broadcast.
     sensor, frame : str
-        What saw the points, and their frame of reference.
+        Sensor of the points, and their reference frame.
     pose : ndarray, shape (4, 4), or None
-        Of a camera: the transform from camera to world coordinates [m].
+        For a camera: the transform from camera to world coordinates [m].
     clock : {'recorded', 'nominal'}
+        As in `JointGroup`.
     """
 
     name: str
@@ -171,23 +171,22 @@ class PointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorChannelGroup(ReprMixin):
-    """Samples of one additional sensor, for example a current sensor, with their own clock.
-
-    Arrays are copied, made float64 and read-only.
+    """Samples of one additional sensor, such as a current sensor, with its own clock. Arrays are read-only copies.
 
     Attributes
     ----------
     name : str
-        Declared group, `motors` for example, or that, `_` and a word of one's own.
+        Declared group such as `motors`, optionally with `_` and a word chosen by the user.
     names : tuple of str, length k
-        Of joints, or whatever the columns are.
+        Names of the columns, such as joints.
     t : ndarray, shape (M,)
         Strictly increasing time [s].
     values_by_quantity : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
-        In the channel's unit.
+        Values in the channel's unit.
     noise_and_bias_stds_by_attribute : mapping of str to float or ndarray, shape (k,)
-        Noise by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), where known, in the channel's unit.
+        Standard deviations by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), in the channel's unit.
     clock : {'recorded', 'nominal'}
+        As in `JointGroup`.
     """
 
     name: str
@@ -226,15 +225,15 @@ class Recording(ReprMixin):
     joints : JointGroup or None
         Positions, velocities, efforts and commands at M times `t` (M,) [s], shape (M, nj) [rad, rad/s, N m; m, m/s, N].
     points, channel_groups : tuple of PointGroup, tuple of SensorChannelGroup
-        What cameras, motion capture or an arm measured of points, and other sensors of anything; on their own clocks.
+        Measured points and the channels of other sensors, each group with its own clock.
     name, sha256 : str, str or None
-        Short name, the stem of the file, and hash of the file read.
+        Short name (the file name without suffix), and hash of the file.
     true_parameters : mapping of str to float
-        The parameter values of a virtual experiment, in the parameters' own units; empty for a real one.
+        Parameter values of a virtual experiment, in the parameters' units; empty for a real recording.
     marker_reference_pose : ndarray, shape (np, 3), or None
         Positions of the points of the first group while the object was held straight, in that group's frame [m].
     notes : tuple of str
-        What an import left out or changed, in words.
+        Sentences on content that an import omitted or changed.
     """
 
     joints: JointGroup | None = None
@@ -274,7 +273,7 @@ class Recording(ReprMixin):
 
     @property
     def all_groups(self) -> tuple[JointGroup | PointGroup | SensorChannelGroup, ...]:
-        """All groups of the recording. Joints precede points, then channels of additional sensors."""
+        """All groups of the recording: joints, then points, then channels of additional sensors."""
         return (*self.joint_and_point_groups, *self.channel_groups)
 
     @property
@@ -287,7 +286,7 @@ class Recording(ReprMixin):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the recorded joints, length nj. Empty without a joint group."""
+        """Names of the recorded joints, length nj; empty without a joint group."""
         return () if self.joints is None else self.joints.names
 
     @property
@@ -301,15 +300,15 @@ class Recording(ReprMixin):
         return float(max(group.t[-1] for group in self.all_groups) - min(group.t[0] for group in self.all_groups))
 
     def with_effort_sampling_kind(self, kind: EffortSamplingKind | None) -> Recording:
-        """Replace `effort_kind`. The recording is unchanged if `kind` is None or there are no joints."""
+        """Return a copy with another `effort_kind`, or the same recording if `kind` is None or there are no joints."""
         if kind is None or self.joints is None:
             return self
         return replace(self, joints=replace(self.joints, effort_kind=kind))
 
     def time_slice(self, start: float, stop: float) -> Recording:
-        """Select samples with start <= t <= stop [s]. Times are kept, and groups without samples are dropped.
+        """Return a copy with the samples from start to stop [s] and their times, without groups that have none.
 
-        `DataError` where nothing was recorded in between, or `start` is not before `stop`.
+        Raises `DataError` if there are no samples in this interval, or if `start` is not before `stop`.
         """
         masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.all_groups]
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
@@ -324,19 +323,19 @@ class Recording(ReprMixin):
 
 
 def validated_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
-    """Check shapes, clocks, names, values and units of a recording. It is returned unchanged.
+    """Check shapes, clocks, names, values and units of a recording, and return it unchanged.
 
-    `allow_nan_effort` says whether `effort` and `external_effort` may hold NaN, `where` what errors call the recording,
-    its file for example; its name where empty.
+    `allow_nan_effort` permits NaN in `effort` and `external_effort`. `where` names the recording in errors (default:
+    its name).
 
     Raises
     ------
     DataError
-        If there is no group, or one is empty; names are repeated or do not match the arrays; a clock is not finite and
-        strictly increasing; a joint channel has a value that is not finite; a point is infinite or seen in part; a
-        standard deviation is negative; the kind of effort is unknown; a pose is not a rigid transform; joint
-        positions exceed 50 rad or points 50 m, which are degrees or millimetres; speeds or efforts are beyond any
-        machine; `straight` does not match the first group of points.
+        There is no group, or a group is empty. Names are repeated or do not match the arrays. A clock is not finite and
+        strictly increasing. A joint channel is not finite, or a point is infinite or partly seen. A standard deviation
+        is negative. The kind of effort is unknown. A pose is not a rigid transform. Joint positions exceed 50 rad or
+        points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any machine. `straight` does
+        not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
     require_data(recording.all_groups, "the recording has no group", origin, "joints, points, points_<name>")
@@ -373,7 +372,7 @@ def require_data(condition: object, what: str, where: str, allowed: str = "", hi
 
 
 def read_only_array(value: ArrayLike, where: str) -> Array:
-    """Copy an array as read-only float64. `DataError` if it cannot be converted."""
+    """Copy an array as read-only float64. Raises `DataError` if it cannot be converted."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -388,7 +387,7 @@ def _constant(value: ArrayLike, where: str) -> float | Array:
 
 
 def _freeze_arrays(group: JointGroup | PointGroup | SensorChannelGroup, names: Iterable[str]) -> None:
-    """Make read-only arrays of the named fields that are not None, while a group is made."""
+    """Convert the named fields of a new group to read-only arrays, except None."""
     for name in names:
         if getattr(group, name) is not None:
             object.__setattr__(group, name, read_only_array(getattr(group, name), f"{group.name}/{name}"))
@@ -489,7 +488,7 @@ def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str
     finite, allowed = np.isfinite(straight).all(), "finite coordinates of every point"
     require_data(finite, "a position is not finite", where, allowed)
     _check_distances(straight, where)
-    # a file lists its groups by name, so only that order survives it
+    # a file lists its groups by name, so other orders are not stored
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
     require_data(first is groups[0], what, where, "groups of points sorted by name")

@@ -1,8 +1,7 @@
-"""Read and write recordings as HDF5 files, with safe access to any HDF5 file. The format is `yid-recording/1`.
+"""Read and write recordings as HDF5 files (format `yid-recording/1`), with safe access to any HDF5 file.
 
-The HDF5 library ends the process that meets a full disk while it writes, or certain damage while it reads, and takes
-links into other files for its own. None of this can be caught, so it is kept away from the process that does the work:
-writes are atomic, and another process reads the file first.
+The HDF5 library ends the process at a full disk and at certain damage of a file, and follows links into other files.
+Such errors cannot be caught. Files are therefore written atomically, and another process reads a file first.
 """
 
 from __future__ import annotations
@@ -50,13 +49,13 @@ _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
-    """Read and check a `yid-recording/1` file. With `allow_nan_effort`, efforts may hold NaN.
+    """Read and check a `yid-recording/1` file. With `allow_nan_effort`, efforts may contain NaN.
 
     Raises
     ------
     DataError
-        If the file is missing, not HDF5 or damaged, of another format, has a group, dataset, attribute or unit that
-        the format does not know, lacks one that it needs, or fails `validated_recording`.
+        The file is missing, not HDF5, damaged or of another format. It has an unknown group, dataset, attribute or
+        unit, lacks a required one, or fails `validated_recording`.
     """
     path = Path(path)
     digest = files.file_sha256(path)
@@ -69,9 +68,10 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Check a recording and write a `yid-recording/1` file atomically. Efforts may hold NaN.
+    """Check a recording and write a `yid-recording/1` file atomically. Efforts may contain NaN.
 
-    Errors as `validated_recording`, and `OutputError` where the file cannot be written; an older one is left as it was.
+    Raises the errors of `validated_recording`, and `OutputError` if the file cannot be written; an older file then
+    stays.
     """
     validated_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:
@@ -220,9 +220,9 @@ _MAX_GROUP_DEPTH = 10
 def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
     """Check in a forked process that a file can be read. A crash of the library then cannot end this process.
 
-    A fork, as a new process would take a second and a process of a pool may have no children. In it, `complaint` reads
-    the file and says what stands against it, nothing where all of it can be read. `DataError` where the file is no
-    regular one, with what the trial said of a file of the format `noun`, or how it ended.
+    `complaint` reads the file in the fork and returns a description of the error, empty on success. Raises `DataError`
+    if the file is not a regular file, with this description (for a file of the format `noun`), or if the fork crashes.
+    A fork is used because a new process takes a second, and pool processes may have no children.
     """
     files.check_input_file(path)
     if not hasattr(os, "fork"):
@@ -263,7 +263,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
 
 @contextlib.contextmanager
 def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """Create an HDF5 file in memory, written only if the block succeeds (context manager). Errors: `atomic_write`."""
+    """Create an HDF5 file in memory and write it if the block succeeds (context manager; errors of `atomic_write`)."""
     with files.atomic_write(Path(path)) as temporary:
         with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
             yield file
@@ -276,8 +276,8 @@ def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     """Open an HDF5 file after another process has checked that it can be read (context manager).
 
-    `DataError` where the file is damaged, holds more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers to
-    other files, whose contents no hash of this one covers; errors of the library in the block, too.
+    Raises `DataError` if the file is damaged, contains more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers
+    to other files (which its hash does not cover), and for errors of the library within the block.
     """
     check_readable_in_fork(Path(path), _complaint, "HDF5")
     try:
@@ -307,7 +307,7 @@ def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
 
 
 def _foreign(group: h5py.Group, depth: int = 0) -> str:
-    """Name of an entry that links into another file."""
+    """Description of an entry that links to another file, or empty."""
     for name in group:
         link = group.get(name, getlink=True)
         item = None if isinstance(link, h5py.ExternalLink) else group.get(name)
@@ -323,7 +323,7 @@ def _foreign(group: h5py.Group, depth: int = 0) -> str:
 
 
 def _excess(file: h5py.File) -> str:
-    """Whether a file declares more than allowed, whatever its types and its compression make of it in the file."""
+    """Description of an excess of declared numbers (independent of compression), or empty."""
     numbers = 0.0
 
     def count(name: str, item: h5py.Group | h5py.Dataset) -> None:

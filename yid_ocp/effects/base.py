@@ -141,8 +141,7 @@ class EffectBase(Effect):
 
     @property
     def shape_parameter_names(self) -> tuple[str, ...]:
-        """Names of shape parameters, such as a relaxation time, which have no influence while the amplitudes are
-        neutral."""
+        """Names of shape parameters, such as a relaxation time, without influence while the amplitudes are neutral."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
     @property

@@ -29,9 +29,9 @@ for _format in iter_modules(__path__):
 def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS, **options: Any) -> Recording:
     """Read and check a recording in any known format. The path's suffix selects the reader.
 
-    It is an HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
-    The options are those of the reader in `READERS`, by name. `DataError` where the format or an option is not known,
-    or the reader refuses the file.
+    Formats: HDF5 recording, CSV file, rosbag, MCAP file, ROS 2 bag folder, C3D file, LeRobot dataset. `options` are
+    those of the reader in `READERS`. Raises `DataError` if the format or an option is unknown, or if the reader refuses
+    the file.
     """
     path = Path(path)
     known_as = _format_of(path)
@@ -47,14 +47,14 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
 
 
 def reader_option_names(path: str | os.PathLike[str]) -> list[str]:
-    """Names of the options that `read_any` takes for a file or folder of its format. Errors are as in `read_any`."""
+    """Names of the options of `read_any` for a file or folder of this format. Raises the errors of `read_any`."""
     parameters = inspect.signature(READERS[_format_of(Path(path))]).parameters
     names = [entry.name for entry in fields(parameters["options"].default)] if "options" in parameters else parameters
     return [name for name in names if name not in ("path", "progress")]
 
 
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:
-    """Preview the data sources of a file in any known format, with options for `read_any`. Errors as there."""
+    """Preview the data sources of a file in any known format, with options for `read_any`, and its errors."""
     path = Path(path)
     known_as = _format_of(path)
     if known_as in FILE_PREVIEWERS:
@@ -68,7 +68,7 @@ def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
 
 
 def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
-    """The progress as an argument, for readers of files that may take long."""
+    """The `progress` argument for readers that take it."""
     return {"progress": progress} if "progress" in inspect.signature(reader).parameters else {}
 
 

@@ -1,4 +1,4 @@
-"""Read joint states, stamped points and poses, wrist sensors and IMUs from ROS bags and MCAP files."""
+"""Reader of joint states, stamped points and poses, wrist sensors and IMUs in ROS bags and MCAP files."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ _WRENCH, _IMU = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Imu"
 _MOUNTED = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
 _JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *JOINT_MESSAGE_TYPES)
 _KNOWN = (*_JOINT_TYPES, *_PLACES, *_MOUNTED)
-# last parts of topics that say what a message is, not what was seen
+# last parts of topics that name a message type, not the measured object
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu", "data", "data_raw")
 
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One message of a bag with topic, time of recording and header stamp [ns], and decoded content."""
+    """One message of a bag: topic, time of recording and header stamp [ns], and decoded content."""
 
     source: str
     logged: int
@@ -62,7 +62,7 @@ _MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
 
 
 class OpenBag:
-    """An open ROS 1 bag, ROS 2 bag or MCAP file with its topics and reader. `DataError` if unreadable."""
+    """An open ROS 1 bag, ROS 2 bag or MCAP file with its topics and reader. Raises `DataError` if it is unreadable."""
 
     def __init__(self, path: Path) -> None:
         highlevel, typesys = (
@@ -75,7 +75,7 @@ class OpenBag:
                 check_input_file(file, _MAX_METADATA_BYTES if file.suffix == ".yaml" else None)
         counted: Counter[tuple[str, str]] = Counter()
         with self.read_errors_as_data_errors():
-            # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
+            # older ROS 2 bags do not contain message definitions, which have not changed since
             store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
             self.reader: Any = highlevel.AnyReader([path], default_typestore=store)
             self.reader.open()
@@ -85,7 +85,7 @@ class OpenBag:
 
     @contextmanager
     def read_errors_as_data_errors(self) -> Iterator[None]:
-        """Turn every error while the bag is read into a `DataError` (context manager)."""
+        """Turn every error during reading of the bag into a `DataError` (context manager)."""
         try:
             with limited_memory():  # what is packed may say nothing, or lie, about its size
                 yield
@@ -96,17 +96,17 @@ class OpenBag:
             raise DataError(what, where=where, allowed=allowed, hint=hint) from error
 
     def topic_names_of_types(self, *kinds: str) -> list[str]:
-        """Names of the bag's topics that have one of the given message types."""
+        """Names of the bag's topics with one of the given message types."""
         return [topic.name for topic in self.topics if topic.kind in kinds]
 
     def check_topic_is_among(self, name: str, known: Sequence[str], noun: str) -> None:
-        """Raise `DataError` if the topic `name` is not among `known`. `noun` says what these topics provide."""
+        """Raise `DataError` if the topic `name` is not among `known`. `noun` names the content of these topics."""
         if name not in known:
             what = f"there are no {noun} on the topic '{name}'"
             raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known))
 
     def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
-        """Make the `DataError` for a bag without usable topics. It lists the bag's topics."""
+        """Return the `DataError` for a bag without usable topics, with a list of its topics."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
         return DataError(what, where=str(self.path), allowed=allowed, hint=f"it holds {held}")
 
@@ -114,8 +114,8 @@ class OpenBag:
 def relative_message_time_function(
     messages: Sequence[BagMessage], origins: Sequence[BagMessage] | None = None
 ) -> Callable[[BagMessage], float]:
-    """Make a function for a message's time [s] since the first of `origins`, or of `messages`."""
-    # one message without a stamp makes the two clocks incomparable, so then no stamp is used
+    """Return a function for a message's time [s] since the first of `origins` (default: of `messages`)."""
+    # if one message has no stamp, the two clocks are not comparable, and no stamp is used
     stamped = all(message.stamp > 0 for message in (*messages, *(origins or ())))
     origin = min((message.stamp if stamped else message.logged for message in origins or messages), default=0)
 
@@ -137,19 +137,19 @@ class _Contents:
 
 @dataclass(frozen=True)
 class BagOptions(base.SelectionAndUnitOptions):
-    """Options of `read_bag` for topics, joints and points, with their names in the recording and units.
+    """Options of `read_bag`: topics, joints and points, with their names in the recording, and units.
 
-    Joints are needed where the messages of a topic do not all have the same ones; messages that lack one are skipped.
-    Points are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`; all topics of points, poses and transforms
-    under the last telling part of their names where absent, and none of `/tf`.
+    `joints` is required if the messages of a topic differ in their joints; messages that lack one are skipped. `points`
+    are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`. By default they are all topics of points, poses and
+    transforms except `/tf`, each under the last descriptive part of its name.
     """
 
     joint_topics: Sequence[str] | None = None  # topics of the joint states; all that there are when absent
-    # topic of joint states whose positions are what the controller asked for: `position_command`, held in between
+    # topic of joint states whose positions are commands: `position_command`, held until the next command
     command_topic: str | None = None
-    # path of an array by joint channel, `/topic.field.field`, in messages of any type; joints are then called 1, 2, ...
+    # path of an array by joint channel, `/topic.field.field`, in messages of any type; joints are then named 1, 2, ...
     fields: Mapping[str, str] | None = None
-    # distance from a pose's origin at which NAME_x, NAME_y and NAME_z on its axes become points too [m]
+    # distance from a pose's origin of the additional points NAME_x, NAME_y and NAME_z on its axes [m]
     pose_axis_point_distance: float | None = None
     point_sensor_name: str = "unknown"  # what saw the points
     description: str = ""  # what was recorded
@@ -163,17 +163,16 @@ def read_bag(
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    `sensor_msgs/JointState` becomes the joints, of several topics on one clock; where there is none of it, Franka's
-    `FrankaState` and `FrankaRobotState` do (with the wrench that they estimate as `wrist_estimated`),
-    `DynamicJointState` and `JointTrajectoryControllerState` of `control_msgs`, and `RobotStateRTMsg` of `ur_msgs`;
-    `joint_topics` chooses them beside it, `fields` takes messages of any type. Stamped points, poses and transforms of
-    `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference;
-    `WrenchStamped` and `Imu` become a group `wrist` or `imu` per topic, on the frame of their header. Times are the
-    headers' stamps (the times of recording if a message has none), from the first message on. A joint channel that is
-    empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
+    Joints come from `sensor_msgs/JointState`; several topics are merged on one clock. Without it, they come from
+    Franka's `FrankaState` and `FrankaRobotState` (with the estimated wrench as `wrist_estimated`), `DynamicJointState`
+    and `JointTrajectoryControllerState` of `control_msgs`, or `RobotStateRTMsg` of `ur_msgs`. `joint_topics` selects
+    such topics even if there are joint states, and `fields` reads messages of any type. Stamped points, poses and
+    transforms of `geometry_msgs` and frames of `/tf` become points, one group per reference frame. Each topic of
+    `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
 
-    `DataError` where `rosbags` is not installed, the bag cannot be read, holds no such topic or leaves a choice open,
-    and as `validated_recording`.
+    Times are header stamps (recording times if a message has no stamp), relative to the first message. A joint channel
+    that is empty or all NaN is omitted. `notes` lists unused topics. Raises `DataError` if `rosbags` is not installed,
+    if the bag cannot be read, has no usable topic or is ambiguous, and the errors of `validated_recording`.
     """
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
@@ -244,7 +243,7 @@ for _kind in (".bag", ".mcap", ".db3", "folder"):
 def _contents(
     path: Path, trees: Sequence[str] | None, progress: Progress, fields: Mapping[str, str] | None = None
 ) -> _Contents:
-    """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
+    """Decode the usable messages of a bag. Of transform trees only the frames `trees` are decoded (None: all)."""
     bag, states, places, mounted = OpenBag(path), list[BagMessage](), list[BagMessage](), list[BagMessage]()
     own_topic, paths = _topic_and_paths(bag, fields or {})
     refused: DataError | None = None
@@ -252,10 +251,10 @@ def _contents(
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
     with bag.read_errors_as_data_errors(), closing(bag.reader) as reader:
         wanted = [c for c in reader.connections if c.topic == own_topic or c.msgtype in wanted_kinds]
-        # without definitions, as in older bags of ROS 2, only common types can be read
+        # without definitions, as in older ROS 2 bags, only common types can be read
         wanted = [c for c in wanted if c.topic == own_topic or c.msgtype in reader.typestore.fielddefs]
         total = sum(connection.msgcount for connection in wanted)
-        # an empty selection would mean all topics, images included
+        # an empty selection would mean all topics, including images
         for done, (connection, logged, data) in enumerate(reader.messages(wanted) if wanted else ()):
             if done % _PROGRESS_INTERVAL == 0:
                 progress.report_parts_done(done, total, "messages")
@@ -282,7 +281,7 @@ def _contents(
 
 
 def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """Topic and the path by channel of fields `/topic.field.field`; an empty topic where there are none."""
+    """Topic of fields `/topic.field.field`, empty without fields, and the path by channel."""
     split = {channel: text.partition(".") for channel, text in fields.items()}
     topics = sorted({topic for topic, _, _ in split.values()})
     where, allowed = str(bag.path), "CHANNEL=/TOPIC.FIELD, of one topic, position among them"
@@ -297,7 +296,7 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
 
 
 def _default_joint_topics(bag: OpenBag) -> list[str]:
-    """Topics of joint states; where there are none, those of other messages that hold joints."""
+    """Topics of joint states or, without any, of other messages with joints."""
     return bag.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE) or bag.topic_names_of_types(*JOINT_MESSAGE_TYPES)
 
 
@@ -331,7 +330,7 @@ def _plain(content: Any, kind: str) -> SimpleNamespace:
 
 
 def _vectors(content: Any, kind: str) -> dict[str, Any]:
-    """Values by quantity, and variances of their components where the message states them."""
+    """Values by quantity, and variances of their components if the message states them."""
     if kind == _WRENCH:
         return {"values": {name: _numbers(getattr(content.wrench, name), "xyz") for name in ("force", "torque")}}
     parts = {"angular_velocity": "angular_velocity", "specific_force": "linear_acceleration"}
@@ -349,7 +348,7 @@ def _numbers(content: Any, names: str) -> tuple[float, ...]:
 def _mounted_sensors(
     bag: _Contents, groups: Sequence[_States], seconds: Callable[[BagMessage], float]
 ) -> Iterator[SensorChannelGroup]:
-    """A group for each topic of wrenches or inertial readings, and for the wrench that an arm's driver estimates."""
+    """A group for each topic of wrenches or inertial readings, and for the wrench that a driver estimates."""
     for kind, group in _MOUNTED.items():
         topics = _names_of(bag, kind)
         for topic, name in topics.items():
@@ -372,7 +371,7 @@ def _sensor_group(
 
 
 class _States(NamedTuple):
-    """Joint states of one topic: names recorded and wanted, and the messages; whether they are commands."""
+    """Joint states of one topic: recorded and wanted names, messages, and whether they are commands."""
 
     topic: str
     names: tuple[str, ...]
@@ -419,7 +418,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
 
 
 def _own(wanted: Mapping[str, str], sets: Iterable[Sequence[str]]) -> tuple[str, ...]:
-    """Wanted joints that come together in messages of one topic, the most that do."""
+    """The largest set of wanted joints that occur together in messages of one topic."""
     return max((tuple(name for name in wanted if name in names) for names in sets), key=len, default=())
 
 
@@ -447,7 +446,7 @@ def _on_one_clock(
     for entry in groups:
         if entry.command:
             group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
-            # each command is held until the next; before the first it is that
+            # each command is held until the next; before the first command, the first one is used
             held = group.position[np.maximum(np.searchsorted(group.t, together.t + 1e-9, side="right") - 1, 0)]
             together = replace(together, position_command=held)
     return together, notes
@@ -480,7 +479,7 @@ _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 
 def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
-    """Topics of some types, those of points when absent, and the last part of each that says what was seen."""
+    """Topics of some types (default: points), with the last descriptive part of each name."""
     names = dict[str, str]()
     for topic in bag.file.topic_names_of_types(*(kinds or _PLACES)):
         parts = [part for part in topic.split("/") if part]
@@ -490,7 +489,7 @@ def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
 
 
 def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) -> _MessagesByFrame:
-    """Sort the points by frame of reference, each with its name."""
+    """Points with their names, by frame of reference."""
     present = sorted({message.source for message in bag.places})
     names = _names_of(bag) if points is None else dict(points)
     known = [*present, *(f"{tree}:FRAME" for tree in bag.file.topic_names_of_types(*_TREES))]
@@ -507,7 +506,7 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
 
 
 def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None) -> Iterator[tuple[str, BagMessage]]:
-    """The points, and of poses three more along the axes where a distance is given."""
+    """The points and, if a distance is given, three more points on the axes of each pose."""
     from scipy.spatial.transform import Rotation
 
     for name, message in entries:
@@ -515,7 +514,7 @@ def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None
         turn = message.content.axes
         if turn is None or distance is None:
             continue
-        # a quaternion of no length says nothing
+        # a quaternion of zero length has no rotation
         rotation = Rotation.from_quat(turn).as_matrix() if any(turn) else np.full((3, 3), np.nan)
         for axis, direction in zip("xyz", rotation.T, strict=True):
             place = tuple(np.array(message.content.point) + distance * direction)
@@ -526,7 +525,7 @@ def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None
 def _positions(
     entries: Iterable[tuple[str, BagMessage]], seconds: Callable[[BagMessage], float], where: str
 ) -> tuple[tuple[str, ...], Array, Array]:
-    """Names, times and positions (N, np, 3) of some points, NaN where one was not seen."""
+    """Names, times and positions (N, np, 3) of some points, NaN if a point was not seen."""
     seen: dict[tuple[float, str], tuple[float, ...]] = {}
     for point, message in entries:
         key = seconds(message), point
@@ -566,7 +565,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
 
 
 def _for_guess(bag: _Contents) -> Recording:
-    """Angles and points as they stand in a bag, whatever joints they are of, to see what units they have."""
+    """Angles and points of a bag as recorded, regardless of their joints, to guess their units."""
     widest = [float(np.nanmax(np.abs(m.content.position), initial=0.0)) for m in bag.states]
     joints = JointGroup(("any",), np.arange(float(len(widest))) * 1e-3, np.array(widest)[:, None]) if widest else None
     own = np.array([m.content.point for m in bag.places if ":" not in m.source], float).reshape(-1, 1, 3)

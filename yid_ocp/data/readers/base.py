@@ -1,4 +1,4 @@
-"""Registries of readers and previews, and shared steps such as selection, renaming and unit conversion."""
+"""Registries of readers and previews, and steps that readers share: selection, renaming and unit conversion."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _RecordingReader = Callable[..., Recording]
 
 @dataclass(frozen=True)
 class TopicOrColumnSummary:
-    """One topic, column or marker of a file to import, with sample count, rate and imported name."""
+    """One topic, column or marker of a file to import: sample count, rate and imported name."""
 
-    # what the file calls it, and its type
+    # name in the file, and type
     name: str
     kind: str
     n_samples: int  # messages or values
@@ -37,7 +37,7 @@ class TopicOrColumnSummary:
 
 @dataclass(frozen=True)
 class FilePreview:
-    """Preview of a file to import, with its data sources, suggested reader options and notes."""
+    """Preview of a file to import: data sources, suggested reader options and notes."""
 
     sources: tuple[TopicOrColumnSummary, ...]
     reader_options: Mapping[str, Any] = field(default_factory=dict)  # named options of the reader
@@ -45,13 +45,13 @@ class FilePreview:
 
 
 READERS: Registry[_RecordingReader] = Registry("recording format")
-"""Readers by file suffix, and by word for what is stored as a folder; each takes a path, then named options."""
+"""Readers by file suffix, or by a word for formats stored as a folder. Each takes a path, then named options."""
 
 FILE_PREVIEWERS: Registry[Callable[..., FilePreview]] = Registry("recording format with a preview")
-"""Functions that list a file's contents without importing it, by the same keys; each takes a path."""
+"""Functions that list a file's contents without importing it, by the keys of `READERS`. Each takes a path."""
 
 SKIPPED_COLUMN_MEANING = "skip"
-"""Column meaning that leaves the column out."""
+"""Column meaning that omits the column."""
 
 _TO_SI: Mapping[str, Mapping[str, float]] = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -61,14 +61,14 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
     "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "A": 1.0, "mA": 1e-3},
 }
 CURRENT_UNITS = ("A", "mA")
-"""Units of `effort` that are a motor's current."""
+"""Units of `effort` for motor currents."""
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
 _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 """Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
 
 
 def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
-    """Parse units by quantity from words such as `deg` or `velocity=rpm`. `DataError` if unknown or conflicting."""
+    """Parse units by quantity from words such as `deg` or `velocity=rpm`. Raises `DataError` if one is invalid."""
     units, exact = dict[str, str](), dict[str, str]()
     for word in words:
         quantity, equals, unit = word.partition("=")
@@ -96,7 +96,7 @@ def _spaceless(unit: str) -> str:
 
 
 def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
-    """Factor to SI of every quantity; of a current to ampere."""
+    """Factor to SI units of every quantity; for a current, to ampere."""
     factors = dict.fromkeys(_QUANTITIES, 1.0)
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
@@ -111,7 +111,7 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
 
 
 def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
-    """Parse new names from entries `name` or `recorded=name`. `DataError` for an empty or repeated name."""
+    """Parse new names from entries `name` or `recorded=name`. Raises `DataError` for an empty or repeated name."""
     found: dict[str, str] = {}
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))
@@ -126,13 +126,13 @@ def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class SelectionAndUnitOptions:
-    """Options shared by readers, for the selection and names of joints and points and the file's units."""
+    """Options that readers share: selection and names of joints and points, and the file's units."""
 
     joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
     points: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
     units: Mapping[str, str] | None = None  # unit of `t`, a joint channel or `points`, if not SI
-    # where `effort` is a motor's current, by joint or pattern: torque per current [N m/A], and turns of the motor per
-    # turn of the joint (1 where a joint has none)
+    # if `effort` is a motor current, by joint or pattern: torque per current [N m/A], and motor turns per joint turn
+    # (default 1)
     torque_constants: Mapping[str, float] | None = None
     gears: Mapping[str, float] | None = None
 
@@ -140,8 +140,8 @@ class SelectionAndUnitOptions:
 def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
     """Convert a recording to SI units, select joints and points, and validate the result.
 
-    `DataError` for a joint, point, quantity or unit that is not known, a current without torque constants, and as
-    `validated_recording`.
+    Raises `DataError` for an unknown joint, point, quantity or unit, or a current without torque constants, and the
+    errors of `validated_recording`.
     """
     factors = _factors(options.units or {}, where)
     group = raw.joints
@@ -196,7 +196,7 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
 
 
 def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, where: str) -> Array:
-    """N m per recorded number of every joint, shape (nj,)."""
+    """N m per recorded unit of every joint, shape (nj,)."""
     constants, gears = options.torque_constants or {}, options.gears or {}
     for word, given in (("torque_constants", constants), ("gears", gears)):
         for pattern, value in given.items():
@@ -225,7 +225,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
 
 
 def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
-    """Import a module of an optional dependency. `DataError` with an install hint if it is missing."""
+    """Import a module of an optional dependency. Raises `DataError` with an install hint if it is missing."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -233,13 +233,13 @@ def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
 
 
 def mean_sample_rate(t: Array) -> float:
-    """Mean sample rate [Hz] of the times `t` [s]. NaN for fewer than two samples."""
+    """Mean sample rate [Hz] of the times `t` [s]; NaN for fewer than two samples."""
     span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
     return (len(t) - 1) / span if span > 0 else math.nan
 
 
 def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Guess units of values that cannot be in SI units. The reasons are sentences."""
+    """Guess the units of values that cannot be in SI units. Returns the units, and the reasons as sentences."""
     units: dict[str, str] = {}
     notes = []
     joints = recording.joints
@@ -266,11 +266,11 @@ _MAX_INTERPOLATED_PERIODS = 5.0  # of a source, in the longest gap that is inter
 
 
 def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
-    """Merge joint groups of several named sources on the fastest clock, with notes on the merge.
+    """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
-    Values of the others are interpolated linearly between their samples. A time at which one of them has no sample
-    within five of its periods on both sides is left out, so that a gap stays a gap. `DataError` where two sources have
-    a joint in common, one lacks a channel that another has, or they share no time.
+    Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
+    its periods there. Raises `DataError` if two sources have a joint in common, if their channels differ, or if they
+    share no time.
     """
     if len(groups) == 1:
         return groups[0][1], ()

@@ -1,4 +1,4 @@
-"""Read markers from C3D files of motion capture (Vicon, Qualisys, OptiTrack) as points."""
+"""Reader of markers in C3D files of motion capture (Vicon, Qualisys, OptiTrack), as points."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from yid_ocp.errors import DataError
 from yid_ocp.files import file_sha256
 
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
-"""Lists of `points` that are no places, as models of a body write them."""
+"""Lists in `points` that are not positions but results of a body model."""
 _UNITS = ("m", "cm", "mm")
 
 
 class _Markers(NamedTuple):
-    """Markers of a file in its own unit: names, times, positions (N, np, 3), NaN where unseen; what else there is."""
+    """Markers of a file in its own unit: names, times, positions (N, np, 3), NaN if unseen; and other content."""
 
     names: tuple[str, ...]
     t: Array
@@ -46,13 +46,12 @@ def read_c3d(
 ) -> Recording:
     """Read the markers of a C3D file as one point group `points`. Its nominal clock starts at zero.
 
-    The file says its rate and its unit; `units` where it does not or wrongly. A marker that was not seen in a frame
-    (residual -1, NaN, or exactly the origin) is NaN. A subject in front of the name (`Subject:tip`) is left out where
-    the rest is unique. In `notes` are markers without a label, what a model of a body has computed (angles, forces,
-    moments, powers) and analog channels. `points` are markers to keep, each with its name; all labelled ones that were
-    ever seen when absent.
-
-    `DataError` where `ezc3d` is not installed, the file cannot be read or has no markers, and as `validated_recording`.
+    The file states rate and unit; `units` overrides the unit. A marker that was not seen in a frame (residual -1, NaN,
+    or exactly the origin) is NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `points`
+    maps the markers to keep to their names; by default all labelled markers that were ever seen are kept. `notes` lists
+    omitted content: unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels.
+    Raises `DataError` if `ezc3d` is not installed, if the file cannot be read or has no markers, and the errors of
+    `validated_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
@@ -125,7 +124,7 @@ def _markers(path: Path) -> _Markers:
 
 
 def _complaint(path: Path) -> str:
-    """Error of the library for a file; it may end its process, too."""
+    """Error of the library for a file; the library may also end the process."""
     import ezc3d
 
     try:
@@ -141,13 +140,13 @@ def _unreadable(path: Path, why: str) -> DataError:
 
 
 def _listed(group: Mapping[str, Any], key: str) -> list[str]:
-    """A list of a group of parameters with its continuations (`LABELS2` and so on), of more than 255 entries."""
+    """A list of a parameter group with its continuations (`LABELS2` and so on) beyond 255 entries."""
     names = takewhile(group.__contains__, chain([key], (f"{key}{number}" for number in count(2))))
     return [str(label).strip() for name in names for label in group[name]["value"]]
 
 
 def _short(labels: list[str]) -> tuple[str, ...]:
-    """Labels without their subjects where that leaves them unique."""
+    """Labels without their subjects if they stay unique."""
     last = [label.rpartition(":")[2] for label in labels]
     counts = Counter(last)
     return tuple(short if short and counts[short] == 1 else label for label, short in zip(labels, last, strict=True))

@@ -1,4 +1,4 @@
-"""Read CSV tables with one row per time, with or without a header row."""
+"""Reader of CSV tables with one row per time, with or without a header row."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from yid_ocp.sensors import CHANNEL_KINDS
 
 _AXES = ("x", "y", "z")
 _Meaning = tuple[str, str] | None
-"""Of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None for one to leave out."""
+"""Meaning of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None if it is omitted."""
 _MOUNTED = [
     channel for key in CHANNEL_KINDS if (channel := CHANNEL_KINDS[key]).components and channel.group != "points"
 ]
 _COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
-"""Components of vectors that sensors on a link read, such as `force_x`."""
+"""Components of vectors measured by sensors on a link, such as `force_x`."""
 _MOST_BAD = 0.5  # of a table's lines; beyond it the table is not understood at all
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # in cells: what a line takes beside them
@@ -47,10 +47,10 @@ _LISTED = 5  # numbers of bad lines in a note
 
 @dataclass(frozen=True)
 class CsvOptions(base.SelectionAndUnitOptions):
-    """Options of `read_csv` for the meaning of columns, columns to keep, delimiter, header and clock.
+    """Options of `read_csv`: meaning of columns, columns to keep, delimiter, header and clock.
 
-    `columns` say what a column means where its name does not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
-    column's name matches any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
+    `columns` gives the meaning of columns whose names do not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
+    column name matches any text, which replaces a `*` in the meaning: `*_pos` with `position:*`.
     """
 
     columns: Mapping[str, str] | None = None
@@ -69,17 +69,18 @@ _DEFAULTS = CsvOptions()
 def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> Recording:
     """Read a recording from a CSV table with one row per time. Its points become one group `points`.
 
-    Columns are understood by their names: `t`, `time` or `timestamp`; a channel and a joint, `q_<joint>`,
-    `position_<joint>`, `velocity_<joint>`, `effort_<joint>` and so on, also as other loggers write them: `pos_<joint>`,
-    `<joint>.vel`, `tau1`, `dq1`, `tau_J[0]`, `/joint_states/<joint>/effort`; a unit may follow, `time [ms]` or
-    `q1_deg`; `<sensor>_force_x`, `<sensor>_torque_x` of a wrist sensor, `<sensor>_angular_velocity_x`,
-    `<sensor>_specific_force_x` of an inertial unit; else a point and an axis, `<point>_x`, `<point>_y`, `<point>_z`.
-    Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are known by their headers; their points are in the
-    unit that the header states. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints,
-    points or such sensors together, a row in which all cells of one of them are empty is a time at which only the
-    others were measured.
+    Columns are recognised by name, optionally with a unit (`time [ms]`, `q1_deg`):
 
-    `DataError` where the file, a column, cell, option or unit cannot be understood, and as `validated_recording`.
+    - time: `t`, `time`, `timestamp`
+    - joints: `q_<joint>`, `position_<joint>`, `velocity_<joint>`, `effort_<joint>` and so on, or the spelling of other
+      loggers: `pos_<joint>`, `<joint>.vel`, `tau1`, `dq1`, `tau_J[0]`, `/joint_states/<joint>/effort`
+    - sensors on a link: `<sensor>_Q_x` with Q = force, torque, angular_velocity, specific_force
+    - points: `<point>_x`, `<point>_y`, `<point>_z`
+
+    Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are recognised by their headers, which also state
+    the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. If all cells of the joints,
+    of the points or of a sensor are empty in a row, this group has no sample at that time. Raises `DataError` if the
+    file, a column, cell, option or unit cannot be understood, and the errors of `validated_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
@@ -106,13 +107,13 @@ def _mocap_table(path: Path) -> tuple[PointGroup, str, tuple[str, ...]] | None:
 
 
 def _delimiter(path: Path) -> str:
-    """Delimiter of the first line with several cells; a comma where nothing does."""
+    """Delimiter of the first line with several cells; a comma if there is none."""
     _, first = next(_rows(path, ","), (1, []))
     return next((mark for mark in "\t; " if mark in first[0].strip()), ",") if len(first) == 1 else ","
 
 
 def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
-    """The table's joints, points and other sensors in its own units."""
+    """Joints, points and other sensors of the table in its own units."""
     t = table[:, meanings.index(("t", ""))]
     found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNEL_UNITS]
     joint_names = tuple(dict.fromkeys(joint for _, joint in found))
@@ -234,7 +235,7 @@ _ALLOWED = "one header row with names such as t, q_<joint>, effort_<joint>, <poi
 
 
 def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of every line that is not empty."""
+    """Line number and cells of every nonempty line."""
     if len(delimiter) != 1:
         raise DataError(f"the delimiter is {delimiter!r}", where=str(path), allowed="one character")
     try:
@@ -256,7 +257,7 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
-    """Lines of a file, none of which is longer than a table's may be."""
+    """Lines of a file. Raises `DataError` for a line longer than the limit."""
     while line := file.readline(_MAX_LINE_LENGTH + 1):
         if len(line) > _MAX_LINE_LENGTH:
             what, allowed = f"a line has more than {_MAX_LINE_LENGTH} characters", "one row of numbers per line"
@@ -267,7 +268,7 @@ def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
 def _read_table(
     path: Path, options: CsvOptions
 ) -> tuple[list[tuple[str, str]], dict[str, str], Array, tuple[str, ...]]:
-    """The columns that mean something: meanings, units of the header, table (rows, columns), and what was bad."""
+    """The columns with a meaning: meanings, units of the header, table (rows, columns), and notes on bad lines."""
     lines = _rows(path, options.delimiter or _delimiter(path))
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]

@@ -1,4 +1,4 @@
-"""Read state and action of one episode of a LeRobot dataset (version 2.0, 2.1 or 3.0) as joints."""
+"""Reader of state and action of one episode of a LeRobot dataset (version 2.0, 2.1 or 3.0), as joints."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CHANNELS = {
     "observation.state.velocity": "velocity",
     "observation.state.effort": "effort",
 }
-"""Features beside state and action that some robots record, one number for each joint of the state."""
+"""Features besides state and action that some robots record, with one number per joint."""
 _SUFFIXES = {"pos": "position", "vel": "velocity", "torque": "effort", "effort": "effort", "current": "effort"}
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
 _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -69,15 +69,13 @@ def read_lerobot_episode(
 ) -> Recording:
     """Read one episode, counted from zero, from the folder of a LeRobot dataset.
 
-    `observation.state` is the measured position of the joints, or position, velocity and effort where the names of its
-    entries end in `.pos`, `.vel` and `.torque`, `.effort` or `.current`; `action` is the commanded position. Times are
-    frame numbers over the frames a second, a nominal clock. Angles that cannot be radians, or are of robots which
-    LeRobot never records in radians, are refused unless `units` says what they are. Images and other features are in
-    `notes`. The other options are those of `SelectionAndUnitOptions`: a gripper that is not in the model is left out
-    with `joints`; many of these robots record degrees.
-
-    `DataError` where `pyarrow` is not installed, the dataset is not understood or has no such episode, and as
-    `validated_recording`.
+    `observation.state` is the measured position of the joints. If the names of its entries end in `.pos`, `.vel` and
+    `.torque`, `.effort` or `.current`, it is position, velocity and effort. `action` is the commanded position. Times
+    are frame index / frame rate, a nominal clock. Angles that cannot be radians, or of robots that LeRobot never
+    records in radians, are refused unless `units` states their unit (often degrees). `notes` lists images and other
+    features. The other options are those of `SelectionAndUnitOptions`; `joints` can omit a gripper that is not in the
+    model. Raises `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode,
+    and the errors of `validated_recording`.
     """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
@@ -119,13 +117,13 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
 
 
 def _widest(group: JointGroup) -> float:
-    """Largest recorded angle, without grippers, whose 0 to 100 is a part of their range also beside degrees."""
+    """Largest recorded angle without grippers, whose range is 0 to 100 even if the arm is in degrees."""
     arm = [i for i, name in enumerate(group.names) if "gripper" not in name.lower()]
     return float(np.nanmax(np.abs(group.position[:, arm]), initial=0.0))
 
 
 def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None:
-    """Raise `DataError` where angles are in degrees or normalised units, or the robot's are never in radians."""
+    """Raise `DataError` if angles are in degrees or normalised units, or the robot is never recorded in radians."""
     widest, robot = _widest(group), dataset.info.robot_type or ""
     if widest <= _MAX_RADIANS and not _NEVER_RADIANS.search(robot):
         return
@@ -161,7 +159,7 @@ def _dataset(folder: Path) -> _Dataset:
 
 
 def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path]:
-    """Columns of one episode, shape (frames, numbers of a frame), and the file in which it stands."""
+    """Columns of one episode, shape (frames, numbers of a frame), and its file."""
     arrow, parquet = (
         base.import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow", dataset.folder)
         for name in ("pyarrow", "pyarrow.parquet")
@@ -190,7 +188,7 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
 
 
 def _files(dataset: _Dataset, episode: int) -> list[Path]:
-    """Tables in which an episode may stand: its own one in version 2, any in version 3."""
+    """Tables that may contain an episode: its own one in version 2, any in version 3."""
     pattern, numbers = dataset.info.data_path, {"episode_chunk": 0, "episode_index": episode}
     if "episode_index" not in pattern:
         return sorted(dataset.folder.glob("data/*/*.parquet"))
@@ -207,7 +205,7 @@ def _files(dataset: _Dataset, episode: int) -> list[Path]:
 
 
 def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
-    """Raise `DataError` where the wanted columns of a parquet file declare more numbers than can be meant."""
+    """Raise `DataError` if the wanted columns of a parquet file declare implausibly many numbers."""
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     held = (group.column(i) for group in groups for i in range(group.num_columns))
     count = sum(column.num_values for column in held if column.path_in_schema.split(".list.")[0] in columns)
@@ -215,7 +213,7 @@ def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
 
 
 def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
-    """Raise `DataError` where a column of a parquet file holds anything but numbers, or lists of them."""
+    """Raise `DataError` if a column of a parquet file contains anything except numbers or lists of numbers."""
     from pyarrow import types
 
     for name in columns:
@@ -232,7 +230,7 @@ def _times(dataset: _Dataset, table: Mapping[str, Array]) -> Array:
 
 
 def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str, ...], dict[str, Any], dict[str, str]]:
-    """Joints, their channels, and the features that are left out, with the reason."""
+    """Joints, their channels, and omitted features with the reason."""
     state = table[_STATE]
     entries = [_entry(name) for name in _names(dataset, _STATE, state.shape[1])]
     joints = tuple(dict.fromkeys(joint for joint, channel in entries if channel == "position"))
