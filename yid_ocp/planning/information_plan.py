@@ -30,12 +30,12 @@ from yid_ocp.planning.motion_search import (
 from yid_ocp.planning.planned_experiment import ParameterizedExperiment
 from yid_ocp.problem import EstimationProblem
 
-_UNOBSERVABLE_STDS = 1e-2  # stds by which no reading moves when a parameter changes by its whole value: nothing sees it
-_RANDOM_COEFFICIENT_STD = 0.3  # of random motions from which a search begins, before limits shrink them [rad or m]
-_MAX_RELATIVE_SENSITIVITY_CHANGE = 0.05  # of a sensitivity with a ten-thousandth of the motion, or the object snaps
-_ACTIVE_LIMIT_FRACTION = 0.98  # part of a limit from which it counts as reached
-_PROBE_AMPLITUDE = 0.05  # largest unknown of a motion that asks what else could see a parameter [rad or m]
-_MIN_VISIBLE_MOTION = 1e-4  # of a point that a camera may see, for a change of a parameter by its whole value [m]
+_UNOBSERVABLE_STDS = 1e-2  # [data stds], for a change of a parameter by its whole value; below, it is unobservable
+_RANDOM_COEFFICIENT_STD = 0.3  # of random initial motions, before limits scale them down [rad or m]
+_MAX_RELATIVE_SENSITIVITY_CHANGE = 0.05  # for a 1e-4 larger motion; more means that the object snaps
+_ACTIVE_LIMIT_FRACTION = 0.98  # fraction of a limit from which the limit counts as reached
+_PROBE_AMPLITUDE = 0.05  # largest coefficient of the motion that tests other sensors [rad or m]
+_MIN_VISIBLE_MOTION = 1e-4  # of a point, for a change of a parameter by its whole value, to be worth a camera [m]
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class _ParameterPrecision:
 
 @dataclass(frozen=True, eq=False)
 class InformativeMotionPlan(PlannedMotion):
-    """Most informative motion found, with predicted parameter precisions and distances between effects."""
+    """The best of the informative motions found, with predicted parameter precisions and distances between effects."""
 
     parameter_precisions: Mapping[str, _ParameterPrecision]
-    # for each pair of effects, distance of the change by the first from what the second and all free unknowns can
-    # imitate, in standard deviations of the data: in the recordings and in the plan; empty without effects
+    # for each pair of effects: distance of the first effect's change from its best imitation by the second effect and
+    # all free unknowns [data stds], in the recordings and in the plan; empty without effects
     effect_distances: Mapping[tuple[str, str], tuple[float, float]]
     start_results: tuple[MotionSearchResult, ...]  # of the random initial motions, in the order drawn
     best_start_index: int
@@ -68,23 +68,22 @@ def plan_informative_motion(
     effects: Mapping[str, Mapping[str, float]] | None = None,
     progress: Progress = NULL_PROGRESS,
 ) -> InformativeMotionPlan:
-    """Plan the arm motion within limits that best identifies parameters or discriminates between effects.
+    """Plan the arm motion, within limits, that best identifies parameters or discriminates between effects.
 
     Parameters
     ----------
     problem : EstimationProblem
-        As configured: its sensors with their noise and rates are those of its first recording, its free parameters are
-        those that a recording of the motion would be fitted by.
+        Its first recording defines the sensors, their noise and their rates. Its free parameters are fitted.
     values : mapping of str to float, optional
-        Parameters at which to judge; the problem's when absent.
+        Parameter values at which the motion is optimised. Default: the values of the problem.
     effects : mapping of label to mapping of quantity to value, optional
-        Sizes of effects that are to be separated, where they are known; typical ones otherwise.
+        Known sizes of the effects to discriminate. Default: typical sizes.
 
     Raises
     ------
     ConfigError, ModelError, DataError, SolverError
-        Parameters or effects that do not exist or that no sensor sees, limits that leave no motion; no rest to begin
-        from; sensors without a noise level; a motion that its torques do not follow.
+        A parameter or effect does not exist or is unobservable; the limits leave no motion; there is no start
+        equilibrium; a sensor has no noise level; the rollout of a motion fails.
     """
     check_option_bounds(options, "plan")
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
@@ -121,7 +120,7 @@ def plan_informative_motion(
 def _chosen(
     problem: EstimationProblem, options: PlanOptions, sizes: Mapping[str, Mapping[str, float]]
 ) -> tuple[tuple[str, ...], tuple[EffectBase, ...]]:
-    """Parameters to identify, or effects to separate."""
+    """Parameters to identify, or effects to discriminate."""
     if options.identify is not None and options.discriminate is not None:
         what = "both parameters to identify and effects to discriminate are given"
         raise ConfigError(what, where="plan.discriminate", allowed="one of the two")
@@ -177,7 +176,7 @@ def _criterion(
 
 
 def _size(effect: EffectBase) -> Array:
-    """Amplitudes of an effect beside neutral: the known ones together, else half of its range, one after the other."""
+    """Amplitudes of an effect relative to neutral: the known ones together, else half of each range, one at a time."""
     neutral = effect.neutral_values
     known = np.array([effect.parameters[name].value - neutral[name] for name in effect.amplitude_names])
     if np.any(known):
@@ -187,7 +186,7 @@ def _size(effect: EffectBase) -> Array:
 
 
 def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions) -> None:
-    """Refuse limits that the arms pass where they begin."""
+    """Raise `ConfigError` if the arms violate their limits at the start."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
     for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
         if not low <= 0.0 <= high:
@@ -207,7 +206,7 @@ def _random(experiment: ParameterizedExperiment, seed: int) -> Array:
 
 
 def _smooth(experiment: ParameterizedExperiment, w: Array) -> tuple[Array, Array | None]:
-    """The motion, made smaller until what it tells changes smoothly with it, and its sensitivities."""
+    """Scale a motion down until its sensitivities change smoothly with it. Returns the motion and its sensitivities."""
     for _ in range(10):
         rows = experiment.search_problem_sensitivities(w)
         there = None if rows is None else experiment.search_problem_sensitivities((1.0 + 1e-4) * w)
@@ -222,7 +221,7 @@ def _is_near(there: Array, rows: Array) -> bool:
 
 
 def _unseen(experiment: ParameterizedExperiment, told: Sequence[Array | None]) -> dict[str, float]:
-    """Parameters of which no reading tells in any motion, by sensitivities: how far one moves at most [stds]."""
+    """Parameters to which no measurement of any motion is sensitive, with the largest sensitivity of each [stds]."""
     largest = np.zeros(len(experiment.sensitivity_column_names))
     for rows in told:
         if rows is not None:
@@ -325,7 +324,7 @@ def _judged(
 def _parameters(
     experiment: ParameterizedExperiment, w: Array
 ) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:
-    """Parameters of the nominal problem before, after and with both, and what the planned recording leaves open."""
+    """Parameter precisions from the recordings, the plan and both, and the directions left unidentifiable."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
     after = identifiability(

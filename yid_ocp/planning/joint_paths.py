@@ -116,10 +116,9 @@ class PlanOptions:
 
 
 class FramePositionEvaluator:
-    """Numeric world positions of named frames, and their Jacobian with respect to the configuration.
+    """World positions of named frames, and their Jacobian with respect to the configuration.
 
-    Raises `ConfigError` for a frame that does not exist.
-    """
+    Raises `ConfigError` if a frame does not exist."""
 
     def __init__(self, system: System, names: Sequence[str]) -> None:
         for name in names:
@@ -135,7 +134,7 @@ class FramePositionEvaluator:
             self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
 
     def positions_and_jacobian(self, q: Array, theta: Array) -> tuple[Array, Array]:
-        """Positions of np frames and their Jacobian at configurations (N, n). Shapes: (N, 3 np) [m], (N, 3 np, n)."""
+        """Positions (N, 3 np) [m] of np frames at configurations (N, n), and their Jacobian (N, 3 np, n)."""
         at, slope = (np.array(x).T for x in self._function(np.asarray(q).T, np.asarray(theta)))
         return at, slope.reshape(len(at), at.shape[1], np.shape(q)[1])
 
@@ -146,11 +145,10 @@ _N_REST_CONTROL_POINTS = 3  # control points alike at either end: no velocity an
 
 @dataclass(frozen=True)
 class SplinePath:
-    """Spline path of joints from rest to rest. q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
+    """Spline path of joints between standstills: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
-    A spline of degree 5 with clamped ends lies within the hull of its control points, and so do its derivatives:
-    limits on these hold at all times, not at nodes alone.
-    """
+    The spline has degree 5 and clamped ends. It and its derivatives lie within the convex hulls of their control
+    points, so limits on control points hold at all times, not only at nodes."""
 
     duration: float  # [s]
     n_coefficients: int  # K, coefficients of each joint; the last one is its displacement at the end
@@ -165,17 +163,17 @@ class SplinePath:
         return BSpline(knots, controls, _SPLINE_DEGREE).derivative(order)
 
     def coefficients_to_control_points_matrix(self, order: int = 0) -> Array:
-        """Matrix from coefficients to control points of the spline or its `order`-th derivative, (..., K)."""
+        """Matrix (..., K) from K coefficients to the control points of the spline or its `order`-th time derivative."""
         splines = self._splines(order)
         return np.asarray(splines.c[: len(splines.t) - splines.k - 1])
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
-        """Values of the K basis functions, or of their `order`-th derivative, at times `t` (N,) [s]: (N, K)."""
+        """Values (N, K) of the K basis functions, or of their `order`-th time derivative, at the times `t` (N,) [s]."""
         values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight_line_coefficients(self, change: Array) -> Array:
-        """Coefficients of a straight line in joint space, shape (K, nj). The displacement `change` is (nj,)."""
+        """Coefficients (K, nj) of a straight line in joint space with the displacement `change` (nj,)."""
         t = np.linspace(0.0, self.duration, 200)
         s = t / self.duration
         smooth = s**3 * (10 - 15 * s + 6 * s**2)
@@ -226,11 +224,11 @@ class PathSimulator:
         return self.path.basis_values(self.node_times)
 
     def joint_positions(self, w: Array) -> Array:
-        """Positions of the moved joints at the nodes, (N + 1, nc). The spline coefficients are (K, nc)."""
+        """Positions (N + 1, nc) of the moved joints at the nodes, for spline coefficients `w` (K, nc)."""
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """Simulate the path of coefficients (K, nc), with sensitivities to named parameters, then coefficients."""
+        """Simulate a path `w` (K, nc), with sensitivities to parameters `names`, then to `w` if `slopes`."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
@@ -305,7 +303,7 @@ class PlannedMotion:
 
     @cached_property
     def point_trajectories(self) -> dict[str, Array]:
-        """Trajectories of the system's points and any target point, by name, each (N + 1, 3) [m]."""
+        """World trajectories (N + 1, 3) [m] of the system's points and of the target point, if any, by name."""
         system = self.simulator.step.system
         names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
         places = self.simulator.frame_positions_along_states(FramePositionEvaluator(system, names), self.rollout.state)
@@ -322,7 +320,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 
 
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
-    """Start positions of the moved joints from a mapping, (nc,). `ConfigError` if one is missing or out of range."""
+    """Start positions (nc,) of the moved joints. Raises `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
@@ -345,8 +343,7 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
 def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, guess: Array | None = None) -> Equilibrium:
     """Solve for the equilibrium at which a motion begins, near the configuration `guess` if given.
 
-    Raises `ModelError` where there is none, for example because a grasp cannot be closed.
-    """
+    Raises `ModelError` if there is no equilibrium, for example because a grasp cannot be closed."""
     rest = EquilibriumSolver(step).solve(configuration, theta, guess=guess)
     if not rest.is_converged:
         allowed, where = "joint positions at which every grasp holds the object at rest", "plan.start_joint_positions"
@@ -375,10 +372,9 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 def solve_equilibrium_at_point_target(
     step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, place: Array, tolerance: float
 ) -> Equilibrium:
-    """Find an equilibrium within joint limits at which a point rests at its target. The start is the guess.
+    """Find an equilibrium within joint limits at which a point rests at its target. `start` is the initial guess.
 
-    Raises `ConfigError` where no joint moves the point, or where it cannot rest there.
-    """
+    Raises `ConfigError` if no joint moves the point, or if no equilibrium has the point at the target."""
     statics, system = EquilibriumSolver(step), step.system
     n, first = system.n_coordinates, start.state[list(system.prescribed_coordinate_indices)]
 
@@ -421,7 +417,7 @@ def solve_equilibrium_at_point_target(
 
 
 def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """Cache a function's latest value. Searches often ask for residual and Jacobian at one point."""
+    """Cache a function's latest value, because searches request residual and Jacobian at the same point."""
     last: list[tuple[Array, _Value]] = []
 
     def at(x: Array) -> _Value:

@@ -1,4 +1,4 @@
-"""Plan a motion that brings a point to a target. Statics gives end equilibria, shooting the path."""
+"""Plan a motion that brings a point to a target: statics gives the final equilibrium, shooting the path."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _CONVERGED_TOLERANCE_FRACTION = 0.1  # change by halving it, in parts of the tol
 
 @dataclass(frozen=True)
 class ParameterCovariance:
-    """Covariance matrix of uncertain model parameters, in the order of their names."""
+    """Covariance matrix of uncertain model parameters, in the order of `parameter_names`."""
 
     parameter_names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -46,8 +46,7 @@ class ParameterCovariance:
 class TargetMotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
-    Its simulator's step may be a shorter one than that the plan began with.
-    """
+    The time step of its simulator can be shorter than that of the given step."""
 
     target_point: str
     target_position: Array  # (3,) [m]
@@ -71,10 +70,10 @@ def plan_motion_to_target(
 ) -> TargetMotionPlan:
     """Plan a motion of a step's prescribed joints that brings a point to a target.
 
-    Parameters are the system's values when `theta` is absent; the covariance of some of them may be `known`. There is a
-    plan also where no motion within the limits was found: its `message` says which one is passed, and by how much.
-    `ConfigError` or `ModelError`: a goal out of reach, names that do not exist, an empty box, no rest to begin from.
-    """
+    `theta` defaults to the parameter values of the system; `known` is the covariance of uncertain parameters. If no
+    motion keeps the limits, the result is still a plan, and its `message` names the violated limit and the excess.
+    Raises `ConfigError` or `ModelError` if the goal is out of reach, a name does not exist, or there is no
+    equilibrium."""
     check_option_bounds(options, "plan")
     system = step.system
     if system.driven or not system.prescribed:
@@ -146,7 +145,7 @@ def _place(options: PlanOptions, begin: Array) -> Array:
 
 
 def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, place: Array) -> None:
-    """Refuse a box that frames begin outside of at places (frames, 3) [m], or that the point leaves."""
+    """Raise `ConfigError` if frames start outside the box, at `places` (frames, 3) [m], or if the target is outside."""
     if options.box is None:
         raise ConfigError("there is no box", where="plan.box", allowed="two corners [m]", hint="goal: place needs none")
     low, high = np.array(options.box)
@@ -168,10 +167,8 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
 
 
 def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> TargetMotionPlan:
-    """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
-
-    What swings in the end is a small difference of large motions, and a part of it is lost by too coarse a step.
-    """
+    """Find the best motion of one duration, and refine it with shorter time steps to resolve the residual
+    oscillation."""
     options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
     lower, upper = mover.coefficient_bounds()
     for halved in range(_MAX_STEP_HALVINGS + 1):
@@ -189,13 +186,13 @@ def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) ->
 
 
 def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
-    """The same motion from rest with another step or other parameters."""
+    """The same motion from equilibrium with another step or other parameters."""
     rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.start_configuration)
     return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
 
 def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array) -> bool:
-    """Whether half the time step changes neither the final position of the point nor its rest."""
+    """Whether the final position of the point and its standstill are the same with half the time step."""
     pairs = ((rows.simulator, 1), (finer, 2))
     own, other = (
         mover.frame_positions_along_states(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs
@@ -208,7 +205,7 @@ def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array)
 
 
 def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> list[PlanResidualAndLimitFunctions]:
-    """The same motion with parameters a standard deviation off, along the axes that move the point's rest most."""
+    """The same motion with parameters off by one std, along the axes that move the point's equilibrium most."""
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
         what, where = "the parameters' uncertainty is not known", "plan.minimize_parameter_sensitivity"
@@ -231,7 +228,7 @@ def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) 
 
 
 def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: ParameterCovariance) -> Array:
-    """Derivative of the point's place at every node of the end by the uncertain parameters, shape (nodes, 3, count)."""
+    """Derivative of the point's final position, at each final node, by the uncertain parameters, (nodes, 3, count)."""
     mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.standstill_node_indices
     rollout = mover.simulate_path(w, names=known.parameter_names)
     assert rollout.state_sensitivity is not None
@@ -279,7 +276,7 @@ def _shortest(
     attempt: Callable[[float], TargetMotionPlan],
     progress: Progress,
 ) -> TargetMotionPlan:
-    """Halve the gap between a duration with which the goal is reached and one with which it is not, in steps of h."""
+    """Bisect, in steps of h, between a duration that reaches the goal and one that does not."""
 
     def good(one: TargetMotionPlan) -> bool:
         return one.is_successful and one.max_residual_speed <= options.point_rest_speed_tolerance

@@ -1,13 +1,13 @@
 """Search for motions within limits that reach a goal or maximise information.
 
-For a goal it is single shooting. Bounds of the unknowns are kept by the trust region, all other limits by an augmented
-Lagrangian: a row g <= u adds rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is passed.
+To reach a goal, single shooting is used. The trust region keeps the bounds of the unknowns. An augmented Lagrangian
+keeps all other limits: a row g <= u adds rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until all rows
+are satisfied.
 
-For information, sensitivities J(w) and limits are linearised in every round and the criterion of the linear J is
-maximised within a trust region (Burke and Ferris 1995, doi:10.1007/BF01585997) by SLSQP (Kraft 1988, DFVLR-FB 88-28).
-All iterates keep the limits. Every parameter has a prior standard deviation of `MAX_WEAK_RELATIVE_STD` of its value, so
-that a criterion stays finite where no measurement informs one.
-"""
+To maximise information, each round linearises the sensitivities J(w) and the limits, and SLSQP (Kraft 1988, DFVLR-FB
+88-28) maximises the criterion of the linear J within a trust region (Burke and Ferris 1995, doi:10.1007/BF01585997).
+All iterates satisfy the limits. Each parameter has a prior standard deviation of `MAX_WEAK_RELATIVE_STD` of its value;
+it keeps the criterion finite if no measurement informs the parameter."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array,
 
 @dataclass(eq=False)
 class PlanResidualAndLimitFunctions:
-    """Goal residuals and limited quantities of a planned motion as functions, for one set of model parameters."""
+    """Goal residuals and limited quantities of a planned motion, as functions, for one set of model parameters."""
 
     simulator: PathSimulator
     options: PlanOptions
@@ -82,7 +82,7 @@ class PlanResidualAndLimitFunctions:
         return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.simulator.node_times, at[-1])))
 
     def _goal_residual(self, rollout: Rollout, w: Array) -> list[tuple[Array, Array]]:
-        """Goal residual and Jacobian in parts: distances and speeds over their tolerances, and weak regularisation."""
+        """Goal residual (distances and speeds over tolerances, weak regularisation) and its Jacobian, in parts."""
         mover, options, h = self.simulator, self.options, self.simulator.step.time_step
         n, size = mover.step.system.n_coordinates, w.size
         assert rollout.state_sensitivity is not None
@@ -107,10 +107,10 @@ class PlanResidualAndLimitFunctions:
         return parts
 
     def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
-        """Values of the limited quantities along a motion, in the order and units of `limit_rows`, (rows,).
+        """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
-        The second result is their Jacobian (rows, K nc) by the coefficients; None if the rollout has no sensitivities.
-        """
+        Also returns their Jacobian (rows, K nc) with respect to the coefficients, or None if `rollout` has no
+        sensitivities."""
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
@@ -150,12 +150,12 @@ class PlanResidualAndLimitFunctions:
         return found
 
     def split_values_by_limit_kind(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
-        """Iterate over pairs of limit rows and values by kind of limit. `value` is ordered as `limit_rows`."""
+        """Iterate over pairs (limit rows, values), one per kind of limit. `value` is ordered as `limit_rows`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
     def worst_violated_row_by_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
-        """Name, value and bound of the worst violated row of each kind of limit that is violated."""
+        """For each violated kind of limit: name, value and bound of its worst row."""
         found = {}
         for rows, own in self.split_values_by_limit_kind(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
@@ -172,7 +172,7 @@ def _by_coefficients(matrix: Array, w: Array) -> Array:
 
 
 def _rows(value: Array, slope: Array, unit: float) -> tuple[Array, Array]:
-    """Rows of nodes (N, m), so that the sum of their squares is the mean over the nodes in squares of the unit."""
+    """Rows (N, m) of nodes, scaled such that the sum of their squares is the mean over the nodes in units squared."""
     scale = 1.0 / (unit * np.sqrt(len(value)))
     return scale * value.ravel(), scale * slope.reshape(value.size, -1)
 
@@ -199,7 +199,7 @@ class TargetMotionSearchResult:
 
 
 class TargetMotionSearch:
-    """Shooting problem for a motion. Goal residuals are of several parameter cases, limits of the first case."""
+    """Shooting problem for a motion. Goal residuals cover several parameter cases, limits only the first."""
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
@@ -208,7 +208,7 @@ class TargetMotionSearch:
         self.evaluations = 0
 
     def _evaluated(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """Residual and its Jacobian, scaled limit values and theirs; not finite where a rollout fails."""
+        """Residual, scaled limit values and the Jacobians of both; not finite if a rollout fails."""
         self.evaluations += 1
         w = x.reshape(self._shape)
         rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
@@ -220,10 +220,11 @@ class TargetMotionSearch:
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> TargetMotionSearchResult:
-        """Optimise a motion's spline coefficients from `start` within bounds, all (K, nc).
+        """Optimise the spline coefficients of a motion. `start`, `lower` and `upper` have shape (K, nc).
 
-        Rockafellar (1973), doi:10.1007/BF01580138; Branch, Coleman and Li (1999), doi:10.1137/S1064827595289108.
-        """
+        An augmented Lagrangian keeps the limits (Rockafellar 1973, doi:10.1007/BF01580138). An interior trust-region
+        method keeps the bounds (Branch, Coleman and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations`
+        evaluations."""
         low, high = lower.ravel(), upper.ravel()
         x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
         pull = np.zeros((2, len(self._unit)))
@@ -266,7 +267,7 @@ class TargetMotionSearch:
 
 
 def _prior(columns: int, bounded: Sequence[int]) -> Array:
-    """Information beforehand: of parameters `MAX_WEAK_RELATIVE_STD`, of all else next to none (it is in the rows)."""
+    """Prior information: parameters have a std of `MAX_WEAK_RELATIVE_STD`, other unknowns a negligible term."""
     prior = np.full(columns, 1e-6)
     prior[list(bounded)] = MAX_WEAK_RELATIVE_STD**-2
     return prior
@@ -274,17 +275,16 @@ def _prior(columns: int, bounded: Sequence[int]) -> Array:
 
 @dataclass(frozen=True)
 class DOptimalityCriterion:
-    """Optimality criterion -1/2 log det of chosen parameters' covariance. All other unknowns are eliminated.
+    """Optimality criterion -1/2 log det of the covariance of chosen parameters, with all other unknowns eliminated.
 
-    D-optimality, with some of the parameters chosen D_s-optimality: Atkinson, Donev and Tobias (2007), Optimum
-    Experimental Designs, with SAS, sections 10.2 and 10.3.
-    """
+    It is D-optimality, or D_s-optimality if only some parameters are chosen (Atkinson, Donev and Tobias 2007, Optimum
+    Experimental Designs, with SAS, sections 10.2 and 10.3)."""
 
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] and its gradient at sensitivities (nr, columns). No gradient if `slope` is False."""
+        """Criterion [nat] and its gradient by the sensitivities `rows` (nr, columns), empty without `slope`."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
@@ -299,11 +299,10 @@ class DOptimalityCriterion:
 
 @dataclass(frozen=True)
 class EffectDiscriminationCriterion:
-    """Criterion of how well the readings separate effects from imitations by other effects.
+    """Criterion of how well the measurements separate effects: -1/2 log sum_ij 1 / (1 + d_ij^2).
 
-    d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
-    -1/2 log sum_ij 1 / (1 + d_ij^2).
-    """
+    d_ij^2 = min_b |J_i a - J_j b|^2 is the distance of effect i from the best imitation by effect j and the nuisance
+    unknowns. The smallest distances dominate the sum."""
 
     amplitude_columns: tuple[tuple[int, ...], ...]  # of every effect
     # of the amplitudes, in units of the columns, (amplitudes, cases): one case where they are known, else one for each
@@ -311,14 +310,14 @@ class EffectDiscriminationCriterion:
     parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
 
     def pairwise_effect_distances(self, rows: Array) -> Array:
-        """Distances of effect i (row) from all that effect j can imitate [data stds]. The diagonal is infinite."""
+        """Distances [data stds] of effect i (row) from its best imitation by effect j; infinite diagonal."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] and its gradient at sensitivities (nr, columns). No gradient if `slope` is False."""
+        """Criterion [nat] and its gradient by the sensitivities `rows` (nr, columns), empty without `slope`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
@@ -331,7 +330,7 @@ class EffectDiscriminationCriterion:
         return -0.5 * float(np.log(total)), 0.5 * by_rows / total if slope else np.zeros((0, 0))
 
     def _apart(self, rows: Array, i: int, j: int) -> tuple[float, Array, list[int], Array]:
-        """Squared distance, what is left of the change by i, the columns of what may explain it, and how they do."""
+        """Squared distance, unexplained change by effect i, and columns and coefficients that imitate it."""
         away = {column for k, effect in enumerate(self.amplitude_columns) if k != j for column in effect}
         others = [column for column in range(rows.shape[1]) if column not in away]
         change, basis = rows[:, list(self.amplitude_columns[i])] @ self.amplitude_cases[i], rows[:, others]
@@ -365,7 +364,7 @@ class MotionSearchResult:
 
 
 class InformativeMotionSearch:
-    """Searches the motion of a planned experiment that maximises an optimality criterion within limits."""
+    """Search for the motion of a planned experiment that maximises an optimality criterion within limits."""
 
     def __init__(
         self,
@@ -378,14 +377,14 @@ class InformativeMotionSearch:
         self._unit, self._low, self._high = _limit_units_and_scaled_bounds(limits.limit_rows)
 
     def _limited_values(self, w: Array) -> tuple[Array, bool]:
-        """Limited quantities of a motion in parts of their limits, and whether it can be simulated and keeps these."""
+        """Limited quantities of a motion over their limits, and whether its rollout succeeds and satisfies them."""
         value = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w), w)[0] / self._unit
         flat = w.ravel()
         within = np.all((value <= self._high) & (value >= self._low))  # not where a value is not finite
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
     def shrink_to_limits(self, w: Array) -> Array:
-        """Scale down spline coefficients until the motion keeps its limits, shape (K, nc)."""
+        """Scale spline coefficients (K, nc) down until the motion satisfies its limits."""
         for _ in range(60):
             if self._limited_values(w)[1]:
                 return w
@@ -393,7 +392,7 @@ class InformativeMotionSearch:
         return np.zeros_like(w)
 
     def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
-        """Criterion and sensitivities of a motion; minus infinity where it cannot be simulated."""
+        """Criterion and sensitivities of a motion; the criterion is minus infinity if the rollout fails."""
         rows = self.experiment.search_problem_sensitivities(w)
         return -np.inf if rows is None else self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows
 
@@ -431,7 +430,7 @@ class InformativeMotionSearch:
         return MotionSearchResult(w, first, value, finished, done)
 
     def _step(self, rows: Array, slopes: Array, w: Array, bounded: tuple[Array, Array], radius: float) -> Array:
-        """The best step in the linear picture within a trust region, made such that the true limits are kept."""
+        """The best step of the linearised problem within a trust region, shortened until the true limits hold."""
         value, slope = bounded
         reach = np.abs(slope).sum(1) * radius
         shift = np.zeros_like(value)

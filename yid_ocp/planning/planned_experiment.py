@@ -1,10 +1,9 @@
 """Predict recording and sensitivities of a planned arm motion with the configured sensors.
 
-To search, the arms are moved and the torques that this needs are measured, with a constant error each; what errors of a
-driven arm's motion do to all readings is taken at rest, once, and eliminated (Golub and Pereyra 1973,
-doi:10.1137/0710036). To judge what was found, the estimation problem as it is configured is driven by these torques. Of
-a camera the information of its mean rate over the recording is spread evenly over the motion.
-"""
+During the search, the arm motion is prescribed and the required torques are measured, each with a constant error. The
+effect of errors of a driven arm's motion on all readings is computed once, at standstill, and eliminated (Golub and
+Pereyra 1973, doi:10.1137/0710036). The motion found is judged with the configured estimation problem, which is driven
+by these torques. The information of a camera is its mean rate over the recording, constant along the motion."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ _SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
 
 @dataclass(frozen=True, eq=False)
 class ParameterizedExperiment:
-    """A planned experiment whose predicted recording and sensitivities depend on spline coefficients w."""
+    """A planned experiment whose predicted recording and sensitivities depend on spline coefficients w (K, nc)."""
 
     configured_problem: EstimationProblem  # of the settings; its first recording defines sensors, noise and rates
     parameter_values: Mapping[str, float]  # at which the sensitivities are taken
@@ -59,10 +58,10 @@ class ParameterizedExperiment:
     def from_options(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
     ) -> ParameterizedExperiment:
-        """Make a planned experiment from a plan's options at parameter `values`, with parameters `names` free.
+        """Make a planned experiment from a plan's options, at parameter `values` and with the free parameters `names`.
 
-        Raises `ConfigError` if no joint moves or clamps follow measured points, `ModelError` without an equilibrium.
-        """
+        Raises `ConfigError` if no joint moves or clamps follow measured points, `ModelError` if there is no
+        equilibrium."""
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_definitions_from_points or not (system.driven or system.prescribed):
             said, allowed = "no joint moves whose motion could be planned", "a robot whose arms move"
@@ -86,11 +85,9 @@ class ParameterizedExperiment:
         return ParameterizedExperiment(problem, known, mover, tuple(names) or problem.free)
 
     def _noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
-        """Noise-free predicted recording of a motion (K, nc); it states the standard deviations of its sensors.
+        """Noise-free predicted recording of a motion (K, nc), with its sensors' standard deviations.
 
-        `fastest` is the highest sample rate of points [Hz]; those of a faster sensor are thinned, their information per
-        second kept.
-        """
+        The samples of point sensors above the rate `fastest` [Hz] are thinned; their information per second is kept."""
         mover, base = self.simulator, self.configured_problem.episodes[0]
         rollout, system = mover.simulate_path(w), mover.step.system
         if not rollout.status.is_converged:
@@ -126,7 +123,7 @@ class ParameterizedExperiment:
     def _seen(
         self, samples: SensorMeasurements, frames: FramePositionEvaluator, q: Array, fastest: float
     ) -> PointGroup:
-        """Points of one sensor along the motion, their information per second as in the recording."""
+        """Points of one sensor along the motion, with the same information per second as in the recording."""
         mover, base = self.simulator, self.configured_problem.episodes[0]
         sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
         inverse = np.sum(np.where(samples.positive_weight_mask, samples.weight**2, 0.0), axis=0)
@@ -145,13 +142,13 @@ class ParameterizedExperiment:
 
     @cached_property
     def _points(self) -> list[tuple[SensorMeasurements, FramePositionEvaluator]]:
-        """Measurements of points, each with their frames."""
+        """Measurements of points, each with an evaluator of its frames."""
         system, measured = self.simulator.step.system, self.configured_problem.episodes[0].measurements
         seen = [samples for samples in measured if samples.sensor.point_names]
         return [(samples, FramePositionEvaluator(system, samples.sensor.frame_names)) for samples in seen]
 
     def _options(self, **changes: object) -> ProblemOptions:
-        """The problem's options for the planned recording alone, which states its points' noise itself."""
+        """The problem's options for the planned recording alone, which holds the noise of its points."""
         options, base = self.configured_problem.options, self.configured_problem.episodes[0]
         own = dict(options.sensors)
         for name in (samples.sensor.group_name for samples, _ in self._points):
@@ -164,11 +161,11 @@ class ParameterizedExperiment:
 
     @property
     def zero_coefficients(self) -> Array:
-        """Zero spline coefficients, which keep the arms at their start, shape (K, nc)."""
+        """Zero spline coefficients (K, nc), with which the arms stay at their start."""
         return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.moved_joint_indices)))
 
     def planned_estimation_problem(self, w: Array) -> EstimationProblem:
-        """Configured estimation problem on the planned recording of coefficients w, instead of its own recordings."""
+        """Configured estimation problem, with the planned recording of coefficients `w` as its only recording."""
         return self._problem(self.configured_problem.step, self._noise_free_recording(w), self._options())
 
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
@@ -195,7 +192,7 @@ class ParameterizedExperiment:
         return self._relative(problem, evaluation)
 
     def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
-        """Sensitivities to relative changes, without what is known of the parameters beforehand: no sensor sees it."""
+        """Sensitivities to relative changes, without the prior information on parameters."""
         jacobian = linearization_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
         jacobian[problem.residual_rows.stated_priors] *= ~own
@@ -203,7 +200,7 @@ class ParameterizedExperiment:
 
     @cached_property
     def _known(self) -> EstimationProblem:
-        """The problem in which the motion is known and torques are measured."""
+        """The problem of the search, in which the motion is known and torques are measured."""
         recording = self._noise_free_recording(self.zero_coefficients, _MAX_SEARCH_POINT_RATE)
         joints = recording.joints
         assert joints is not None
@@ -222,12 +219,12 @@ class ParameterizedExperiment:
 
     @cached_property
     def unknown_scales(self) -> Array:
-        """Size of every unknown of the search problem, in column order. Relative changes refer to it."""
+        """Size of each unknown of the search problem, in column order, to which relative changes refer."""
         return _sizes(self._known)
 
     @cached_property
     def sensitivity_column_names(self) -> tuple[str, ...]:
-        """Column names of `search_problem_sensitivities`, from parameters, other unknowns and torque errors."""
+        """Column names of `search_problem_sensitivities`: parameters, other unknowns, torque offsets."""
         return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
 
     @cached_property
@@ -240,7 +237,7 @@ class ParameterizedExperiment:
 
     @cached_property
     def _offsets(self) -> Array:
-        """Columns of the constant errors, in units of their standard deviations, priors below, (nr + no, no)."""
+        """Sensitivities (nr + no, no) to constant errors in units of their stds; the last rows are priors."""
         problem, std = self._known, self._offset_std
         found = np.zeros((problem.residual_rows.slice_without_weak_priors.stop, len(std)))
         for samples, rows in zip(problem.episodes[0].measurements, problem.residual_rows.measurements[0], strict=True):
@@ -255,7 +252,7 @@ class ParameterizedExperiment:
         return np.vstack([found, np.eye(len(std))])
 
     def search_problem_sensitivities(self, w: Array) -> Array | None:
-        """Whitened sensitivities to relative changes of unknowns, (nr, columns). None if the rollout fails."""
+        """Whitened sensitivities (nr, columns) to relative changes of the unknowns, or None if the rollout fails."""
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None
@@ -277,7 +274,7 @@ class ParameterizedExperiment:
 
     @cached_property
     def _blur(self) -> tuple[Array, Array]:
-        """Directions of the data that errors of a driven arm's motion blur, and how much of each is lost, 0 to 1."""
+        """Directions of the data affected by motion errors of a driven arm, and the lost fraction of each (0 to 1)."""
         problem, mover, errors = self._known, self.simulator, self.configured_problem.episodes[0].input_errors
         data = problem.residual_rows.data.stop
         if not self.configured_problem.system.driven:
@@ -307,7 +304,7 @@ class ParameterizedExperiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
-        """Differences of `search_problem_sensitivities` in w, (w.size, nr, columns). None if one fails."""
+        """Difference derivatives (w.size, nr, columns) of `search_problem_sensitivities` by w, or None."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()
@@ -320,7 +317,7 @@ class ParameterizedExperiment:
 
 
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
-    """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
+    """Raise `ConfigError` if the motion is too short for the low-pass filter of its efforts."""
     joints, low_pass = problem.episodes[0].recording.joints, twice_applied_effort_filter(problem.options.path_cutoff)
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
@@ -332,12 +329,12 @@ def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
 
 
 def _sizes(problem: EstimationProblem) -> Array:
-    """Value of every unknown, its typical size where that is zero."""
+    """Value of each unknown, or its typical size if the value is zero."""
     return np.where(problem.initial_unknowns != 0, np.abs(problem.initial_unknowns), problem.unknown_scales)
 
 
 def _splines(times: Array, band: float) -> Array:
-    """Cubic splines from rest up to a frequency, shape (N + 1, count)."""
+    """Cubic splines (N + 1, count) that start at zero, up to the frequency `band` [Hz]."""
     inner = np.linspace(times[0], times[-1], max(2, round((times[-1] - times[0]) * 2 * band)))
     knots = np.concatenate([np.full(3, inner[0]), inner, np.full(3, inner[-1])])
     # the first posture is known
