@@ -1,4 +1,4 @@
-"""The estimation problem, with recordings on rollout nodes, predictions, and residuals with derivatives."""
+"""The estimation problem: recordings on rollout nodes, predictions, and residuals with derivatives."""
 
 from yid_ocp.problem.estimation_problem import EstimationProblem as EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses as EquilibriumGuesses

@@ -56,7 +56,7 @@ class _Prepared:
 
 @dataclass(frozen=True)
 class EpisodePredictor:
-    """Predicts episodes with the model, from the initial state to readings with derivatives. It holds no state."""
+    """Predicts episodes with the model, from the initial state to readings with derivatives. It is stateless."""
 
     model_functions: ModelFunctions
     options: ProblemOptions
@@ -84,7 +84,7 @@ class EpisodePredictor:
         )
 
     def episode_with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
-        """Fit an episode's initial state to the first measured points if `initial_state` requires this."""
+        """Fit an episode's initial state to the first measured points, if the option `initial_state` says so."""
         if episode.fixed_initial_state is not None or self.options.initial_state != "fitted_to_points":
             return episode
         samples = episode.measurements
@@ -98,7 +98,7 @@ class EpisodePredictor:
         return replace(episode, fixed_initial_state=start)
 
     def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
-        """Insert an episode's own values into theta, both known ones and those fitted with its initial state."""
+        """Copy of `theta` with the episode's known parameters and the parameters fitted with its initial state."""
         start = episode.fixed_initial_state
         return self._with(theta, {**episode.known_parameters, **({} if start is None else start.fitted_parameters)})
 
@@ -111,12 +111,11 @@ class EpisodePredictor:
     def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode's rollout, with derivatives with respect to `wanted` parameters and `offset`.
+        """Initial state of an episode's rollout, with derivatives with respect to the parameters `wanted` and `offset`.
 
-        `theta` is that of `theta_with_episode_values`, `offset` that of an estimated initial state from equilibrium,
-        and `guess` (n,) a configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of
-        least energy.
-        """
+        `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `guess`
+        (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else that of least
+        energy)."""
         nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0
@@ -157,16 +156,15 @@ class EpisodePredictor:
 
     @property
     def _follows_momenta(self) -> bool:
-        """Whether a filter keeps the driven joints on their measured motion by their momenta too."""
+        """Whether the tracking filter of the driven joints feeds back momenta too."""
         return bool(self.system.driven) and not self.system.servos and self.options.arm_tracking_feedback == "lqr"
 
     def inputs_with_effect_momentum_shift(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
-        """Inputs of an episode corrected by effects, with the momentum shift of its tracking filter's reference.
+        """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
 
-        `state` (nx,) is the initial one, `by_unknowns` (nx, d) its derivative by the parameters and its estimated part.
-        """
+        `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative by `wanted` and the offset."""
         inputs = self.corrected_inputs(episode, theta, wanted)
         if not self._follows_momenta:
             return inputs
@@ -177,7 +175,7 @@ class EpisodePredictor:
         return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
-        """Correct recorded torques, angles and paths for effects, with derivatives along the parameters `wanted`."""
+        """Correct recorded torques, angles and paths for effects, with derivatives by the parameters `wanted`."""
         corrections = self.model_functions.input_corrections
         torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
@@ -217,13 +215,13 @@ class EpisodePredictor:
     def predict_episode(
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
     ) -> EpisodePrediction | str:
-        """Roll out one episode and predict its samples. Return an error message if it fails."""
+        """Roll out one episode and predict its samples. Returns an error message if the rollout fails."""
         return self.predict_episodes([(episode, theta, offset, guess)], derivatives)[0]
 
     def predict_episodes(
         self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
     ) -> list[EpisodePrediction | str]:
-        """Predict several episodes, each given as (episode, theta, offset, guess). A failed one gives an error text."""
+        """Predict several episodes, each given as (episode, theta, offset, guess). A failure gives an error message."""
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
@@ -245,7 +243,7 @@ class EpisodePredictor:
     def _prepared(
         self, episode: Episode, theta: Array, offset: Array, guess: Array | None, derivatives: bool
     ) -> _Prepared | str:
-        """Start and inputs of an episode's rollout."""
+        """Initial state and inputs of an episode's rollout, or an error message."""
         wanted = self.unknowns.free_parameters if derivatives else ()
         theta = self.theta_with_episode_values(episode, theta)
         start = self.initial_state_of_episode(episode, theta, offset, wanted, guess)
@@ -266,7 +264,7 @@ class EpisodePredictor:
         return _Prepared(episode, start, inputs, member, wanted, derivatives)
 
     def _told(self, prepared: _Prepared | str, rollout: Rollout | None) -> EpisodePrediction | str:
-        """The samples of a rollout."""
+        """Prediction of the samples of one rollout, or an error message."""
         if isinstance(prepared, str) or rollout is None:
             return str(prepared)
         episode, start, inputs, wanted = prepared.episode, prepared.start, prepared.inputs, prepared.wanted
@@ -303,16 +301,15 @@ class EpisodePredictor:
     def readings_along_trajectory(
         self, samples: SensorMeasurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
-        """Predict readings along a trajectory (N + 1, nx), with derivatives. Shapes: (M, k) and (M, k, d).
+        """Predict readings (M, k) and their derivatives (M, k, d) along a trajectory `state` (N + 1, nx).
 
-        `by_state` (N + 1, nx, d) are those of the trajectory, the first ones by the free parameters.
-        """
+        `by_state` (N + 1, nx, d) is the derivative of the trajectory; its first columns are the free parameters."""
         read = _Trajectory(TimeGridStateValues.from_trajectory(self.integrator_step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
     def state_values_at_nodes(self, rollout: Rollout) -> TimeGridStateValues:
-        """State values at all nodes of a rollout. The load is effort (prescribed joints) or torque (driven joints)."""
+        """State values at all nodes of a rollout. Loads are efforts (prescribed joints) or torques (driven joints)."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.driven_coordinate_indices)] = rollout.torque
@@ -323,7 +320,7 @@ class EpisodePredictor:
     def _delay_in_steps(
         self, samples: SensorMeasurements, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Delay of each output in steps, shape (k,), and its derivative, (k, d); None without delays."""
+        """Delay of each output in steps (k,), and its derivative (k, d); None without delays."""
         found = self.model_functions.input_corrections.sensor_delays_with_derivatives(samples.sensor, theta, wanted)
         return (
             None
@@ -332,12 +329,12 @@ class EpisodePredictor:
         )
 
     def delay_corrected_measurements(self, samples: SensorMeasurements, theta: Array) -> SensorMeasurements:
-        """Shift measurements earlier by the sensor's delay at `theta`, to the times at which they were true."""
+        """Shift measurements earlier by the sensor's delay at `theta`, to the times of the true values."""
         late = self._delay_in_steps(samples, theta, ())
         return samples if late is None else samples.shifted_earlier_by_steps(late[0])
 
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
-        """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
+        """The rollout with efforts of prescribed joints as sensors record them: with lag and smoothed."""
         effort, slope = rollout.effort, rollout.effort_sensitivity
         if (lag := self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted)) is not None:
             effort, slope = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_node_values(effort, slope)
@@ -346,7 +343,7 @@ class EpisodePredictor:
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
     def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeSmoother | None:
-        """Smoother of predicted efforts, equal to the filter of measured ones. None if no efforts are compared."""
+        """Smoother of predicted efforts, equal to the filter of measured efforts. None if no efforts are compared."""
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
@@ -376,7 +373,7 @@ class EpisodePredictor:
     def _read(
         self, samples: SensorMeasurements, along: _Trajectory, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
-        """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d)."""
+        """Readings (nodes, k) at the samples' nodes, and their derivatives (nodes, k, d) in d directions."""
         n, nodes = self.system.n_coordinates, samples.evaluation_nodes
         read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(along.values.at(nodes), theta)
         if along.by_state is None:
@@ -404,10 +401,10 @@ class EpisodePredictor:
     def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
-        """Gradient of a cost of an episode's predictions with respect to its (shared, local, start) unknowns.
+        """Gradient of a cost of one episode's predictions, with respect to its (shared, local, initial state) unknowns.
 
-        `result` is predicted at the same unknowns, `pulls` (M, k) are the cost's derivatives by every prediction.
-        """
+        `result` is the prediction at these unknowns. `pulls` (M, k) are the derivatives of the cost by each
+        prediction."""
         wanted, rollout = self.unknowns.free_parameters, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
         pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}
@@ -447,7 +444,7 @@ class EpisodePredictor:
         theta: Array,
         pulled: dict[str, Array],
     ) -> Array:
-        """Add the pull at one group's samples to that of what a rollout gives; the direct part by the parameters."""
+        """Add the adjoint of one sensor's samples to `pulled`. Returns the direct derivative by the parameters."""
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
@@ -488,12 +485,12 @@ class _Trajectory:
 
 
 def with_seen_equilibrium_and_denoised_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Start an episode at an equilibrium near its first points, and remove effort noise from gear loads."""
+    """Start an episode at the equilibrium near its first points, and remove effort noise from gear loads."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
 
 def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Episode with the equilibrium near its first points, where that of least energy is far from them."""
+    """Episode with the equilibrium near its first points, if the equilibrium of least energy is far from them."""
     fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
     if fitted or not predictor.system.grasps:
         return episode
@@ -519,7 +516,7 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
 
 
 def _first(samples: SensorMeasurements, time_step: float) -> SensorMeasurements | None:
-    """The first sample of points, as if it were taken at node 0; None where it comes too late."""
+    """The first sample of points, moved to node 0; None if it comes too late."""
     rows = np.flatnonzero(samples.positive_weight_mask.any(axis=1))[:1]
     if not samples.sensor.point_names or not len(rows):
         return None
@@ -532,7 +529,7 @@ def _first(samples: SensorMeasurements, time_step: float) -> SensorMeasurements 
 def _error(
     predictor: EpisodePredictor, seen: Sequence[SensorMeasurements], start: InitialStateWithSensitivity, theta: Array
 ) -> float:
-    """Root mean square error of first points at a start [standard deviations]; infinite where it is not at rest."""
+    """Root mean square error of the first points at an initial state [stds]; infinite if it is no equilibrium."""
     if start.failure_message:
         return math.inf
     state = start.state[None]
@@ -545,7 +542,7 @@ def _error(
 
 
 def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """The episode with the model's loads on gears of joints whose efforts are compared (`denoised_gear_loads`)."""
+    """The episode with the model's gear loads of joints whose efforts are compared (`denoised_gear_loads`)."""
     compared = [s for s in episode.measurements if s.sensor.effort_joints]
     corrections = predictor.model_functions.input_corrections
     if not compared or not corrections.angles_depend_on_effort:

@@ -1,4 +1,4 @@
-"""Episodes, which are recordings placed on the nodes of a rollout."""
+"""Episodes: recordings placed on the nodes of a rollout."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from yid_ocp.sensors.joints import (
 
 @dataclass(frozen=True)
 class EpisodePrediction:
-    """Prediction of one episode, with rollout, initial equilibrium, sensor readings and sensitivities."""
+    """Prediction of one episode: rollout, initial equilibrium, sensor readings and sensitivities."""
 
     rollout: Rollout
     equilibrium: Equilibrium | None
@@ -63,7 +63,7 @@ class EpisodePrediction:
 
     @property
     def torque_correction_and_sensitivity(self) -> Array | None:
-        """`torque_correction` and its derivative, if known, in one array (N, nu, 1 + d). None without correction."""
+        """`torque_correction` and its derivative, if known, as one array (N, nu, 1 + d). None without a correction."""
         if self.torque_correction is None:
             return None
         known, slopes = self.torque_correction[:, :, None], self.torque_correction_sensitivity
@@ -72,7 +72,7 @@ class EpisodePrediction:
 
 @dataclass(frozen=True)
 class InitialStateWithSensitivity:
-    """Initial state of a rollout, its derivative, and the equilibrium it starts from; or why there is none."""
+    """Initial state of a rollout, its derivative and its equilibrium, or the reason why there is no initial state."""
 
     state: Array  # (q, p, z), (nx,)
     state_sensitivity: Array  # with respect to (wanted parameters, state offset), (nx, d)
@@ -90,8 +90,7 @@ _MIN_TORQUE_ERROR_FRACTION = 1e-3
 class InputErrorModel:
     """Noise levels and current estimates of the errors of recorded torques and angles that drive a rollout.
 
-    The torque is off by w in a step and by b throughout [N m], the angles by v [rad].
-    """
+    A recorded torque has an error w in each step and a constant error b [N m]; an angle has an error v [rad]."""
 
     torque_std: Array  # standard deviation of w, (nu,)
     torque_bias_std: Array  # standard deviation of b, (nu,)
@@ -109,24 +108,24 @@ class InputErrorModel:
 
     @property
     def estimated_torque_error(self) -> Array:
-        """Estimated torque error, recorded minus true, in every step, (N, nu) [N m]. It has offset and noise."""
+        """Estimated torque error, recorded minus true, in every step, (N, nu) [N m]. It includes offset and noise."""
         return self.torque_bias + self.torque_noise
 
     @property
     def estimated_torque_error_to_subtract(self) -> Array:
-        """Torque error that remains to be subtracted once effects on torques apply, (N, nu) [N m]."""
+        """Torque error that remains to be subtracted after effects on torques were applied, (N, nu) [N m]."""
         return self.estimated_torque_error - self.transmitted_torque_noise
 
     @property
     def torque_bias_part(self) -> InputErrorModel:
-        """Keep only the torques' constant offset, without torque noise and smoothed reference."""
+        """The same error model with the constant torque offset only, without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
     def on_finer_steps(self, ratio: int) -> InputErrorModel:
-        """Make the same error model for `ratio` times shorter steps. Torques are held, the reference interpolated."""
+        """The same error model for `ratio` times shorter steps. Torques are held, the reference is interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
         if (known := self.smoothed_reference) is not None:
@@ -148,7 +147,7 @@ def _recorded_input_errors(
     sensors: Mapping[str, SensorOptions],
     samples: Sequence[SensorMeasurements],
 ) -> InputErrorModel | None:
-    """Error levels of the torques and angles that drive a recording's rollout; None where there are none."""
+    """Error levels of the torques and angles that drive a recording's rollout; None without driven joints."""
     joints, driven = recording.joints, system.driven
     if joints is None or joints.effort is None or not driven or system.servos:
         return None
@@ -178,7 +177,7 @@ def _recorded_input_errors(
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording on the time grid of a rollout, with inputs, measurements, tracking filter and input errors."""
+    """One recording on the time grid of a rollout: inputs, measurements, tracking filter and input errors."""
 
     recording: Recording
     grid: TimeGrid
@@ -201,14 +200,14 @@ class Episode:
 
     @property
     def feedback_about_smoother_estimate(self) -> TrackingFeedback | None:
-        """Tracking filter about the Kalman smoother's estimate. It is unchanged without a smoother."""
+        """Tracking filter about the Kalman smoother's estimate, or unchanged if there is no such estimate."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
 
     @property
     def has_uncertain_sensor_biases(self) -> bool:
-        """Whether a sensor or its clock has an error of unknown size over the recording, which is treated as noise."""
+        """Whether a sensor or its clock has a constant error of unknown size, which is treated as noise."""
         return any(samples.has_uncertain_errors for samples in self.measurements)
 
     @property
@@ -222,9 +221,8 @@ def prepare_episode(
 ) -> Episode:
     """Place a recording's inputs and measurements on the nodes of a rollout's time grid.
 
-    At the nominal parameters `theta` encoder noise is converted to effort and the filter's gains are computed.
-    `DataError` where the recording does not fit the model, is too short, or states no noise level.
-    """
+    The nominal parameters `theta` are used to convert encoder noise to effort and to compute the tracking filter's
+    gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level."""
     step, system = functions.step, functions.step.system
     recording = recording.with_effort_sampling_kind(
         options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_sampling_kind
@@ -261,7 +259,7 @@ def prepare_episode(
 
 
 def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOptions, theta: Array) -> Episode:
-    """The episode with the tracking filter of its driven joints, its gains worked out at given parameters."""
+    """The episode with the tracking filter of its driven joints; its gains are computed at `theta`."""
     step = functions.step
     if not step.system.driven or step.system.servos or options.arm_tracking_feedback == "none":
         return episode
@@ -275,7 +273,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
 
 
 def truncate_episode(episode: Episode, steps: int) -> Episode:
-    """Truncate an episode to its first `steps` steps, with the measurements in these."""
+    """Truncate an episode to its first `steps` steps and the measurements in them."""
     steps = min(steps, episode.grid.steps)
     samples = []
     for entry in episode.measurements:
@@ -299,7 +297,7 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
 
 
 def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
-    """Diagonal of the mass matrix for the named joints at zero configuration, (k,) [kg m^2 or kg]."""
+    """Diagonal (k,) of the mass matrix of the named joints at zero configuration [kg m^2 or kg]."""
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]

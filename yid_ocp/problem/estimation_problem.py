@@ -1,4 +1,4 @@
-"""Estimation problem of a model and recordings, with unknowns, residual and derivatives."""
+"""Estimation problem of a model and recordings: unknowns, residual and derivatives."""
 
 from __future__ import annotations
 
@@ -54,41 +54,42 @@ class EstimationProblem(ReprMixin):
     """Immutable, thread-safe problem of estimating free parameters from recordings.
 
     It evaluates the cost, predicts held-out recordings, and derives problems with other parameters, data, options or
-    whitening filters; `inference.whitening` makes these filters.
+    whitening filters. `inference.whitening` makes the filters.
 
     Parameters
     ----------
     step : Step
-        Compiled step; its time step is the problem's.
+        Compiled step. It defines the time step of the problem.
     recordings : sequence of Recording
-        To estimate on.
+        Recordings used by the fit.
     free : sequence of str
         Names of free parameters.
     values : mapping of str to float, optional
-        Initial values, and values of fixed parameters, where they differ from the model's.
+        Initial values of free parameters and values of fixed ones. Default: the values of the model.
     held_out : sequence of Recording
-        Not used by the fit, only predicted by `predict_held_out`.
+        Recordings not used by the fit, only predicted by `predict_held_out`.
     may_free : sequence of str, optional
-        Further parameters that `with_free_parameters_without_recompiling` may be asked for.
+        Further parameters that `with_free_parameters_without_recompiling` can free.
 
     Attributes
     ----------
-    unknown_names, shared_parameters, local_parameters : tuple of str
-        All unknowns, local ones and initial states with their recording's name; free parameters with one value for all
-        recordings, and with one in each.
+    unknown_names : tuple of str
+        Names of all unknowns. Local parameters and initial states include the recording's name.
+    shared_parameters, local_parameters : tuple of str
+        Free parameters with one value for all recordings, and with one value per recording.
     theta : ndarray, shape (ntheta,)
         Initial values of free parameters and values of fixed ones.
     unknowns, residual_rows : UnknownVectorLayout, ResidualVectorLayout
         Layouts of the unknown vector and of the residual.
     whitening_filters, held_out_whitening_filters : tuple of ProcessNoiseWhitener or None
-        Filter that whitens each recording's residual; None where sensor noise is the only noise.
+        Filter that whitens each recording's residual, or None if sensor noise is the only noise.
 
     Raises
     ------
     ConfigError
-        Unknown or doubly named parameters, a value outside its bounds.
+        A parameter is unknown, listed twice, or outside its bounds.
     DataError
-        A recording that does not fit the model: missing joints or points, no noise level, too short.
+        A recording lacks joints, points or a noise level, or is too short.
     """
 
     def __init__(
@@ -151,7 +152,7 @@ class EstimationProblem(ReprMixin):
         self.residual_rows = ResidualVectorLayout.from_episodes(episodes, len(self._stated), len(self._weak))
 
     def _changed(self, **changes: Any) -> EstimationProblem:
-        """Changed problem that shares the compiled functions; episodes are not prepared again."""
+        """Changed copy of the problem that shares the compiled functions and the prepared episodes."""
         made = object.__new__(EstimationProblem)
         kept = ("model_functions", "options", "free", "theta", "episodes", "held_out")
         same = {name: getattr(self, name) for name in (*kept, "whitening_filters", "held_out_whitening_filters")}
@@ -171,7 +172,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_unknowns(self) -> Array:
-        """Initial unknown vector of initial parameter values and zero state offsets, shape (nx,)."""
+        """Initial unknown vector (nx,): initial parameter values, and zero offsets of initial states."""
         index, parts = self.system.parameters.index, (self.shared_parameters, self.local_parameters)
         shared, local = ([self.theta[index(name)] for name in part] for part in parts)
         offset = np.zeros(len(self.unknowns.initial_state_names))
@@ -179,7 +180,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the unknown vector, two arrays (nx,)."""
+        """Lower and upper bounds of the unknown vector, (nx,) each."""
         parts = (self.shared_parameters, self.local_parameters)
         (low, high), (own_low, own_high) = (self.system.parameters.bounds(part) for part in parts)
         wide = initial_internal_state_offset_bounds(self.system, self.unknowns.initial_state_names)
@@ -188,7 +189,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def unknown_scales(self) -> Array:
-        """Typical size of each unknown. It is the initial value, or if that is 0 the prior's std or 0.1 x range."""
+        """Typical size (nx,) of each unknown: its initial value, or if that is 0 the prior's std or 0.1 x range."""
         lower, upper = self.bounds
         size = np.abs(self.initial_unknowns)
         width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
@@ -197,12 +198,12 @@ class EstimationProblem(ReprMixin):
 
     @property
     def positive_unknowns_mask(self) -> BoolArray:
-        """Mask of unknowns with a nonnegative lower bound and a positive initial value, shape (nx,)."""
+        """Mask (nx,) of unknowns with a nonnegative lower bound and a positive initial value."""
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     @property
     def rms_noise_of_data_residuals(self) -> float:
-        """RMS noise of all data residuals. It is 1 if they are whitened, else that of the points [m]."""
+        """RMS noise of all data residuals: 1 for whitened residuals, else the noise of the points [m]."""
         if self.options.weighting != "paper":
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
@@ -210,7 +211,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_state_prior_std(self) -> Array:
-        """Prior standard deviations of the estimated initial state components, as in `initial_state_names`."""
+        """Prior standard deviations of the estimated initial state components, ordered as `initial_state_names`."""
         at = len(self.unknowns.free_parameters)
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
@@ -220,11 +221,11 @@ class EstimationProblem(ReprMixin):
         return all(self.predictor.has_no_input_corrections(episode, self.theta) for episode in self.episodes)
 
     def theta_and_initial_state_deviation(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
-        """Extract theta and the initial state offset of episode number `episode` from the unknown vector."""
+        """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""
         return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Copy of the initial unknown vector with the named `values` in it, all clipped to the bounds, shape (nx,)."""
+        """Copy (nx,) of the initial unknown vector, with the named `values` inserted and clipped to the bounds."""
         start = self.named_values(self.initial_unknowns)
         return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
 
@@ -235,11 +236,10 @@ class EstimationProblem(ReprMixin):
     def evaluate(
         self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
-        """Evaluate residual and cost at an unknown vector. With `derivatives` the Jacobian is evaluated too.
+        """Evaluate residual and cost at the unknown vector `x`, and the Jacobian if `derivatives` is True.
 
-        `ok` is False, with the reason, where an equilibrium or a rollout failed. `equilibrium_guesses` of a nearby
-        point's evaluation shorten the search for least energy.
-        """
+        If an equilibrium or a rollout fails, `ok` is False and `message` holds the reason. `equilibrium_guesses` from
+        the evaluation at a nearby point shorten the search for the equilibrium of least energy."""
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
         asked = [(e, *self.theta_and_initial_state_deviation(x, i), guess) for i, (e, guess) in enumerate(pairs)]
@@ -270,11 +270,10 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Compute cost, gradient and evaluation. The gradient uses the adjoint, or sensitivities with process noise.
+        """Compute cost, gradient and evaluation. With process noise, the gradient uses sensitivities, else the adjoint.
 
-        An `evaluation` at `x` that is known already saves the rollout, most of the work; it is returned, without a
-        Jacobian.
-        """
+        A known `evaluation` at `x` saves the rollout, which is most of the work. The returned evaluation has no
+        Jacobian."""
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
         weighted |= any(episode.has_uncertain_sensor_biases for episode in self.episodes)
@@ -309,10 +308,9 @@ class EstimationProblem(ReprMixin):
     def initial_state_of_episode(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode, with derivatives with respect to free parameters and equilibrium offset.
+        """Initial state of an episode, with derivatives with respect to the free parameters and the equilibrium offset.
 
-        `guess` (n,) is a configuration near the equilibrium.
-        """
+        `guess` (n,) is a configuration near the equilibrium."""
         own = self.predictor.theta_with_episode_values(episode, theta)
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
         return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameters, guess)
@@ -320,17 +318,16 @@ class EstimationProblem(ReprMixin):
     def predict_held_out(
         self, x: ArrayLike, derivatives: bool = False
     ) -> list[tuple[Episode, EpisodePrediction | str]]:
-        """Predict held-out recordings with the shared parameters in `x` and initial values of local ones.
+        """Predict held-out recordings with the shared parameters in `x` and initial values of local parameters.
 
-        Returns each episode, with its fitted initial state where it has one, and its prediction or an error message.
-        An `estimated` initial state is found from the first moments and its prior. Derivatives are by
-        (free parameters, initial state offset), the initial state held.
-        """
+        Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
+        prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free
+        parameters (at a fixed initial state) and to an offset of the initial state."""
         predict = self.predictor.predict_episode
         return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """Episode with fitted initial state, theta, and estimated state offset of each held-out prediction."""
+        """Episode, theta and initial state offset for each held-out prediction; a fitted initial state is included."""
         x = np.asarray(x, float)
         theta, found = self.held_out_theta(x), []
         for held in self.held_out:
@@ -345,7 +342,7 @@ class EstimationProblem(ReprMixin):
         return found
 
     def held_out_theta(self, x: Array) -> Array:
-        """Vector theta with the shared parameters in `x`. Local parameters keep their initial values."""
+        """Vector theta (ntheta,) with the shared parameters in `x`. Local parameters keep their initial values."""
         theta, _ = self.theta_and_initial_state_deviation(x, 0)
         for name in self.local_parameters:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
@@ -354,31 +351,31 @@ class EstimationProblem(ReprMixin):
     def simulate_synthetic_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
     ) -> Recording:
-        """Simulate a synthetic recording with one recording's inputs and, if given, other parameter values.
+        """Simulate a synthetic recording with the inputs of an existing recording.
 
         Parameters
         ----------
         values : mapping of str to float, optional
-            Parameters that differ from the problem's own values (`theta`), free or not, such as `{"cable.bend": 0.09}`.
+            Parameters that differ from `theta`, free or not, such as `{"cable.bend": 0.09}`.
         recording : int
-            Which recording's start, motion or torques and times of samples are taken.
+            Index of the recording that defines initial state, motion or torques, and sample times.
         seed : int, optional
-            Of noise with the standard deviations of the sensors; none when absent.
+            Random seed of noise with the sensors' standard deviations. Default: no noise.
 
         Raises
         ------
         ConfigError, SolverError
-            There is no such parameter; the model cannot be rolled out.
+            A parameter does not exist; the rollout fails.
         """
         theta = self.with_parameter_values(values or {}).theta
         return synthesize_recording(self.predictor, self.episodes[recording], theta, seed)
 
     def with_free_parameters_without_recompiling(self, names: Sequence[str]) -> EstimationProblem:
-        """Choose other free parameters from `free` and `may_free`. Compiled functions are shared."""
+        """Problem with other free parameters, from `free` and `may_free`. It shares the compiled functions."""
         return self._changed(free=tuple(names))
 
     def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
-        """Set values of fixed and initial values of free parameters. Filters are kept."""
+        """Problem with other values of fixed and initial values of free parameters. Filters are kept."""
         theta = self.theta.copy()
         for name, value in values.items():
             theta[self.system.parameters.index(name)] = value
@@ -391,7 +388,7 @@ class EstimationProblem(ReprMixin):
         whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
         held_out_whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
     ) -> EstimationProblem:
-        """Use other episodes. Without given filters, residuals are whitened by sensor noise alone."""
+        """Problem with other episodes. Without filters, residuals are whitened by sensor noise alone."""
         filters = {"whitening_filters": whitening_filters, "held_out_whitening_filters": held_out_whitening_filters}
         changes = {"episodes": episodes, "held_out": held_out, **filters}
         return self._changed(**{name: tuple(value) for name, value in changes.items()})
@@ -404,18 +401,17 @@ class EstimationProblem(ReprMixin):
     def whitened_held_out_prediction_residual(
         self, i: int, episode: Episode, result: EpisodePrediction
     ) -> ResidualAndJacobian:
-        """Whitened residual of held-out recording `i` (`predict_held_out`), without a robust loss."""
+        """Whitened residual of held-out recording `i` without robust loss; `result` is from `predict_held_out`."""
         return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
     def truncated_to_duration(self, duration: float) -> EstimationProblem:
-        """Rebuild the problem on the first `duration` [s] of each recording, without held-out recordings."""
+        """Problem rebuilt on the first `duration` [s] of each recording, without held-out recordings."""
         return self._prepared(options=replace(self.options, duration=duration), held_out=())
 
     def with_time_step(self, time_step: float) -> EstimationProblem:
-        """Use another time step [s]. Whitening filters and held-out recordings are removed.
+        """Problem with another time step [s], without whitening filters and held-out recordings.
 
-        Initial states, guesses of equilibria and loads on gears are those of this problem.
-        """
+        Initial states, guesses of equilibria and gear loads are copied from this problem."""
         functions = self.model_functions.with_time_step(time_step)
 
         def placed(episode: Episode) -> Episode:
@@ -429,15 +425,15 @@ class EstimationProblem(ReprMixin):
         return self._changed(model_functions=functions).with_episodes(list(map(placed, self.episodes)), ())
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
-        """Prepare the problem anew from its recordings with other options."""
+        """Problem with other options, prepared anew from its recordings."""
         return self._prepared(options=options)
 
     def with_multivariate_prior(self, prior: MultivariateGaussianPrior) -> EstimationProblem:
-        """Use another multivariate prior. Filters are kept."""
+        """Problem with another multivariate prior. Filters are kept."""
         return self._changed(options=replace(self.options, multivariate_prior=prior))
 
     def with_free_parameters(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
-        """Prepare the problem anew with other free parameters and, if given, other parameter values."""
+        """Problem with other free parameters and, if given, other parameter values, prepared anew."""
         options = replace(
             self.options,
             local_parameters=tuple(name for name in self.options.local_parameters if name in free),
@@ -454,10 +450,7 @@ class EstimationProblem(ReprMixin):
 
 
 def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episode, theta: Array, std: Array) -> Array:
-    """Offset of the initial state from equilibrium, estimated from the first measurements and its prior.
-
-    Zero where the rollout fails; `std` is the prior's, (number of estimated rows,).
-    """
+    """Offset of the initial state from equilibrium, estimated from the first measurements and its prior `std`."""
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
     if not len(offset):
         return offset

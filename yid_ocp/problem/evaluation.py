@@ -1,4 +1,4 @@
-"""Layout of unknowns and residual of an estimation problem, with priors, bounds and evaluations."""
+"""Layout of unknowns and residual of an estimation problem, priors, bounds and evaluations."""
 
 from __future__ import annotations
 
@@ -31,25 +31,24 @@ EquilibriumGuesses = tuple[Array | None, ...]
 
 
 class ProcessNoiseWhitener(Protocol):
-    """Interface of a Kalman filter with fixed gains that whitens one recording's residual, with process noise."""
+    """Interface of a fixed-gain Kalman filter that whitens one recording's residual against process noise."""
 
     @property
     def input_error_model(self) -> InputErrorModel:
-        """Standard deviations of torque and angle errors, and the errors about which the filter is linearized."""
+        """Standard deviations of torque and angle errors, and the errors about which the filter is linearised."""
         ...
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
 
-        Of `rows` (r, c), a residual in units of the sensors' noise and columns of its derivative, and `push`
-        (N, nu, c), the tracking filter's correction of the torque and its derivative [N m].
-        """
+        `rows` (r, c) holds, in units of sensor noise, the residual and its derivatives side by side. `push` (N, nu, c)
+        is the tracking filter's torque correction and its derivative [N m]."""
         ...
 
 
 @dataclass(frozen=True)
 class ResidualVectorLayout:
-    """Slices of the residual vector. Measurements of all episodes precede stated priors, then weak priors."""
+    """Slices of the residual vector: measurements of all episodes, then stated priors, then weak priors."""
 
     measurements: tuple[tuple[slice, ...], ...]  # slices by episode and sensor group
     data: slice
@@ -63,7 +62,7 @@ class ResidualVectorLayout:
 
     @staticmethod
     def from_episodes(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualVectorLayout:
-        """Build the layout from the episodes' measurements and the numbers of stated and weak priors."""
+        """Build the layout from the episodes and the numbers of stated and weak prior residuals."""
         at, groups = 0, []
         for episode in episodes:
             own = []
@@ -93,7 +92,7 @@ class Evaluation(ReprMixin):
 
     @property
     def equilibrium_guesses(self) -> EquilibriumGuesses:
-        """Initial equilibrium of each episode, as a guess for evaluating a nearby point."""
+        """Initial equilibrium configuration of each episode, as a guess for the evaluation at a nearby point."""
         return tuple(result.equilibrium_guess for result in self.episode_predictions)
 
 
@@ -122,8 +121,7 @@ def whitened_episode_residual(
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
-    Constant sensor errors count as noise, see `whitened_for_sensor_biases`.
-    """
+    Constant sensor errors count as noise (`whitened_for_sensor_biases`). `threshold` is that of the Huber loss."""
     by_constants = whitened_measurement_sensitivities_to_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
@@ -151,7 +149,7 @@ SOFT_LOGARITHM_MIN_RATIO = 1e-3
 
 @dataclass(frozen=True)
 class UnknownVectorLayout:
-    """Order of the unknown vector. Shared parameters precede each recording's local parameters and state offset."""
+    """Order of the unknown vector: shared parameters, then each recording's local parameters and state offset."""
 
     shared_parameters: tuple[str, ...]  # free, with one value for all recordings
     local_parameters: tuple[str, ...]  # free, with a value in each
@@ -167,16 +165,16 @@ class UnknownVectorLayout:
 
     @property
     def free_parameters(self) -> tuple[str, ...]:
-        """Names of the free parameters, shared then local, in the order of one recording's derivative columns."""
+        """Names of the free parameters, shared then local: the order of one recording's derivative columns."""
         return (*self.shared_parameters, *self.local_parameters)
 
     def unknown_indices_affecting_recording(self, recording: int) -> IntArray:
-        """Indices of shared unknowns and of one recording's local and initial state unknowns."""
+        """Indices of the shared unknowns and of one recording's local parameters and initial state."""
         shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
 
     def scatter_to_unknown_columns(self, block: Array, recording: int) -> Array:
-        """Scatter one recording's derivative columns to those of all unknowns, (r, d) to (r, nx). Others are zero."""
+        """Expand one recording's derivative columns (r, d) to columns of all unknowns (r, nx), filled with zeros."""
         wide = np.zeros((len(block), len(self.unknown_names)))
         wide[:, self.unknown_indices_affecting_recording(recording)] = block
         return wide
@@ -184,7 +182,7 @@ class UnknownVectorLayout:
     def theta_and_initial_state_deviation(
         self, x: ArrayLike, recording: int, theta: Array, system: System
     ) -> tuple[Array, Array]:
-        """Extract theta with one recording's values from `x`, and that recording's initial state offset."""
+        """Copy of `theta` with one recording's values from `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
         result = theta.copy()
         for name, value in zip(self.free_parameters, own, strict=False):
@@ -192,7 +190,7 @@ class UnknownVectorLayout:
         return result, own[len(self.free_parameters) :]
 
     def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
-        """Pack the unknown vector, with the same local values and initial state offset for all recordings."""
+        """Pack an unknown vector with the same local parameters and initial state offset for all recordings."""
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
         return np.concatenate(parts)
@@ -201,11 +199,10 @@ class UnknownVectorLayout:
 def stated_prior_stds(
     unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
 ) -> Array:
-    """Standard deviation of each unknown's stated Gaussian prior, (nx,). Infinite for unknowns without one.
+    """Standard deviation of each unknown's stated Gaussian prior, (nx,). It is infinite for unknowns without prior.
 
-    `inertia` gives the diagonal of the mass matrix, by which a start's velocity becomes a momentum. An internal
-    coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
-    """
+    `inertia` returns the mass matrix diagonal, which converts an initial velocity to a momentum. An effect's internal
+    coordinate has a uniform prior within its limits; the standard deviation is that of the uniform distribution."""
     limits = _unobserved_state_limits(system)
     stds = []
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
@@ -225,7 +222,7 @@ def stated_prior_stds(
 
 
 def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Jacobian of the stated priors' whitened residual, (k, nx). The residual is Jacobian x (x - initial x)."""
+    """Jacobian (k, nx) of the whitened residual of the stated priors, Jacobian x (x - initial x)."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -242,9 +239,8 @@ def estimated_initial_state_names(
 ) -> tuple[str, ...]:
     """Names of the estimated components of initial states, such as `q.JOINT`, `p.JOINT` and `z.NAME`.
 
-    Where starts are estimated, q and p of the coordinates that are neither driven by torques, nor prescribed, nor
-    follow their load at once; in any case the unobserved internal coordinates of effects that are free or not neutral.
-    """
+    If initial states are estimated, they include q and p of coordinates that are not driven by torques, not prescribed
+    and not compliant. They always include unobserved internal coordinates of effects that are free or not neutral."""
     found: list[str] = []
     if options.initial_state == "estimated":
         known = {*(() if system.servos else system.driven_coordinate_indices), *system.prescribed_coordinate_indices}
@@ -261,19 +257,19 @@ def estimated_initial_state_names(
 
 
 def _unobserved_state_limits(system: System) -> dict[str, float]:
-    """Unobserved initial internal coordinates of the effects, each with its largest magnitude."""
+    """Largest magnitude of each unobserved initial internal coordinate of the effects."""
     effects = [effect for effect in system.effects if isinstance(effect, EffectBase)]
     return {name: size for effect in effects for name, size in effect.max_abs_unknown_initial_states.items()}
 
 
 def initial_internal_state_offset_bounds(system: System, names: Sequence[str]) -> Array:
-    """Largest absolute initial offset of effects' internal coordinates, infinite for other names, (len(names),)."""
+    """Largest absolute initial offset (len(names),) of effects' internal coordinates, infinite for other names."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 
 
 def check_free_parameters(system: System, free: Sequence[str], options: ProblemOptions) -> None:
-    """Raise `ConfigError` if a free parameter is unknown or repeated, or a local or prior's parameter is not free."""
+    """Raise `ConfigError` if a free parameter is unknown or repeated, or if a local or prior parameter is not free."""
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)
     if len(set(free)) != len(free):
@@ -288,7 +284,7 @@ def check_free_parameters(system: System, free: Sequence[str], options: ProblemO
 
 
 def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:
-    """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or its bounds coincide."""
+    """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or if its bounds coincide."""
     for name in free:
         entry, value = system.parameters[name], theta[system.parameters.index(name)]
         replace(entry, value=float(value))  # it checks its bounds
@@ -298,7 +294,7 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
 
 
 def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
-    """Logarithm of a ratio and its slope. Below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
+    """Logarithm of a ratio and its derivative; below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
     below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
     small = below < 0
     kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)

@@ -47,7 +47,7 @@ class PrecomputedInitialState:
 
 @dataclass(frozen=True)
 class _Task:
-    """One fit: measured rows, theta, configuration and weights of the prior, number of parameters sought, softness."""
+    """One fit: measured rows, theta, configuration and weights of the prior, number of parameters, softness."""
 
     measured: list[tuple[SensorMeasurements, int]]
     theta: Array
@@ -60,14 +60,13 @@ class _Task:
 class InitialStateFitter:
     """Fits an initial state, and optionally parameters, to the first measured points of an episode.
 
-    Minimises, by Gauss-Newton over q (and the parameters asked for) at the first frame,
+    Gauss-Newton over q (and the parameters `fitted_parameters`, which need finite bounds) minimises at the first frame
 
-        |(w(q) - wbar)/std|^2 + sum kappa_i/kappa_mean (q_i - q_rest,i)^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2,
+        |(w(q) - wbar)/std|^2 + sum kappa_i/kappa_mean (q_i - q_rest,i)^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2.
 
-    so that among all shapes through the measured points it is the one of least elastic energy: that is what tells
-    apart turns which no point sees, such as the roll of a clamp. At the last frame of the window the prior is that the
-    rate between the two is small. The momentum is that of this rate. `fitted_parameters` must have finite bounds.
-    """
+    Among all shapes through the measured points, this is the shape of least elastic energy. It determines angles that
+    no point shows, such as the roll of a clamp. The last frame of the window is fitted with a prior of small velocity
+    from the first. The momentum follows from this velocity."""
 
     def __init__(self, step: Step, fitted_parameters: Sequence[str] = ()) -> None:
         self.step = step
@@ -115,10 +114,10 @@ class InitialStateFitter:
     ) -> PrecomputedInitialState:
         """Fit configuration and momentum to the first frame's points and their change within the window.
 
-        Given are driven, then prescribed coordinates at node 0 (nk,), samples, of which only points are used, how far
-        from the start frames may be used [s], and the prescribed coordinates at all nodes (N + 1, nc). `roughly` finds
-        the place of the object without its details. `DataError` where no point is seen within the window.
-        """
+        `configuration` (nk,) holds the driven, then the prescribed coordinates at node 0. Only points of `samples` are
+        used, in the first `window` [s]. `path` (N + 1, nc) holds the prescribed coordinates at all nodes. With
+        `roughly`, only the pose of the object is fitted. Raises `DataError` if no point is measured within the
+        window."""
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
         frames: dict[int, list[tuple[SensorMeasurements, int]]] = {}
@@ -170,10 +169,10 @@ class InitialStateFitter:
         return PrecomputedInitialState(state, own)
 
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
-        """Angle of every joint with a preset, and the torque that its spring holds there if the object is at rest.
+        """Angle of each joint with a preset, and the torque that its spring holds there if the object is at
+        equilibrium.
 
-        The clamps' unknown reactions f are those of least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa.
-        """
+        The clamps' unknown reactions f have least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa."""
         if not self._presets:
             return {}
         none = (np.zeros(self.step.sizes[key]) for key in ("n", "nz", "nz", "m", "nu"))
@@ -198,7 +197,7 @@ class InitialStateFitter:
         return [values, *(np.array(entry) for entry in itertools.product(*grids))]
 
     def _fit(self, guess: Array, values: Array, task: _Task) -> tuple[Array, Array, float]:
-        """Configuration, values of the parameters sought, and the sum of squares there."""
+        """Fitted configuration, fitted parameter values and the sum of squares."""
         free = self._free
         index = [self.step.system.parameters.index(name) for name in self.fitted_parameters]
         lower, upper = self.step.system.parameters.bounds(self.fitted_parameters)
@@ -228,7 +227,7 @@ class InitialStateFitter:
         return q, theta[index], found.final_model.cost
 
     def _rows(self, q: Array, theta: Array, task: _Task) -> tuple[Array, Array]:
-        """Residual of a fit and its derivative by the free coordinates and the parameters sought."""
+        """Residual of a fit and its derivative by the free coordinates and the fitted parameters."""
         step, free, wanted = self.step, self._free, task.wanted
         nz, m = step.sizes["nz"], step.sizes["m"]
         residuals, jacobians = [], []
@@ -255,7 +254,7 @@ class InitialStateFitter:
 def _speed(
     before: Sequence[tuple[SensorMeasurements, int]], after: Sequence[tuple[SensorMeasurements, int]], span: float
 ) -> float:
-    """Root mean square speed of the points seen in both frames, zero where there is one frame only [m/s]."""
+    """Root mean square speed of the points measured in both frames, zero if there is only one frame [m/s]."""
     squares = []
     for samples, row in before:
         for other, later in after:

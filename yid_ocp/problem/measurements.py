@@ -1,4 +1,4 @@
-"""Measurements of one sensor on rollout nodes, with time grid, interpolation, whitening and constant errors."""
+"""Measurements of one sensor on rollout nodes: time grid, interpolation, whitening and constant errors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class TimeGrid:
         return np.asarray(self.start_time + self.time_step * np.arange(self.steps + 1), dtype=float)
 
     def node_and_fraction(self, t: ArrayLike) -> tuple[IntArray, Array]:
-        """Node before each time, and the fraction of a step after it, to within 1e-6 of a step."""
+        """Node before each time, and the time since that node as a fraction of a step (rounded within 1e-6 steps)."""
         position = (np.asarray(t, float) - self.start_time) / self.time_step
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-6, near, position)
@@ -45,10 +45,10 @@ class TimeGrid:
 
 
 def recording_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
-    """Make an equally spaced time grid over the span of the joint samples, or without joints of the first point group.
+    """Make a time grid over the span of the joint samples, or of the first point group without joints.
 
-    `DataError` where it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its length.
-    """
+    Raises `DataError` if it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its
+    length."""
     t = recording.all_groups[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
@@ -68,7 +68,7 @@ ResidualWeightingName = Literal["whitened", "paper"]
 
 @dataclass(frozen=True)
 class ResidualAndJacobian:
-    """One block of the residual vector, with cost, Jacobian and factors of the robust loss."""
+    """One block of the residual vector, with its cost, Jacobian and robust loss factors."""
 
     cost: float  # half the sum of squares, or Huber's loss
     residual: Array  # (nr,)
@@ -93,12 +93,12 @@ class SensorMeasurements:
 
     @property
     def has_uncertain_errors(self) -> bool:
-        """Whether outputs have constant errors, or the clock an offset, of unknown size over the recording."""
+        """Whether outputs have constant errors of unknown size, or the clock has an offset of unknown size."""
         return bool(np.any(self.bias_std > 0)) or self.change_by_clock is not None
 
     @property
     def error_directions(self) -> Array:
-        """Change of the outputs by one std of each constant error and of the clock's offset, (M, k, m)."""
+        """Change (M, k, m) of the outputs by one std of each constant error and of the clock offset."""
         own = self.bias_std * np.eye(len(self.bias_std))[self.bias_std > 0]
         constant = np.broadcast_to(own.T, (len(self.value), *own.T.shape))
         return constant if self.change_by_clock is None else np.dstack([constant, self.change_by_clock])
@@ -110,7 +110,7 @@ class SensorMeasurements:
 
     @property
     def evaluation_nodes(self) -> IntArray:
-        """Sorted indices of the nodes at which the sensor is predicted, to interpolate at the samples."""
+        """Sorted indices of the nodes at which the sensor is predicted, for interpolation to the samples."""
         if self.node.ndim > 1:
             # with the neighbours that a slope needs
             low = int(self.node.min(initial=self.predictable_nodes[1]))
@@ -126,16 +126,15 @@ class SensorMeasurements:
 
     @property
     def n_residuals(self) -> int:
-        """Number of scalar residuals of the measurements, one for each used output."""
+        """Number of scalar residuals, one for each output with positive weight."""
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
     def residual_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
-        """Matrix that decorrelates normalized residuals, R^(-1/2), shape (nr, nr). None if outputs are independent.
+        """Matrix R^(-1/2) (nr, nr) that decorrelates normalised residuals. None if outputs are independent.
 
-        R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
-        doi:10.1080/00031305.2016.1277159).
-        """
+        R is the noise correlation of one sample's outputs. The whitening is zero-phase (ZCA; Kessy, Lewin and Strimmer
+        2018, doi:10.1080/00031305.2016.1277159)."""
         if self.noise_correlation is None:
             return None
         seen = self.positive_weight_mask
@@ -147,18 +146,18 @@ class SensorMeasurements:
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.n_residuals, self.n_residuals))
 
     def decorrelate(self, rows: Any) -> Any:
-        """Decorrelate rows already divided by their standard deviations, (nr,) or (nr, d), dense or sparse."""
+        """Decorrelate rows (nr,) or (nr, d), dense or sparse, already divided by their standard deviations."""
         return rows if self.residual_decorrelation_matrix is None else self.residual_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
-        """Whitened residual, prediction minus measurement, shape (M, k). It is zero where nothing was measured."""
+        """Whitened residual (M, k), prediction minus measurement. It is zero for outputs without measurement."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
         if self.residual_decorrelation_matrix is not None:
             plain[self.positive_weight_mask] = self.residual_decorrelation_matrix @ plain[self.positive_weight_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
-        """Convert a cost's gradient in the residual to that in the prediction, both (M, k) (adjoint)."""
+        """Convert a cost's gradient by the residual to a gradient by the prediction, both (M, k) (adjoint)."""
         if self.residual_decorrelation_matrix is not None:
             pull = pull.copy()
             pull[self.positive_weight_mask] = self.residual_decorrelation_matrix.T @ pull[self.positive_weight_mask]
@@ -167,7 +166,7 @@ class SensorMeasurements:
     def residual_and_jacobian(
         self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf
     ) -> ResidualAndJacobian:
-        """Residual block with Huber weights. It has a Jacobian if the prediction's slopes (M, k, d) are given."""
+        """Residual block with Huber weights, and with a Jacobian if `slopes` (M, k, d) of the prediction are given."""
         raw = self.whitened_residual(predicted)
         cost, factor = huber_loss_and_residual_factors(raw, threshold)
         seen, jacobian = self.positive_weight_mask, None
@@ -177,7 +176,7 @@ class SensorMeasurements:
         return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
     def shifted_earlier_by_steps(self, steps: Array) -> SensorMeasurements:
-        """Shift samples earlier by each output's delay [steps], clipped to predictable nodes. Delays: (k,)."""
+        """Shift samples earlier by each output's delay `steps` (k,), clipped to the predictable nodes."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-9, near, position)
@@ -188,8 +187,8 @@ class SensorMeasurements:
     def prediction_change_per_step(self, at_nodes: Array, unmoved: SensorMeasurements, steps: Array) -> Array:
         """Change of a prediction per step at delayed samples, (M, k). At a node it is the mean of adjacent steps.
 
-        `at_nodes` (len(nodes), k) is the prediction, `unmoved` the measurements before the delay of `steps` (k,).
-        """
+        `at_nodes` (len(nodes), k) is the prediction. `unmoved` are the measurements before the delay of `steps`
+        (k,)."""
         nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short piece may hold no sample of a slow sensor
             return np.zeros((0, at_nodes.shape[1]))
@@ -205,7 +204,7 @@ class SensorMeasurements:
         return np.where((position < first - 1e-9) | (position > last + 1e-9), 0.0, rate)
 
     def interpolate_to_samples(self, at_nodes: Array) -> Array:
-        """Interpolate values at `evaluation_nodes` linearly to the samples, (len(nodes), ...) to (M, ...)."""
+        """Interpolate values (len(nodes), ...) at `evaluation_nodes` linearly to the samples, (M, ...)."""
         nodes = self.evaluation_nodes
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
         before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
@@ -214,7 +213,7 @@ class SensorMeasurements:
         return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
     def interpolation_adjoint(self, at_samples: Array) -> Array:
-        """Apply the transpose of `interpolate_to_samples` to values (M, ...). Result: (len(nodes), ...)."""
+        """Apply the transpose of `interpolate_to_samples` to values (M, ...), with the result (len(nodes), ...)."""
         nodes = self.evaluation_nodes
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
@@ -231,7 +230,7 @@ class SensorMeasurements:
 
 
 def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -> SensorMeasurements:
-    """Locate a sensor's samples between rollout nodes. `DataError` if a noise level is not positive."""
+    """Locate a sensor's samples between rollout nodes. Raises `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
         what, allowed = "a noise level is zero or missing", "a positive standard deviation"
@@ -247,10 +246,9 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
 
 
 def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
-    """Weight measurements at nearest nodes as Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
+    """Weight measurements at nearest nodes as in Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
 
-    J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
-    """
+    J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2]."""
     nearest_node = samples.node + (samples.fraction >= 0.5)
     weight = np.where(np.isfinite(samples.value), 1.0, 0.0)
     weight[nearest_node == 0] = 0.0
@@ -261,10 +259,9 @@ def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid)
 
 
 def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
-    """Huber loss of whitened residuals, sum rho(r), and least-squares factors sqrt(rho'(r)/r).
+    """Huber loss sum rho(r) of whitened residuals, and the least-squares factors sqrt(rho'(r)/r).
 
-    Beyond `scale` the loss grows linearly [standard deviations]; infinite for plain squares.
-    """
+    Beyond `scale` [standard deviations] the loss is linear. An infinite `scale` gives plain least squares."""
     size = np.abs(residual)
     inside = size <= scale
     with np.errstate(invalid="ignore"):
@@ -274,25 +271,24 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
 
 
 def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
-    """Whiten a residual and its derivatives (r, c), in units of noise, by constant sensor errors too.
+    """Whiten residual and derivatives, already in units of noise, against constant sensor errors as well.
 
-    `slopes` (r, m) are the sensitivities of residuals of unit variance to errors of unit variance.
-    """
+    `columns` (r, c) holds residual and derivatives side by side. `slopes` (r, m) are the derivatives of whitened
+    measurements with respect to m constant errors, each in units of its standard deviation."""
     left, size, _ = np.linalg.svd(slopes, full_matrices=False)
     return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
 
 
 def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
-    """Constant sensor errors (m,), measured minus true, from a residual and its `slopes` (r, m), all in std units."""
+    """Constant sensor errors (m,), measured minus true, from a residual and its `slopes` (r, m), all in stds."""
     left, size, right = np.linalg.svd(slopes, full_matrices=False)
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
 def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasurements]) -> Array:
-    """Derivatives (r, m) of whitened measurements with respect to errors of sensors and clocks of unit variance.
+    """Derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
 
-    Those of the residual, prediction minus measurement, have the opposite sign.
-    """
+    Derivatives of the residual, prediction minus measurement, have the opposite sign."""
     parts = [s.weight[:, :, None] * s.error_directions for s in samples]
     count, before = sum(part.shape[2] for part in parts), 0
     found = np.zeros((sum(s.n_residuals for s in samples), count))
@@ -307,10 +303,7 @@ def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasure
 def subtract_estimated_biases(
     samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
 ) -> tuple[SensorMeasurements, ...]:
-    """Measurements minus their constant errors and their clocks' offsets, which are estimated from a prediction.
-
-    `predicted` has the shape (M, k) for each.
-    """
+    """Subtract constant errors and clock offsets, estimated from a prediction (M, k) per sensor, from measurements."""
     slopes = whitened_measurement_sensitivities_to_biases(samples)
     if not slopes.shape[1]:
         return tuple(samples)

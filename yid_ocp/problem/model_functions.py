@@ -1,4 +1,4 @@
-"""Compiled functions of a model, for sensors, equilibrium and input corrections, that many problems share."""
+"""Compiled functions of a model, shared by many problems: sensors, equilibrium and input corrections."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from yid_ocp.sensors import Sensor, sensor_reading_function
 
 @dataclass(frozen=True)
 class CorrectedInputs:
-    """Inputs of a rollout corrected for effects, with derivatives along d parameters (..., d) (None: zero)."""
+    """Inputs of a rollout corrected for effects, with derivatives (..., d) by d parameters (None: zero)."""
 
     torque: Array  # (N, nu) [N m]
     first_torque: Array  # torque of the initial equilibrium, (nu,) [N m]
@@ -42,11 +42,11 @@ class CorrectedInputs:
 
     @property
     def initial_known_coordinates(self) -> Array:
-        """Coordinates of driven, then prescribed joints at node 0, shape (nk,)."""
+        """Coordinates (nk,) of driven, then prescribed joints at node 0."""
         return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
 
     def initial_known_coordinates_sensitivity(self, width: int) -> Array:
-        """Derivative of `initial_known_coordinates` with respect to the parameters, shape (nk, d)."""
+        """Derivative (nk, d) of `initial_known_coordinates` with respect to the parameters."""
         by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
@@ -54,7 +54,7 @@ class CorrectedInputs:
     def feedback_with_corrected_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
-        """Correct the tracking filter's reference to true angles and by the effects' momentum shift."""
+        """Tracking filter whose reference is corrected to true angles and by the effects' momentum shift."""
         turned = None if self.driven_angles_sensitivity is None else self.driven_angles - measured
         if feedback is None or (turned is None and self.momentum_shift is None):
             return feedback
@@ -76,9 +76,8 @@ class CorrectedInputs:
     ) -> CorrectedInputs:
         """Add to every step the momentum that effects add to the tracking filter's reference.
 
-        The angles `recorded` are smooth, those `measured` (N + 1, nu) are as they were read; `by_internal` (nz, d) is
-        the derivative of the internal coordinates at the start.
-        """
+        The angles in `recorded` are smoothed, those in `measured` (N + 1, nu) are raw. `by_internal` (nz, d) is the
+        derivative of the initial internal coordinates."""
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
         if read and not any(np.any(x) for x in slopes) and not shift.is_active(theta, wanted):
@@ -92,7 +91,7 @@ class CorrectedInputs:
     def nominal_torque_sensitivity(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
-        """Derivatives of the nominal torque, also through the tracking filter's reference, (N, nu, width)."""
+        """Derivatives (N, nu, width) of the nominal torque, including those through the tracking filter's reference."""
         reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
         for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
             if feedback is not None and slope is not None:
@@ -103,7 +102,7 @@ class CorrectedInputs:
         return np.asarray(sum(np.pad(by, ((0, 0), (0, 0), (0, width - by.shape[2]))) for by in reached))
 
     def _followed(self, feedback: TrackingFeedback, driven: tuple[int, ...], momenta: bool) -> list[tuple[int, int]]:
-        """Columns of a filter that follow angles, or momenta, and the driven joint of each."""
+        """Columns of a filter that feed back angles, or momenta, and the driven joint of each column."""
         rows = [int(row) for row in feedback.state_indices]
         if not momenta:
             return [(column, driven.index(row)) for column, row in enumerate(rows) if row in driven]
@@ -113,10 +112,9 @@ class CorrectedInputs:
 
 
 class InputCorrectionFunctions:
-    """Compiled maps from recorded to true inputs and times, from the system's effects on recordings.
+    """Compiled maps from recorded to true inputs and times, defined by the system's effects on recordings.
 
-    Derivatives may be asked for by the parameters `names`; those wanted are some of them.
-    """
+    `names` are the parameters for which derivatives are available. A method's `wanted` is a subset of `names`."""
 
     def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:
         self.system = system
@@ -179,8 +177,8 @@ class InputCorrectionFunctions:
     ) -> tuple[Array, Array, Array, Array, Array]:
         """Compute true angles and efforts (K, nj) of `joint_names` from recorded ones, with derivatives.
 
-        Followed by their derivatives by the d parameters `wanted`, (K, nj, d), and that of the effort by its reading.
-        """
+        Returns angles, efforts, their derivatives (K, nj, d) by the d parameters `wanted`, and the derivative of the
+        effort by its reading."""
         a, e, e_reading, *slopes = self._maps(bool(wanted))(angle, effort, theta)
         at = [self._names.index(name) for name in wanted]
         a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
@@ -189,16 +187,15 @@ class InputCorrectionFunctions:
     def joint_delay_or_lag(
         self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Delays or lag time constants of driven joints' torques or prescribed joints' efforts, (nj,) [s].
+        """Delays or lag time constants (nj,) [s] of driven joints' torques or of prescribed joints' efforts.
 
-        With their derivatives by the parameters `wanted`; None where no effect has any.
-        """
+        Also returns their derivatives (nj, d) by the parameters `wanted`. None if no effect has a delay or lag."""
         return self._evaluate(self._times[kind], theta, wanted)
 
     def sensor_delays_with_derivatives(
         self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Recorded minus true time of each sensor output with derivatives, (k,) [s]. None without delays."""
+        """Recorded minus true time (k,) [s] of each sensor output, with derivatives. None without delays."""
         return self._evaluate(self._sensor_delays(sensor), theta, wanted)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
@@ -206,7 +203,7 @@ class InputCorrectionFunctions:
         return self._with_jacobian([self._delay(c, camera) for c in sensor.channel_names for _ in range(width)])
 
     def _with_jacobian(self, entries: Sequence[ca.SX]) -> ca.Function | None:
-        """Function of theta with its derivative by the chosen parameters; None where it is the same at every theta."""
+        """Function of theta with its derivative by the chosen parameters; None if it is independent of theta."""
         expression, theta = ca.vertcat(ca.SX(0, 1), *entries), self.system.parameters.symbols
         if not _depends(expression, theta):
             return None
@@ -241,7 +238,7 @@ class TimeGridStateValues:
     def from_trajectory(
         step: Step, state: Array, load: Array | None = None, lam: Array | None = None
     ) -> TimeGridStateValues:
-        """Compute the values at all nodes of a trajectory (K, nx). Absent loads and constraint forces are zero."""
+        """Compute the values at all nodes of a trajectory (K, nx). Loads and constraint forces default to zero."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
         v, a = (
@@ -256,7 +253,7 @@ class TimeGridStateValues:
 
 
 def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Velocity at `nodes` from the positions (K, ...) of their neighbours, shape (len(nodes), ...)."""
+    """Velocity (len(nodes), ...) at `nodes`, by central differences of the positions `q` (K, ...)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
@@ -272,7 +269,7 @@ def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int
 
 
 def second_difference_acceleration(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Acceleration at some nodes of a trajectory by second differences, (K, ...) to (len(nodes), ...)."""
+    """Acceleration (len(nodes), ...) at `nodes`, by second differences of the positions `q` (K, ...)."""
     middle = _inner_nodes(nodes, len(q))
     return np.asarray((q[middle + 1] - 2 * q[middle] + q[middle - 1]) / time_step**2) if len(q) > 2 else 0 * q[nodes]
 
@@ -290,7 +287,7 @@ def _inner_nodes(nodes: IntArray, count: int) -> IntArray:
 
 
 class _SensorReadings(NamedTuple):
-    """Readings of a sensor at K nodes, (K, k), and their derivatives, (K, k, ...); see `sensor_reading_function`."""
+    """Readings (K, k) of a sensor at K nodes, and their derivatives (K, k, ...); see `sensor_reading_function`."""
 
     output: Array
     by_q: Array
@@ -303,15 +300,15 @@ class _SensorReadings(NamedTuple):
 
     @property
     def needs_neighbours(self) -> bool:
-        """Whether they depend on velocities, accelerations or constraint forces, which a node's state does not hold."""
+        """Whether they depend on velocities, accelerations or constraint forces, which need neighbouring nodes."""
         return self.by_v.shape[2] + self.by_a.shape[2] + self.by_lam.shape[2] > 0
 
 
 class ModelFunctions:
     """Compiled functions of a system: sensor readings, equilibrium, initial state fit and input corrections.
 
-    Derivatives may be asked for by the parameters `names`; `start_parameters` are fitted along with starts from points.
-    """
+    `names` are the parameters for which derivatives are available. `start_parameters` are fitted with initial
+    states."""
 
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:
         self.step = step
@@ -326,7 +323,7 @@ class ModelFunctions:
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
-        """Make the functions for another time step [s]. Those that do not depend on it are shared."""
+        """The same functions for another time step [s]. Functions independent of the time step are shared."""
         made = ModelFunctions(
             copy_of_step_with_time_step(self.step, time_step), self.parameter_names, self._start_parameters
         )
@@ -351,13 +348,13 @@ class ModelFunctions:
 
     @property
     def effect_momentum_shift_functions(self) -> EffectMomentumShift:
-        """Calculator of the momentum that effects add to the tracking filter's reference at every step."""
+        """Calculator of the momentum that effects add to the tracking filter's reference in each step."""
         return self._momentum(None)
 
     def compiled_sensor_function(
         self, sensor: Sensor, wanted: tuple[str, ...] = ()
     ) -> Callable[[TimeGridStateValues, Array], _SensorReadings]:
-        """Compiled function of a sensor's readings at nodes, with derivatives with respect to `wanted`."""
+        """Compiled function of a sensor's readings at nodes, with derivatives by the parameters `wanted`."""
         function, columns = self._sensors((sensor, bool(wanted))), [self.parameter_names.index(name) for name in wanted]
 
         def read(at: TimeGridStateValues, theta: Array) -> _SensorReadings:

@@ -1,4 +1,4 @@
-"""Settings of an estimation problem, such as initial state, noise, priors and tracking filter."""
+"""Settings of an estimation problem: initial state, noise, priors and tracking filter."""
 
 from __future__ import annotations
 
@@ -24,21 +24,20 @@ DiscretisationName = Literal["links", "time_step"]
 
 @dataclass(frozen=True)
 class MultivariateGaussianPrior:
-    """Multivariate Gaussian prior of shared parameters about their initial values, as from an earlier estimate.
+    """Multivariate Gaussian prior of shared parameters about their initial values, such as an earlier estimate.
 
-    The covariance (n, n) is positive definite, in the parameters' units.
-    """
+    The covariance (n, n) is positive definite, in the parameters' units."""
 
     parameter_names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def with_parameters_scaled_by(self, factors: Mapping[str, float]) -> MultivariateGaussianPrior:
-        """Prior of the rescaled parameters factor x parameter. Parameters without a factor are unchanged."""
+        """Prior of the parameters multiplied by `factors`. Parameters without a factor are unchanged."""
         by = np.array([factors.get(name, 1.0) for name in self.parameter_names])
         return MultivariateGaussianPrior(self.parameter_names, self.covariance * np.outer(by, by))
 
     def restricted_to(self, names: Sequence[str]) -> MultivariateGaussianPrior:
-        """Marginal prior of the named parameters that it covers, in the given order."""
+        """Marginal prior of those of the named parameters that it covers, in the given order."""
         at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
         return MultivariateGaussianPrior(tuple(self.parameter_names[i] for i in at), self.covariance[np.ix_(at, at)])
 
@@ -47,9 +46,8 @@ class MultivariateGaussianPrior:
 class ExcessResidualCriteria:
     """Significance level and smallest excess chi2 at which a residual exceeds its noise.
 
-    It does where it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`; of the stated standard
-    deviations `noise_fraction_of_std` is noise, the rest represents model error.
-    """
+    It exceeds the noise if it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`. The fraction
+    `noise_fraction_of_std` of stated standard deviations is noise; the rest represents model error."""
 
     significance_level: float = 0.01
     min_excess_chi2_per_dof: float = 0.1
@@ -71,29 +69,29 @@ class ProblemOptions:
     Attributes
     ----------
     local_parameters : tuple of str
-        Free parameters with a value of their own in every recording.
+        Free parameters with one value per recording.
     prior_stds : mapping of parameter to standard deviation
         Gaussian priors about the initial value, in the parameter's unit.
     multivariate_prior : MultivariateGaussianPrior
         Correlated prior of several parameters, in place of entries of `prior_stds`.
     stated_std_factor : float
-        Factor by which all standard deviations here have been multiplied, priors' too, so that they are noise alone.
+        Factor already multiplied into all standard deviations here, priors included, so that they are noise alone.
     parameters_by_recording : mapping of recording to mapping of parameter to value
-        Known values of parameters that differ from recording to recording, such as where markers sit.
+        Known values of parameters that differ between recordings, such as marker positions.
     known_initial_states : mapping of recording to array_like, shape (nx,)
-        State (q, p, z) in which a recording starts, in place of equilibrium or of the fit.
+        Known initial state (q, p, z) of a recording, in place of an equilibrium or a fit.
     has_uncertain_point_clocks : bool
-        Whether groups of points may be late by half a sample, as noise, where dampers are free.
+        Whether point groups can be late by half a sample, as noise, if damping parameters are free.
     data_issues : tuple of Issue
         Data quality issues found in the recordings.
     excess_residual_criteria : ExcessResidualCriteria
         Criteria for a residual that exceeds noise.
     checked_discretisations : tuple of str
-        What an estimate's standard deviation includes the error of: `links`, `time_step`.
+        Discretisation errors that the standard deviations include: `links`, `time_step`.
     divided_links_model : DividedLinksModel, optional
-        Needed for `links`.
+        Required for `links`.
     cable_topology : CableTopology, optional
-        Of a cable held by clamps, for the baselines that it has.
+        Topology of a cable held by clamps, for its baselines.
     """
 
     initial_state: Annotated[

@@ -1,4 +1,4 @@
-"""Results of predictions, with model-free baselines, measured channels and synthetic recordings."""
+"""Results of predictions: measured channels, baselines without a model, and synthetic recordings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from yid_ocp.sensors.joints import (
 
 
 def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGroup:
-    """Point group of a recording that contains all given points; raises `DataError` where there is none."""
+    """Point group of a recording that contains all given points. Raises `DataError` if there is none."""
     for group in recording.points:
         if set(points) <= set(group.names):
             return group
@@ -41,9 +41,8 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
 def constant_position_baseline(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
     """Predict that every point stays at its position in the last given frame (baseline).
 
-    The `given` first frames are as measured; shape (M, len(points), 3) [m]. Raises `DataError` for a point that is not
-    recorded or not seen in the last given frame, or too few frames.
-    """
+    Returns positions (M, len(points), 3) [m]; the first `given` frames are as measured. Raises `DataError` if a point
+    is not recorded or not measured in the last given frame, or if there are too few frames."""
     return _carried(recording, points, (), given, np.zeros((len(points), 0)))
 
 
@@ -52,8 +51,7 @@ def mean_clamp_displacement_baseline_prediction(
 ) -> Array:
     """Predict that every point moves by the clamped points' mean displacement since the last given frame.
 
-    Shape and errors as in `constant_position_baseline`; the path of the points `clamped` is known throughout.
-    """
+    The path of the `clamped` points is known. Shape and errors are as in `constant_position_baseline`."""
     share = np.full((len(points), len(clamped)), 1.0 / max(len(clamped), 1))
     return _carried(recording, points, clamped, given, share)
 
@@ -68,10 +66,9 @@ def interpolated_displacement_position_baseline(
 ) -> Array:
     """Predict displacements by interpolation along the parent's arc length. Children move with their junction.
 
-    Shape and errors as in `constant_position_baseline`, and for a point of no branch. `parent` has its points from end
-    to end, of which `clamped` are those between which is interpolated, its two ends when absent; each child begins with
-    the parent's point at which it leaves.
-    """
+    `parent` lists its points from end to end. Displacements are interpolated between its points `clamped` (default: its
+    two ends). Each child starts with the parent point of its junction. Shape and errors are as in
+    `constant_position_baseline`; a point without a branch also raises `DataError`."""
     known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
     at = _given_frame(recording, parent, given)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
@@ -93,9 +90,8 @@ def interpolated_displacement_position_baseline(
 def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
     """Root mean square of the Euclidean error over points and frames [m]. NaN if there is nothing to compare.
 
-    Given frames and those in which a point was not measured do not count; shapes are (M, np, 3), `DataError` where the
-    two differ.
-    """
+    Shapes are (M, np, 3); different shapes raise `DataError`. The first `given` frames and missing points do not
+    count."""
     if predicted.shape != measured.shape:
         raise DataError(f"prediction {predicted.shape} and measurement {measured.shape} differ in shape")
     square = np.sum((predicted - measured)[given:] ** 2, axis=2)
@@ -104,7 +100,7 @@ def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
 
 
 def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
-    """Measured positions of some points of one group of a recording, (M, len(points), 3) [m]."""
+    """Measured positions (M, len(points), 3) [m] of points of one group of a recording."""
     group = _group_with_points(recording, points)
     return group.position[:, [group.names.index(point) for point in points]]
 
@@ -120,7 +116,7 @@ def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Arr
 
 
 def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], given: int, share: Array) -> Array:
-    """Given frames as measured, then the last one plus each point's share of the known points' displacement."""
+    """Given frames as measured, then the last given frame plus each point's share of the known displacements."""
     here = _given_frame(recording, points, given)
     result = np.array(recorded_point_positions(recording, points))
     moved = np.zeros((len(result), len(points), 3))
@@ -133,7 +129,7 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelPrediction(ReprMixin):
-    """Measured and predicted samples (M, w) of one channel. w is 3 for a point, 1 for a joint."""
+    """Measured and predicted samples (M, w) of one channel; w is 3 for a point, 1 for a joint."""
 
     recording: str
     channel: str
@@ -145,16 +141,16 @@ class ChannelPrediction(ReprMixin):
 
     @property
     def predicted_minus_measured(self) -> Array:
-        """Error of the prediction, predicted minus measured, shape (M, w)."""
+        """Error (M, w) of the prediction, predicted minus measured."""
         return self.predicted - self.measured
 
     @property
     def rmse(self) -> float:
-        """Root mean square error in the channel's unit. For a point it is that of the Euclidean distance."""
+        """Root mean square error in the channel's unit; for a point, of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
     def predicted_at(self, t: Array) -> Array:
-        """Interpolate the prediction linearly to other times t (K,) [s], shape (K, w)."""
+        """Interpolate the prediction linearly to other times `t` (K,) [s]. Returns shape (K, w)."""
         return np.stack([np.interp(t, self.t, column) for column in self.predicted.T], axis=1)
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -180,10 +176,9 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
 def rmse_unit_and_count_by_channel(
     results: Sequence[EpisodePrediction], episodes: Sequence[Episode]
 ) -> dict[str, dict[str, Any]]:
-    """Root mean square error, unit and number of samples by channel. The keys are `rmse`, `unit`, `n`.
+    """Root mean square error, unit and number of samples by channel, with the keys `rmse`, `unit`, `n`.
 
-    For points the error of a sample is the Euclidean distance.
-    """
+    For points, the error of a sample is the Euclidean distance."""
     squares: dict[str, list[float]] = {}
     units: dict[str, str] = {}
     for result, episode in zip(results, episodes, strict=True):
@@ -207,8 +202,7 @@ def recording_from_prediction(
 ) -> Recording:
     """Convert an episode's prediction to a synthetic recording with its sensors' clocks and noise levels.
 
-    `seed` is that of the noise that the estimation assumes, constant torque offsets included; no noise when absent.
-    """
+    `seed` generates the noise that the estimation assumes, including constant torque offsets; None gives no noise."""
     rng = None if seed is None else np.random.default_rng(seed)
     system, source = predictor.system, episode.recording
     groups = []
@@ -236,7 +230,7 @@ def recording_from_prediction(
 def synthesize_recording(
     predictor: EpisodePredictor, episode: Episode, theta: Array, seed: int | None = None
 ) -> Recording:
-    """Roll out an episode at `theta` and make a synthetic recording. It has noise if a `seed` is given."""
+    """Roll out an episode at `theta` and make a synthetic recording, with noise if a `seed` is given."""
     refit = predictor.options.initial_state == "fitted_to_points"
     fresh = (
         predictor.episode_with_fitted_initial_state(replace(episode, fixed_initial_state=None), theta)
@@ -285,7 +279,7 @@ def _channel_groups(
 
 
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
-    """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
+    """A group with the recorded points that clamps follow: they are inputs and are not predicted."""
     original = next(entry for entry in source.points if entry.name == group.name)
     clamps = predictor.options.clamp_pose_definitions_from_points
     followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point_name, clamp.z_axis_point_name))
@@ -342,7 +336,7 @@ def _commanded(
     names: tuple[str, ...],
     rng: np.random.Generator | None,
 ) -> JointGroup:
-    """Joints of servos at every node, with what they were commanded there."""
+    """Joints of servos at every node, with their commands."""
     source, times = episode.recording.joints, episode.grid.node_times
     assert source is not None
     columns = [source.names.index(name) for name in names]
@@ -365,10 +359,9 @@ def _commanded(
 def _levels(
     predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...]
 ) -> tuple[Array | None, Array | None, Array | None]:
-    """Standard deviations of angle, torque and its constant error, (nj,) each, as the estimation takes them.
+    """Standard deviations (nj,) of angle, torque and constant torque error, as the estimation assumes them.
 
-    Of driven joints those of what drives the motion, else what is stated; None where nothing says so.
-    """
+    For driven joints they are the input errors, else the stated levels; None if nothing is stated."""
     joints, driven = episode.recording.joints, predictor.system.driven
     assert joints is not None
     effort = predictor.options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())

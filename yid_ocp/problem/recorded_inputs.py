@@ -1,4 +1,4 @@
-"""Inputs of a rollout from a recording, such as torques, commands, prescribed paths and joint angles."""
+"""Inputs of a rollout from a recording: torques, commands, prescribed paths and joint angles."""
 
 from __future__ import annotations
 
@@ -34,15 +34,13 @@ def mean_step_inputs(
     delay: Array | None = None,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Mean input of driven joints in every step, torque [N m] or servo command [rad or m], (steps, nu).
+    """Mean input (steps, nu) of driven joints in every step: torque [N m] or servo command [rad or m].
 
-    An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; a lost sample
-    counts as lying between its neighbours. Through samples of efforts goes a cubic spline, and where means over the
-    recorded intervals are given, the derivative of one through their sums, which keeps every mean. Each acts later than
-    recorded by its `delay` (nu,) [s]; with `servos`, those of all driven joints, these follow commands. `where` is the
-    recording's name. `DataError` where a joint is missing, no effort is recorded, or no commands where servos move the
-    arms.
-    """
+    Effort samples are interpolated by a cubic spline. Recorded interval means give the derivative of a spline through
+    their cumulative sum, which preserves every mean. Efforts of kind `command` and held commands are piecewise
+    constant. A lost sample is interpolated from its neighbours. Each input acts later than recorded by `delay` (nu,)
+    [s]. With `servos` (for all driven joints) the input is the position command. `where` is the name of the recording.
+    Raises `DataError` if a joint is missing, or if efforts (with `servos`: commands) are not recorded."""
     if not driven:
         return np.zeros((grid.steps, 0))
     late = np.zeros(len(driven)) if delay is None else delay
@@ -61,8 +59,7 @@ def mean_step_input_delay_derivative(
     delay: Array,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Derivative of `mean_step_inputs` with respect to each joint's delay, (steps, nu). Jumps have the mean of both
-    sides."""
+    """Derivative (steps, nu) of `mean_step_inputs` by each joint's delay; at jumps, the mean of both sides."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
@@ -75,7 +72,7 @@ def mean_step_input_delay_derivative(
 def _motor_off_steps(
     joints: JointGroup, driven: tuple[str, ...], grid: TimeGrid, where: str, has_servos: bool
 ) -> BoolArray:
-    """Where motors of servos are off, (steps, nu): by `torque_enable` at the middle of a step; all without commands."""
+    """Mask (steps, nu) of steps with servo motors off: by `torque_enable` at mid-step; all if there are no commands."""
     is_off = has_servos and joints.position_command is None
     if is_off or not has_servos or joints.torque_enable is None:
         return np.full((grid.steps, len(driven)), is_off)
@@ -87,8 +84,8 @@ def _motor_off_steps(
 def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
     """Firmware gains stated in recordings, as `JOINT.servo_gain_factor` values by recording name.
 
-    `DataError` where some recordings state it and others, whose motors are on, do not: their gains would not compare.
-    """
+    Raises `DataError` if only some of the recordings with motors on state gains, because gains could not be
+    compared."""
     wanted = {name: f"{name}.{SERVO_GAIN_FACTOR_PARAMETER}" for name in system.servos}
     wanted = {name: parameter for name, parameter in wanted.items() if parameter in system.parameters}
     found: dict[str, dict[str, float]] = {}
@@ -113,7 +110,7 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
 def _courses(
     joints: JointGroup, driven: tuple[str, ...], where: str, servos: Mapping[str, PositionServo]
 ) -> list[scipy.interpolate.PPoly]:
-    """Input of each joint over time, between the first sample and the end of the last one's interval."""
+    """Input of each joint over time, from the first sample to the end of the last sample's interval."""
     t = joints.t
     # the last sample lasts as long as the one before it
     edges = np.append(t, 2 * t[-1] - t[-2])
@@ -147,7 +144,7 @@ def _courses(
 
 
 def _with_lost_samples(t: Array, values: Array) -> tuple[Array, Array]:
-    """Times and rows of a channel (N, k) with the samples that an even clock left out, on straight lines."""
+    """Times and rows of a channel (N, k), with lost samples of an even clock added by linear interpolation."""
     lost = np.rint(np.diff(t) / median_sample_period(t)).astype(int) - 1
     between = [
         t[i] + (t[i + 1] - t[i]) * np.arange(1, n + 1) / (n + 1) for i, n in enumerate(lost) if 0 < n <= _MAX_LOST
@@ -165,7 +162,7 @@ def _straight(values: Array, t: Array) -> scipy.interpolate.PPoly:
 
 
 def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
-    """Integral of an input up to times, shape of t; before its first moment and after its last it is held."""
+    """Integral of an input up to times `t`, same shape; the input is constant outside its time range."""
     inside = np.clip(t, *course.x[[0, -1]])
     return np.asarray(course.antiderivative()(inside) + course(inside) * (t - inside))
 
@@ -186,7 +183,7 @@ def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: LowPas
 def smoothed_joint_efforts(
     recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: LowPassFilter
 ) -> Array:
-    """Low-pass filtered joint efforts at every node, (steps + 1, len(names)) [N m]. `DataError` without efforts."""
+    """Low-pass filtered joint efforts (steps + 1, len(names)) [N m] at every node. `DataError` without efforts."""
     joints = recording.joints
     if joints is None or joints.effort is None:
         what = "the model's gears give way under an effort that the recording does not have"
@@ -197,11 +194,10 @@ def smoothed_joint_efforts(
 
 
 def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Remove effort noise from gear loads. The result is the model's loads plus the slow part of measured minus model.
+    """Remove effort noise from gear loads: the model's loads plus the slow part of measured minus model.
 
-    Both are smoothed (N + 1, k) and compared at `nodes` (M,), beyond the first and last of which neither is right; the
-    filter of paths and efforts has the `cutoff` [Hz].
-    """
+    `measured` and `own` (the model's) are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
+    difference is constant. `cutoff` [Hz] is that of the filter of paths and efforts."""
     gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
@@ -209,9 +205,8 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     """Kinds of signals in recordings that effects can require, such as `joints.effort`.
 
-    Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`, and so is each group of points, no camera's
-    nor an arm's, beside joints: `points:GROUP`.
-    """
+    Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, so is each point group
+    that neither a camera nor an arm measured: `points:GROUP`."""
     found, mounted = set[str](), set[str]()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.values_by_channel}
@@ -234,7 +229,7 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
 
 
 def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
-    """Kinds of effects that are no candidates, by the signals that the recordings lack for them."""
+    """Kinds of effects that cannot be candidates, by the signals that they require but the recordings lack."""
     present, found = recorded_signal_kinds(recordings), dict[str, list[str]]()
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):
@@ -249,11 +244,9 @@ def prescribed_coordinates_at_nodes(
     low_pass: LowPassFilter,
     clamps: tuple[ClampPoseDefinition, ...] = (),
 ) -> Array:
-    """Prescribed coordinates at every node from smoothed recorded joints and clamp points, (steps + 1, nc).
+    """Prescribed coordinates (steps + 1, nc) at every node, from smoothed recorded joints and clamp points.
 
-    Joints follow the smoothed recorded positions, clamps their smoothed points; `DataError` where one is not recorded,
-    or is seen too seldom.
-    """
+    Raises `DataError` if a joint or clamp point is not recorded or has too few measurements."""
     if not system.prescribed:
         return np.zeros((grid.steps + 1, 0))
     course: dict[str, Array] = {}

@@ -23,13 +23,13 @@ _MIN_RELATIVE_WEIGHT = 1e-4
 
 @dataclass(frozen=True)
 class LowPassFilter:
-    """Zero-phase Butterworth low-pass filter of order 4 on an even clock. It runs forward and backward."""
+    """Zero-phase Butterworth low-pass filter of order 4 on an even clock, run forward and backward."""
 
     cutoff: float  # frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter
     passes: int = 1
 
     def __call__(self, t: Array, values: Array) -> Array:
-        """Smoothed values (M, k) at the same times; an uneven clock is resampled to its median step in between."""
+        """Smoothed values (M, k) at the same times. An uneven clock is resampled internally to its median step."""
         if not math.isfinite(self.cutoff):
             return values
         step = float(np.median(np.diff(t)))
@@ -43,12 +43,12 @@ class LowPassFilter:
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def decorrelation_stride(self, step: float) -> int:
-        """Number of samples after which filtered white noise is nearly uncorrelated. `step` [s] is their period."""
+        """Number of samples, `step` [s] apart, after which filtered white noise is nearly uncorrelated."""
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 
     @property
     def settling_time(self) -> float:
-        """Time after which the distortion at the ends of a record has decayed to a thousandth [s]."""
+        """Time [s] after which the distortion at the ends of a record has decayed to a thousandth."""
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * _FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
@@ -65,8 +65,7 @@ class LowPassFilter:
     def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeSmoother:
         """Make a matrix filter that smooths values at `nodes` out of `count` nodes, `step` [s] apart.
 
-        Values before node 1 and after the last node are taken as constant.
-        """
+        The filter does not use the value at node 0. The signal is constant before node 1 and after the last node."""
         nodes = nodes[nodes < count]
         weight = _weights(self, step)
         reach = len(weight) // 2
@@ -77,7 +76,7 @@ class LowPassFilter:
         return NodeSmoother(nodes, entries.tocsr())
 
     def _response(self, step: float) -> Array:
-        """To an impulse in the middle, at an odd number of samples."""
+        """Response to an impulse in the middle of an odd number of samples."""
         length = 2 * int(5 * self.passes / (self.cutoff * step)) + 101
         response = np.zeros((length, 1))
         response[length // 2] = 1.0
@@ -100,19 +99,19 @@ class LowPassFilter:
 
 @dataclass(frozen=True)
 class NodeSmoother:
-    """A smoothing filter as a matrix (M, N). It smooths values at M of N nodes and leaves the others unchanged."""
+    """A smoothing filter as a matrix (M, N). It smooths values at M of N nodes and keeps the others."""
 
     nodes: IntArray
     matrix: scipy.sparse.csr_array
 
     def smooth(self, values: Array) -> Array:
-        """Smooth values at all nodes, (N, ...), in the same shape."""
+        """Smooth values (N, ...) at all nodes."""
         smooth = values.copy()
         smooth[self.nodes] = (self.matrix @ values.reshape(len(values), -1)).reshape(len(self.nodes), *values.shape[1:])
         return smooth
 
     def smoothing_adjoint(self, pull: Array) -> Array:
-        """Convert a cost's gradient in the smoothed values to that in the input values, both (N, k) (adjoint)."""
+        """Convert a cost's gradient by the smoothed values to a gradient by the input values, both (N, k) (adjoint)."""
         passed = pull.copy()
         passed[self.nodes] = 0.0
         return np.asarray(passed + self.matrix.T @ pull[self.nodes])
@@ -120,7 +119,7 @@ class NodeSmoother:
 
 @lru_cache(maxsize=16)
 def _weights(low_pass: LowPassFilter, step: float) -> Array:
-    """Of the samples about each, an odd number of them, which add up to one."""
+    """Filter weights of neighbouring samples, an odd number that sum to one."""
     response = low_pass._response(step)
     middle = len(response) // 2
     reach = int(np.abs(np.flatnonzero(np.abs(response) > _MIN_RELATIVE_WEIGHT * response[middle]) - middle).max())
@@ -129,17 +128,16 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
 
 
 def twice_applied_effort_filter(cutoff: float) -> LowPassFilter:
-    """Filter of measured and predicted efforts, the zero-phase filter of prescribed paths applied twice."""
+    """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
     return LowPassFilter(cutoff, 2)
 
 
 @dataclass(frozen=True)
 class FirstOrderLag:
-    """First-order lags of k channels, with derivatives with respect to their time constants.
+    """First-order lags of k channels, with derivatives with respect to their time constants T.
 
-    With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once. At nodes T may be
-    negative: then the value follows z with the time constant -T, so that z = x - T dx/dt.
-    """
+    E = exp(-h/T) and f = T/h (1 - E); both are zero at T = 0, where output z equals input x. Node values allow a
+    negative T: then z leads x, with z = x - T dx/dt."""
 
     time_constant: Array  # T, (k,) [s]
     time_constant_sensitivity: Array  # (k, d)
@@ -148,8 +146,8 @@ class FirstOrderLag:
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
         """Mean lagged output over each step, for inputs held over steps. Output and input start equal.
 
-        Of x (N, k) with its slope (N, k, d), if any, it is x + (z - x) f, with z_{k+1} = x + (z - x) E; and its slope.
-        """
+        For x (N, k) it is x + (z - x) f with z_{k+1} = x + (z - x) E. Also returns its derivative, given `slope` (N, k,
+        d)."""
         decay, share, decay_slope, share_slope = self._factors()
         held = self._following(value, np.zeros(value.shape), decay)
         gap = held - value
@@ -161,11 +159,11 @@ class FirstOrderLag:
         return value + share * gap, through + mean_by_time
 
     def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
-        """Lagged output at nodes with derivatives, for an input linear between nodes. It starts at node 1.
+        """Lagged output at nodes with derivatives, for an input linear between nodes. The lag starts at node 1.
 
-        Of x (N, k) it is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences. Slopes
-        (N, k, d) are by all directions, first the parameters of `time_constant_sensitivity`.
-        """
+        For x (N, k) it is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences.
+        `slope` (N, k, d) is the derivative of x; its first columns are the parameters of
+        `time_constant_sensitivity`."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         followed = self._straight(value, decay, share) - lead * (rates @ value)
@@ -179,7 +177,7 @@ class FirstOrderLag:
         return followed, total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Convert a cost's gradient in lagged node values to those in input and parameters (adjoint)."""
+        """Convert a cost's gradient by lagged node values to gradients by input and parameters (adjoint)."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         by_time = self._by_time(value, self._straight(value, decay, share))
@@ -200,7 +198,7 @@ class FirstOrderLag:
         return decay, ratio * (1 - decay), decay_slope, (1 - decay - decay * inverse) / self.time_step
 
     def _by_time(self, value: Array, followed: Array) -> Array:
-        """Derivative of `lagged_node_values` by each channel's time constant, shape (N, k)."""
+        """Derivative (N, k) of `lagged_node_values` by each channel's time constant."""
         decay, _, decay_slope, share_slope = self._factors()
         driven = np.zeros_like(value)
         driven[2:] = decay_slope * (followed[1:-1] - value[1:-1]) - share_slope * (value[2:] - value[1:-1])
@@ -239,7 +237,7 @@ def _with_feedback(driven: Array, *factors: float) -> Array:
 
 
 def _filtered_both_ways(sections: Array, values: Array, pad: int) -> Array:
-    """Values (M, k) filtered forward and backward, steady before `pad` samples that go on beyond each end in mirror."""
+    """Values (M, k) filtered forward and backward, after mirror extension by `pad` samples at each end."""
     smooth = np.concatenate([2 * values[0] - values[pad:0:-1], values, 2 * values[-1] - values[-2 : -2 - pad : -1]])
     for _ in range(2):
         start, smooth = smooth[0], smooth - smooth[0]

@@ -1,4 +1,4 @@
-"""Animation data over time, measured and predicted: sticks, points, robot meshes and acting forces."""
+"""Animation data over time, measured and predicted: sticks, points, robot meshes and applied forces."""
 
 from __future__ import annotations
 
@@ -42,11 +42,10 @@ class _Stick:
 class _AnimatedMotion:
     """Motion of one stick figure, measured or predicted.
 
-    `positions` (F, K, 3) [m] are NaN where nothing is known; `point_indices` names those that a sensor sees;
-    `is_new_measurement` (F, number of points) tells those measured at that moment from those held until the next one.
-    `acting` are label, index of the place (-1: no place), unit and values (F, k) of what acts there; `arm` are system,
-    parameters and configurations (F, n) of an arm that may wear meshes.
-    """
+    `positions` (F, K, 3) [m] are NaN where unknown. `point_indices` are the points that a sensor measures;
+    `is_new_measurement` (F, number of points) separates new measurements from held ones. `acting` lists applied forces
+    as (label, point index or -1, unit, values (F, k)). `arm` holds system, parameters and configurations (F, n) for
+    meshes."""
 
     name: str
     sticks: Sequence[_Stick]
@@ -79,11 +78,10 @@ class Animation:
 
 
 def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dict[str, Any]:
-    """Convert scenes to JSON-ready data, with meshes by joint. Places are integers in 0.1 mm, null where unknown.
+    """Convert scenes to JSON-ready data, with meshes by joint. Positions are integers in 0.1 mm, null if unknown.
 
-    The arm of a scene's last model, or of its measured motion where it has no model, wears the meshes of the robot's
-    URDF. Without any that can be read there are none, and the arm is sticks.
-    """
+    The meshes of the robot's URDF are drawn on the arm of a scene's last model, or of its measured motion if the scene
+    has no model. If no mesh can be read, the arm is drawn as sticks."""
     meshes: dict[str, TriangleMesh] | None = None
     made = []
     for scene in scenes:
@@ -103,7 +101,7 @@ def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dic
 
 
 def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, TriangleMesh]:
-    """Thinned meshes of a robot by the joint that carries them, the empty name for what does not move."""
+    """Thinned meshes of a robot by the name of their joint; the empty name is the fixed base."""
     try:
         # the libraries that read meshes take a third of a second to import
         if robot is None or "<visual" not in read_input_text(resolve_urdf_path(robot)):
@@ -121,7 +119,7 @@ def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, Triang
 
 
 def _with_merged_vertices(mesh: TriangleMesh, cell: float) -> TriangleMesh:
-    """A mesh with one vertex, their mean, in place of all in a cube of edge `cell` [m], and the faces that remain."""
+    """A mesh whose vertices in each cube of edge `cell` [m] are merged to their mean, without degenerate faces."""
     cubes = np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64)
     _, index = np.unique(cubes @ np.cumprod([1, *(cubes.max(0)[:2] + 1)]), return_inverse=True)
     means = np.column_stack([np.bincount(index, x) for x in mesh.vertices.T]) / np.bincount(index)[:, None]
@@ -132,7 +130,7 @@ def _with_merged_vertices(mesh: TriangleMesh, cell: float) -> TriangleMesh:
 
 
 def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -> list[list[int]]:
-    """Place and quaternion (x, y, z, w) of joints at configurations (F, n), as integers, a row for each moment."""
+    """Position and quaternion (x, y, z, w) of joints at configurations (F, n), as integers, one row per frame."""
     if not names:
         return []
     symbols, index = ca.SX.sym("q", system.n_coordinates), system.mechanism.joint_index
@@ -150,9 +148,8 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
 class ConfigurationTrajectory:
     """Trajectory of a model, with configurations q (N, n) at times t (N,) [s].
 
-    `acting` is what a page marks: label, where it acts (a joint, segment, grasp or frame), unit, and values (N, k): a
-    vector in world axes, one size, or nothing, as for an effect.
-    """
+    `acting` lists the applied forces to draw: label, location (joint, segment, grasp or frame), unit and values (N, k).
+    Values are vectors in world axes (k = 3), scalars (k = 1) or empty, for an effect."""
 
     name: str
     system: System
@@ -162,7 +159,7 @@ class ConfigurationTrajectory:
     acting: Sequence[tuple[str, str, str, Array]] = ()
 
     def _q_at(self, t: Array) -> Array:
-        """Configurations (F, n) at other times, on straight lines between the known ones."""
+        """Configurations (F, n) at other times, by linear interpolation."""
         return np.stack([np.interp(t, self.t, column) for column in self.q.T], axis=1)
 
 
@@ -215,7 +212,7 @@ def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _Animate
 
 
 def _acting_place(system: System, location: str) -> str | int | None:
-    """Index of a joint, or name of a frame, at which a location is marked; None for one that has no place."""
+    """Index of the joint, or name of the frame, at which a location is drawn; None if it has no position."""
     if location in system.mechanism.joint_names:
         return system.mechanism.joint_index(location)
     held = {grasp.name: grasp.held_frame for grasp in system.grasps}
@@ -229,7 +226,7 @@ def _acting_place(system: System, location: str) -> str | int | None:
 
 
 def _link_radii(system: System, theta: Array) -> dict[str, float]:
-    """Radius of what each joint of the object carries [m]."""
+    """Radius of the links carried by each joint of the object [m]."""
     tree, layouts = system.mechanism, system.segment_layouts
     evaluate = ca.Function("radii", [system.parameters.symbols], [ca.vertcat(*(layout.radius for layout in layouts))])
     radii = np.array(evaluate(theta)).ravel().tolist() if layouts else []
@@ -244,7 +241,7 @@ def _link_radii(system: System, theta: Array) -> dict[str, float]:
 
 
 def _shown_frames(system: System) -> list[str]:
-    """Tips of links, points of sensors, both sides of grasps, and frames at the ends of the arms."""
+    """Tips of links, points of sensors, both sides of grasps, and the arms' end frames."""
     tree = system.mechanism
     tips = [f"{layout.name}_{i}_tip" for layout in system.segment_layouts for i in range(len(layout.link_joints))]
     sides = [frame for grasp in system.grasps for frame in (grasp.holder_frame, grasp.held_frame)]
@@ -259,8 +256,7 @@ def animation_of_trajectories(
 ) -> Animation:
     """Animate model trajectories and the recorded motion. The first trajectory sets the times and joints.
 
-    Of a recording its points are shown, and its arms where it recorded their angles; at most `_MAX_FRAMES` frames.
-    """
+    The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames."""
     t = _frame_times(told[0].t)
     motions = [_model_motion(entry, t, entry._q_at(t)) for entry in told]
     if recording is not None:
@@ -271,10 +267,9 @@ def animation_of_trajectories(
 def recording_animation(
     title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
 ) -> Animation | None:
-    """Animate a recording alone. None where it holds no positions.
+    """Animate a recording alone. None if the recording holds no positions.
 
-    With `has_straight_object` beside it the model on the recorded angles, its object and marked frames as unbent.
-    """
+    With `has_straight_object`, the model at the recorded angles is drawn too, with an undeformed object."""
     clock = max((group.t for group in recording.joint_and_point_groups), key=len)
     told = ConfigurationTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
     motion = _measured_motion(told, recording, t := _frame_times(clock))
@@ -287,7 +282,7 @@ def recording_animation(
 
 
 def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t: Array) -> Array:
-    """Configurations (F, n) at times t, with the angles that were recorded."""
+    """Configurations (F, n) at times t, with the recorded joint angles."""
     q, joints = told._q_at(t), recording.joints
     for name, column in () if joints is None else zip(joints.names, joints.position.T, strict=True):
         if name in told.system.mechanism.joint_names:
@@ -297,7 +292,7 @@ def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t
 
 
 def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Array) -> _AnimatedMotion:
-    """Recorded arms and points at times t; a point stays for half a period after it was measured."""
+    """Recorded arms and points at times t; a point is shown for half a sample period after its measurement."""
     system, joints = told.system, recording.joints
     moved = {*system.driven, *system.prescribed}
     sticks: list[_Stick] = []

@@ -1,4 +1,4 @@
-"""Summarise a diagnosis, its blind validation, and several methods or runs side by side."""
+"""Summaries of a diagnosis, of a blind validation, and of several methods or runs side by side."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
-    """Write the tables of a `yid-blind/1` result as Markdown, with an empty line between two."""
+    """Write the tables of a `yid-blind/1` result as Markdown, separated by empty lines."""
     lines: list[str] = []
     for head, *rows in (table.rows for table in _blind_tables(result)):
         lines += ["", *(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))]
@@ -137,7 +137,7 @@ def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
 
 
 def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
-    """Score, detection by size, experiments, cases, and thresholds where they were calibrated."""
+    """Score, detection by size, experiments, cases, and thresholds if they were calibrated."""
     sure = {name: _rate(own) for name, own in result["intervals"].items()}
     marks: TableRows = [
         ("what", "value, and its binomial 95 % interval"),
@@ -296,7 +296,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
-    """Sentences on errors of the methods' answers; nothing where they agree and that means something."""
+    """Sentences on errors of the methods' answers; empty if the answers agree and the agreement is meaningful."""
     methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
     free = {name: entry for name, entry in own.items() if entry["free"]}
     found = {name: entry for name, entry in free.items() if entry["verdict"] == "identifiable"}

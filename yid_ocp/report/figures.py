@@ -1,4 +1,4 @@
-"""Plotly figures of the report, over time, as curves, and with one row per name. They need the extra `report`."""
+"""Plotly figures of the report: over time, curves, and one row per name. They need the extra `report`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def figure_html(figure: Figure) -> str:
 
 
 def _styled_figure(height: int, x: str, y: str, base: Figure | None = None) -> Figure:
-    """A plotly figure (`base` or an empty one) with height [px], axis titles, and the report's colors and fonts."""
+    """A plotly figure (`base` or a new one) with height [px], axis titles, and the report's colors and fonts."""
     import plotly.graph_objects as go
 
     figure = go.Figure() if base is None else base
@@ -66,7 +66,7 @@ def _styled_figure(height: int, x: str, y: str, base: Figure | None = None) -> F
 
 
 def _add_curves(figure: Figure, curves: Iterable[tuple[str, _Curve]], later_dash: str = "solid") -> Figure:
-    """Add one line with markers for each name and (x, y), each in its own color; `later_dash` once they repeat."""
+    """Add one line with markers per name and (x, y), each in its own color; `later_dash` once colors repeat."""
     for i, (name, (x, y)) in enumerate(curves):
         line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_COLORS) else later_dash}
         if len(x):
@@ -75,7 +75,7 @@ def _add_curves(figure: Figure, curves: Iterable[tuple[str, _Curve]], later_dash
 
 
 def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
-    """Plot the cost at every accepted point, one curve per intermediate horizon."""
+    """Plot the cost of every accepted iterate, with one curve per intermediate horizon."""
     figure = _styled_figure(320, "accepted point", "cost")
     figure.update_yaxes(**_POWERS)
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
@@ -107,8 +107,7 @@ def prediction_and_residual_plots(
 ) -> tuple[TimePlotData, TimePlotData]:
     """Plot measured and predicted values, and their residual with a band of two noise stds.
 
-    All are (M,); `course` (t (K,), value (K,)) is the first of the lines at more times, for what is measured seldom.
-    """
+    All arrays have shape (M,). For sparse measurements, `course` (t (K,), value (K,)) draws the first line densely."""
     seen = np.isfinite(measured) & np.isfinite(std)
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     drawn = {name: (t, values) for name, values in lines.items()}
@@ -129,8 +128,7 @@ def time_plots_figure(
 ) -> Figure:
     """Plot measured points and lines over time, one row per plot.
 
-    `dots` is the color of what is measured, `lines` are those of the lines by name; one after the other when absent.
-    """
+    `dots` is the color of measured points. `lines` maps line names to colors (default: the palette, in order)."""
     import plotly.graph_objects as go
 
     names = dict.fromkeys(name for curve in curves for name in curve.lines)
@@ -176,7 +174,7 @@ def time_plots_figure(
 
 
 def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along_time: bool = False) -> dict[str, Any]:
-    """A shaded rectangle of a row, over its whole width, or over its whole height where it is a time interval."""
+    """A shaded rectangle of a row: over its whole height for a time interval, else over its whole width."""
     domain = (f"x{number}", f"y{number} domain") if along_time else (f"x{number} domain", f"y{number}")
     corners = {"x0": x[0], "x1": x[1], "y0": y[0], "y1": y[1]}
     return {"type": "rect", "xref": domain[0], "yref": domain[1], **corners, **_SHADE}
@@ -238,8 +236,7 @@ def rate_intervals_figure(
 ) -> Figure:
     """Plot rates between 0 and 1 with intervals. Each entry has `rate`, `low` and `high`.
 
-    A calibration has its diagonal, all others a logarithmic axis.
-    """
+    A calibration plot shows the diagonal; all others have a logarithmic x axis."""
     figure = _styled_figure(340, x, y)
     if is_calibration:
         line = {"color": MEASURED_COLOR, "dash": "dot"}
@@ -273,7 +270,7 @@ def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) ->
 def estimated_curve_figure(
     curve: tuple[Array, Array, Array], others: Mapping[str, Array], visited: tuple[float, float], x: str, y: str
 ) -> Figure:
-    """Plot a curve with two standard deviations, (x, y, std). Others are dashed, and the visited x marked."""
+    """Plot a curve (x, y, std) with a band of two stds, `others` as dashed lines, and lines at the `visited` x."""
     figure, (at, middle, std) = _styled_figure(340, x, y), curve
     edges = np.concatenate([middle + 2 * std, (middle - 2 * std)[::-1]])
     band = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False, "opacity": 0.25}
@@ -288,7 +285,7 @@ def estimated_curve_figure(
 
 
 def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
-    """At most `_MAX_CURVE_POINTS` of a curve, in single precision, which takes half the room in a page."""
+    """At most `_MAX_CURVE_POINTS` points of a curve, in single precision to halve the size in a page."""
     count = len(t)
     keep = np.unique(np.linspace(0, count - 1, min(count, _MAX_CURVE_POINTS)).astype(np.int64))
     is_late = count and np.nanmax(np.abs(t[keep])) > _MAX_SINGLE_PRECISION_TIME
@@ -301,7 +298,7 @@ def _rows_figure(height: int, names: Sequence[str], title: str) -> Figure:
 
 
 def estimates_figure(values: Mapping[str, tuple[float, float | None, float, bool]], unit: str) -> Figure:
-    """Plot estimates ± 2 std and initial values, one row per parameter. Values are (value, std, initial, found)."""
+    """Plot estimates ± 2 std and initial values, one row per parameter: (value, std, initial, whether trusted)."""
     names = list(values)
     figure = _rows_figure(110 + 34 * len(names), names, unit)
     marker = {"color": _GRID_COLOR, "size": 10, "symbol": "diamond", "line": {"color": _TEXT_COLOR, "width": 1}}
@@ -321,7 +318,7 @@ def estimates_figure(values: Mapping[str, tuple[float, float | None, float, bool
 def parameter_values_by_source_figure(
     rows: Mapping[str, Mapping[str, tuple[float, float | None]]], unit: str
 ) -> Figure:
-    """Plot values ± 2 std from several sources, one row per parameter and one color per source."""
+    """Plot values ± 2 std from several sources, with one row per parameter and one color per source."""
     sources = list(dict.fromkeys(source for row in rows.values() for source in row))
     names = list(rows)
     figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), unit, "")
@@ -342,7 +339,7 @@ def parameter_values_by_source_figure(
 
 
 def _heat_figure(figure: Figure, rows: Sequence[str], columns: Sequence[str], parts: Array, tickangle: int) -> Figure:
-    """Figure with numbers between 0 and 1 for each pair of a row's and a column's name."""
+    """Heat map of numbers between 0 and 1 for each pair of row name and column name."""
     figure.add_heatmap(
         x=list(columns), y=list(rows), z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
         colorscale=_SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
@@ -353,7 +350,7 @@ def _heat_figure(figure: Figure, rows: Sequence[str], columns: Sequence[str], pa
 
 
 def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> Figure:
-    """Plot a confusion matrix of counts, truth by row and first answer by column. Colors are shares of the row."""
+    """Plot a confusion matrix of counts, truth by row, first answer by column. Color: fraction of the row."""
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
     figure = _heat_figure(_styled_figure(200 + 24 * len(rows), "said first", "true"), rows, columns, parts, -50)
     text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]
@@ -361,7 +358,7 @@ def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts:
 
 
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> Figure:
-    """Plot a heat map of explained fractions in per cent, (n, n). The column explains the row."""
+    """Plot a heat map of explained fractions (n, n) in per cent: how much of the row the column explains."""
     figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
     text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
     hover = "%{y} explained by %{x}: %{z:.2f}<extra></extra>"
@@ -382,8 +379,7 @@ class ValueBeforeAfter:
 def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]) -> Figure:
     """Plot values before and after, one row each. Error bars are two standard deviations.
 
-    `axis` says what the numbers are, with their unit; `words` name before, after and the marks.
-    """
+    `axis` is the title of the x axis, with unit. `words` are the legends of before, after and the reference marks."""
     figure = _rows_figure(110 + 32 * len(rows), list(rows), axis)
     moved = [(name, row.before, row.after) for name, row in rows.items() if row.after is not None]
     figure.add_scatter(
@@ -417,7 +413,7 @@ def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, 
 
 @dataclass(frozen=True)
 class TimeHeatMapRow:
-    """One row of a heat map over time. Rows of one group stand together."""
+    """One row of a heat map over time. Rows of one group are adjacent."""
 
     name: str
     group: str
@@ -426,10 +422,9 @@ class TimeHeatMapRow:
 
 
 def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> Figure:
-    """Plot a heat map over intervals with edges (J + 1,) [s], one row per quantity. Grey: no information in the data.
+    """Plot a heat map over intervals with edges (J + 1,) [s], one row per quantity. Grey: no information.
 
-    `axis` says what the colors are.
-    """
+    `axis` is the title of the color scale."""
     values = np.array([row.values for row in rows])
     seen = np.abs(values[np.isfinite(values)])
     # even to the eye from one standard deviation to thousands
@@ -468,8 +463,7 @@ def candidate_ranking_figure(
 ) -> Figure:
     """Plot candidates ranked by refitted closure [%] with interval (None: unknown), and by predicted decrease.
 
-    `closed` and `promised` are the titles of the two axes.
-    """
+    `closed` and `promised` are the titles of the two axes."""
     from plotly.subplots import make_subplots
 
     done = {name: closure for name, (closure, _) in entries.items() if closure}

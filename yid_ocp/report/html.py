@@ -28,12 +28,10 @@ _NUMBER = re.compile(
 
 
 def write_report(path: Path, findings: ReportData) -> bool:
-    """Write the HTML report and return whether it was written.
+    """Write the HTML report, and return whether it was written. Raises `OutputError`.
 
-    Plotly's script is packed into it, so that it can be sent alone and needs no network; or it refers to a copy that
-    `write_shared_plotly_script` left in its folder, or up to two above. Without the extra `report` there is one notice
-    and no report. Raises `OutputError`.
-    """
+    Plotly's script is embedded, so the page works alone and offline, unless `write_shared_plotly_script` left a copy in
+    the page's folder or up to two levels above. Without the extra `report`, a warning is logged and no page written."""
     if not _installed():
         log.warning("no report: install it with  pip install 'yid-ocp[report]'")
         return False
@@ -57,7 +55,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 
 def write_shared_plotly_script(folder: Path) -> None:
-    """Write one copy of plotly's script to a folder, for pages up to two levels below. Raises `OutputError`."""
+    """Write plotly's script to a folder, shared by pages up to two levels below. Raises `OutputError`."""
     if _installed():
         name, text = _plotly_script()
         if not _is_plotly_script(folder / name):
@@ -82,14 +80,14 @@ def _shared_script(path: Path) -> str:
 
 
 def _is_plotly_script(path: Path) -> bool:
-    """Whether a file is plotly's script to the last byte: anybody may leave a file of that name beside pages."""
+    """Whether a file is byte for byte plotly's script, since any file can have this name."""
     own = _plotly_script()[1].encode()
     return path.is_file() and path.stat().st_size == len(own) and path.read_bytes() == own
 
 
 @functools.cache
 def _packed_script() -> str:
-    """Plotly's script as text that the page unpacks: a third of its size."""
+    """Plotly's script, compressed to a third of its size; the page decompresses it."""
     small = gzip.compress(_plotly_script()[1].encode(), compresslevel=4, mtime=0)
     return base64.b64encode(small).decode("ascii")
 

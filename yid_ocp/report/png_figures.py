@@ -1,4 +1,4 @@
-"""Figures written as PNG: sparsity patterns, blind validation."""
+"""Figures written as PNG: sparsity patterns and blind validation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
-    """Observed rates by nominal level in a blind validation, for coverage of effect parameters and p-values."""
+    """Observed rates by nominal level in a blind validation: coverage of effect parameters, and p-values."""
     labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
     rates = {label: result["calibration"][key] for key, label in labels.items()}
     return {label: {entry["level"]: entry for entry in own if entry["of"]} for label, own in rates.items()}
@@ -29,9 +29,8 @@ def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[st
 def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     """Write `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
 
-    Detection against size with binomial 95 % intervals, what was said of what, and whether intervals and p-values keep
-    what they promise. Raises `OutputError`.
-    """
+    They show detection over effect size with binomial 95 % intervals, first answers against truth, and observed against
+    nominal rates of intervals and p-values. Raises `OutputError`."""
     from matplotlib.figure import Figure
 
     lines = {
@@ -101,10 +100,9 @@ _MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; b
 
 
 def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern]]) -> None:
-    """Draw rows of sparsity patterns as PNG, their blocks separated and named. Raises `OutputError`.
+    """Draw rows of sparsity patterns as PNG, with separated and named blocks. Raises `OutputError`.
 
-    Patterns without rows or columns are left out.
-    """
+    Patterns without rows or columns are omitted."""
     from matplotlib.figure import Figure
 
     rows = [kept for row in layout if (kept := [entry for entry in row if entry.nonzero_mask.size])]
@@ -154,7 +152,7 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
 
 
 def _ticks(labels: Sequence[str], spans: Sequence[NamedIndexRange]) -> tuple[list[float], list[str]]:
-    """Positions of labels: all of them, or one for each owner (a tube, an arm) in a block."""
+    """Positions of labels: all labels, or one per owner (a tube, an arm) in a block."""
     if len(labels) <= _MAX_SINGLE_LABELS:
         return [float(i) for i in range(len(labels))], list(labels)
     places, names = [], []

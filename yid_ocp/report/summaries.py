@@ -1,4 +1,4 @@
-"""Summarise every command's result, by result format. Terminal and HTML report share the summaries."""
+"""Summaries of every command's result, by result format, shared by terminal and HTML report."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
-    """The 95 % interval of an estimate, value ± 1.96 std within its bounds where none is stated; empty if unknown."""
+    """The 95 % interval of an estimate, else value ± 1.96 std within its bounds; empty if unknown."""
     if entry["interval"] is not None:
         return interval_text(*entry["interval"])
     if std is None or entry["verdict"] == "not_identifiable":
@@ -108,10 +108,10 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
 
 
 def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    """Prediction error of each group of held-out channels, compared with the best guess without a model and the noise.
+    """Prediction error per group of held-out channels, compared with the best baseline without a model and the noise.
 
-    Said where the model does not explain what it was fitted to, and where noise does not explain its prediction.
-    """
+    A sentence is given if the model does not explain the fitted data, or noise does not explain the prediction
+    error."""
     groups = dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"])
     for group in groups:
         channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]
@@ -151,7 +151,7 @@ def _rms(values: Sequence[float]) -> float | None:
 
 
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Errors of each shown channel, in each recording and over three or more, with those of guesses without a model."""
+    """Errors of each shown channel per recording and over three or more recordings, with those of baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     found: dict[str, list[tuple[str, str, float, float | None, dict[str, float]]]] = {}
     errors = []
@@ -184,7 +184,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
-    """Groups of many members without their members, groups of few as their members."""
+    """Large groups as one entry, small groups as their members."""
     hidden: set[str] = set()
     for group in errors:
         members = {channel for channel in errors if channel.startswith(f"{group}.")}
@@ -387,7 +387,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _noise_words(noise: Mapping[str, Any], name: str) -> str:
-    """Noise of a recorded group, or of its channels; with the expected offset and whether it was estimated."""
+    """Noise of a recorded group, or of each of its channels, with the expected offset and whether it was estimated."""
     said = []
     for part in ("", ".effort", ".position"):
         known = noise.get(f"{name}{part}")
@@ -447,7 +447,7 @@ _INSPECTION_FILES = (
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Free parameters and those asked for: rows of a step that contain them, and changes of readings by one unit."""
+    """Equation rows that contain each free or named parameter, and changes of the readings by one unit of it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
     yield "parameter", "unit", "rows", "which", "seen", "best sensor", "read by", "from rest [std]", "recordings [std]"
@@ -466,7 +466,7 @@ def _change_in_std_text(change: float) -> str:
 
 
 def _row_names_text(names: Sequence[str]) -> str:
-    """Names of rows in one line; counted by kind where that would be too long."""
+    """Names of rows in one line, or counts by kind if the line would be too long."""
     text, kinds = names_by_pattern_text(names), [name.partition("[")[0] for name in names]
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else counts
@@ -523,7 +523,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-export/1")
 def export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise an export, with what the format cannot express and errors of the replay in MuJoCo."""
+    """Summarise an export: what the format cannot express, and the errors of the replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     changed = {
         name: entry

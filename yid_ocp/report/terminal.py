@@ -1,4 +1,4 @@
-"""Summary blocks, parts that summaries share, and their lines on a terminal. Blocks are statements, tables, code."""
+"""Blocks of a summary (statements, tables, code), text that summaries share, and its lines on a terminal."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 class SummaryStatement:
     """One sentence of a summary, with its importance.
 
-    Verdicts answer the command's question, a conclusion summarises them: a page begins with conclusions, then
-    has the verdicts.
-    """
+    A verdict answers the command's question; a conclusion summarises verdicts. A page shows conclusions first."""
 
     text: str
     kind: _StatementKind = "note"
@@ -46,7 +44,7 @@ class SummaryStatement:
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """A table of text cells whose first row is the header. Empty columns are not shown."""
+    """A table of text cells with a header in the first row. Empty columns are not shown."""
 
     rows: TableRows
     title: str = ""
@@ -75,10 +73,9 @@ SUMMARY_BY_RESULT_FORMAT: dict[str, _Summary] = {}
 def register_summary(
     result_format: str,
 ) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]], _Summary]:
-    """Register a function as summary of a result format, and make its output a list of blocks (decorator).
+    """Decorator that registers the summary of a result format. The summary returns a list of blocks.
 
-    Texts without a word and tables without a row below the header are left out.
-    """
+    Empty texts, and tables with only a header, are omitted."""
 
     def enter(make: Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]) -> _Summary:
         @functools.wraps(make)
@@ -93,12 +90,12 @@ def register_summary(
 
 
 def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:
-    """Scale factor and unit for display. Metres become millimetres, other units stay."""
+    """Scale factor and unit for display: metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, str]:
-    """Format an error's value and display unit. None gives a dash."""
+    """Format an error's value, and its display unit. None gives a dash."""
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     return ("–" if value is None else f"{factor * value:.3g}"), shown
 
@@ -109,7 +106,7 @@ def p_value_text(p_value: float) -> str:
 
 
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise issues of the recordings in a table and advice."""
+    """Summarise issues of the recordings as a table and advice."""
     doubts = result.get("doubts", ())
     rows: TableRows = [("in doubt", "where", "certainty", "times its limit")]
     advice: list[StatementTableOrCode | str] = []
@@ -130,10 +127,9 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
 def misfit_summary_blocks(
     fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
 ) -> SummaryBlockOrTextIterator:
-    """Draw conclusions on a poor fit, such as better guesses, unexplained parts, and numbers that still count.
+    """Conclusions on a poor fit: baselines that predict better, the misfit, and values that are still meaningful.
 
-    Of `parameters` those count that are known to 10 % by a standard deviation that includes the misfit.
-    """
+    Values of `parameters` are meaningful if their standard deviation, misfit included, is at most 10 %."""
     worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
@@ -162,7 +158,7 @@ def misfit_summary_blocks(
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
-    """One sentence per refined discretisation on estimates that it shifts by more than their std."""
+    """One sentence per refined discretisation, on the estimates that it shifts by more than their std."""
     said = []
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
@@ -176,7 +172,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
-    """Table rows of the torque offsets of a result, one per joint. Without offsets there is only the header."""
+    """Table rows of the torque offsets of a result, one per joint; only the header if there are none."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
     rows: TableRows = [("torque offset [N m]", *shown, "expected")]
@@ -191,13 +187,13 @@ def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
 
 
 def parameter_bounds_text(entry: Mapping[str, Any], digits: int) -> str:
-    """Format the bounds of a parameter. Missing ones are `-inf` and `inf`."""
+    """Format the bounds of a parameter. Missing bounds are `-inf` and `inf`."""
     ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
     return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
 
 
 def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
-    """Format summary blocks as text lines, with aligned tables, wrapped sentences and notes."""
+    """Format summary blocks as text lines, with aligned tables and wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:
         if isinstance(block, SummaryTable):
@@ -248,7 +244,7 @@ def _note_lines(notes: Sequence[str]) -> list[str]:
 
 
 def aligned_table_lines(rows: TableRows) -> list[str]:
-    """Format a table with aligned columns, header first. Columns without an entry below it are left out."""
+    """Format a table with aligned columns. The first row is the header; columns without other entries are omitted."""
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in columns]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]
@@ -256,10 +252,9 @@ def aligned_table_lines(rows: TableRows) -> list[str]:
 
 
 def names_by_pattern_text(names: Sequence[str]) -> str:
-    """Join names in one line. Three or more consecutive ones are merged, as in `joint_coulomb@joint1..7`.
+    """Join names in one line. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
 
-    Of a long line only the beginning, and how many names are left.
-    """
+    A long line is cut, with the number of omitted names."""
     parts = [re.split(r"(\d+)", name) for name in names]
     taken: set[int] = set()
     said, left = list[str](), 0

@@ -1,4 +1,4 @@
-"""Interface of all sensors, with recorded channels, symbolic readings, and measurements from a recording."""
+"""Interface of all sensors: recorded channels, symbolic readings, and measurements from a recording."""
 
 from __future__ import annotations
 
@@ -83,10 +83,9 @@ class SensorOptions:
 
 @dataclass(frozen=True)
 class ChannelSpecification:
-    """One kind of recorded quantity, with its group, dataset, unit, components and sensor constants.
+    """One kind of recorded quantity: its group, dataset, unit, components and sensor constants.
 
-    The noise stands in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`, of points in the dataset `std`.
-    """
+    Noise levels are the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`; for points, the dataset `std`."""
 
     group: str  # of the recording; there may be several, `GROUP` and `GROUP_NAME`, each with its own clock
     quantity: str  # dataset of the group, with one column for every name of the group
@@ -110,7 +109,7 @@ CHANNEL_KINDS: Registry[ChannelSpecification] = Registry("recorded channel")
 
 
 def channel_kinds_for_group_name(group: str) -> tuple[ChannelSpecification, ...]:
-    """Channel kinds registered for a recording's group of this name. Joints and points have none."""
+    """Channel kinds registered for a recording's group of this name; empty for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
 
@@ -125,7 +124,7 @@ class _RecordedGroup(Protocol):
 
 
 class RecordedPointGroup(_RecordedGroup, Protocol):
-    """Interface of a recorded point group with times and positions. `data.recording.PointGroup` implements it."""
+    """Interface of a recorded point group, with times and positions; implemented by `data.recording.PointGroup`."""
 
     @property
     def sensor(self) -> str: ...
@@ -138,7 +137,7 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
 
 
 class RecordedJointGroup(Protocol):
-    """Interface of recorded joints with names, times and channels. `data.recording.JointGroup` implements it."""
+    """Interface of recorded joints, with names, times and channels; implemented by `data.recording.JointGroup`."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -161,7 +160,7 @@ class RecordedJointGroup(Protocol):
 
 
 class RecordedChannelGroup(_RecordedGroup, Protocol):
-    """Interface of an additional sensor's recorded channels. `data.recording.SensorChannelGroup` implements it."""
+    """Interface of an additional sensor's recorded channels; implemented by `data.recording.SensorChannelGroup`."""
 
     @property
     def values_by_quantity(self) -> Mapping[str, Array]: ...
@@ -170,7 +169,7 @@ class RecordedChannelGroup(_RecordedGroup, Protocol):
 
 
 class _RecordingData(Protocol):
-    """A recording as sensors need it, as in `data.recording.Recording`."""
+    """Interface of a recording for sensors; implemented by `data.recording.Recording`."""
 
     @property
     def name(self) -> str: ...
@@ -183,7 +182,7 @@ class _RecordingData(Protocol):
 
 
 def recorded_joint_column_indices(joints: RecordedJointGroup, names: tuple[str, ...], where: str) -> list[int]:
-    """Column indices of the named joints in the recorded arrays. `DataError` for a joint that is not recorded."""
+    """Column indices of the named joints in the recorded arrays. Raises `DataError` if one is not recorded."""
     for name in names:
         if name not in joints.names:
             what, hint = f"joint '{name}' of the model is not recorded", nearest_name_hint(name, joints.names)
@@ -194,7 +193,7 @@ def recorded_joint_column_indices(joints: RecordedJointGroup, names: tuple[str, 
 def expand_to_joint_values(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
-    """Expand a single value, one per recorded joint or a mapping by joint to one value per joint in `names`."""
+    """One value per joint in `names`, from a single value, one value per recorded joint, or a mapping by joint."""
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
@@ -207,8 +206,7 @@ def expand_to_joint_values(
 class Sensor(ABC):
     """Base class of sensors. A sensor predicts a group of measured channels with a common clock; it is hashable.
 
-    Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
-    """
+    Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each)."""
 
     channel: ClassVar[ChannelSpecification]  # kind of its recorded channels
     group_name: str  # key of its settings: a group of points, such as `points_camera`, or `joints.effort`
@@ -225,7 +223,7 @@ class Sensor(ABC):
 
     @property
     def outputs_per_channel(self) -> int:
-        """Number of outputs of each channel, 3 for a point and 1 for a joint."""
+        """Number of outputs of each channel, such as 3 for a point and 1 for a joint."""
         return max(len(self.channel.components), 1)
 
     @property
@@ -235,24 +233,24 @@ class Sensor(ABC):
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """Name of each scalar output. With several components, the component's name follows the channel's."""
+        """Name of each scalar output: the channel, followed by the component if there are several."""
         parts = [f".{part}" for part in self.channel.components] or [""]
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
     def output_frame_names(self) -> tuple[str, ...]:
-        """Name of the frame at which each output is measured. Joints have an empty string."""
+        """Name of the frame at which each output is measured; empty for joints."""
         frames = self.frame_names or ("",) * len(self.channel_names)
         return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """Names of the joints whose effort the sensor reads, filtered like the prescribed path."""
+        """Names of the joints whose effort the sensor reads; efforts are filtered like the prescribed path."""
         return ()
 
     @property
     def effort_per_unit_reading(self) -> Array:
-        """Joint effort per unit of each output, shape (len(effort_joints),) [N m per unit]."""
+        """Joint effort per unit of each output, (len(effort_joints),) [N m per unit]."""
         return np.ones(len(self.effort_joints))
 
     @property
@@ -262,16 +260,15 @@ class Sensor(ABC):
 
     @abstractmethod
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        """Symbolic error-free reading at a node, shape (outputs_per_channel * len(channel_names), 1)."""
+        """Symbolic error-free reading at a node, (outputs_per_channel * len(channel_names), 1)."""
 
 
 def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
     """Build a CasADi function of a sensor's readings with effects, and of their derivatives.
 
-    It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in
-    `NodeState`, the last one by the parameters `names`; v, a and lam by the recorded clock. Slopes by these have no
-    columns where nothing reads them.
-    """
+    It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), with the
+    symbols of `NodeState`. dy/dtheta has one column per parameter in `names`. v, a and lam refer to the recorded clock;
+    their derivatives have no columns if the readings do not depend on them."""
     rows = {name: i for i, name in enumerate(system.effect_internal_coordinate_symbols)}
     n = system.n_coordinates
     sizes = {"q": n, "v": n, "a": n, "z": len(rows), "load": n, "lam": system.n_constraints}
@@ -312,11 +309,10 @@ class _SmoothingFilter(Protocol):
 
 @dataclass(frozen=True)
 class SensorDataInputs:
-    """System, recording, options, nodes and filters from which a sensor's measurements are read.
+    """System, recording, options, nodes and filters from which a sensor's measurements are computed.
 
-    `joint_mass_matrices` maps joint names and some of their configurations, shape (K, k), to their part of the mass
-    matrix in each of them, shape (K, k, k) [kg m^2 or kg].
-    """
+    `joint_mass_matrices` maps k joint names and K configurations of these joints (K, k) to the joints' blocks (K, k, k)
+    of the mass matrix [kg m^2 or kg]."""
 
     system: System
     recording: _RecordingData

@@ -1,4 +1,4 @@
-"""Sensors of the robot's joints, with encoders of driven joints and efforts of prescribed joints."""
+"""Sensors of the robot's joints: encoders of driven joints and efforts of prescribed joints."""
 
 from __future__ import annotations
 
@@ -83,13 +83,13 @@ class EffortSensor(JointSensor):
 
 
 def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
-    """Whether a point group was measured by the arm itself, usually by its encoders and forward kinematics."""
+    """Whether the arm itself measured a point group, usually by its encoders and forward kinematics."""
     return "arm" in (group.sensor, group.name.rpartition("_")[2])
 
 
 @SENSOR_READERS.register(JOINT_POSITION_GROUP_NAME)
 def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
-    """Measurements of driven joints' angles without the first sample, which defines the initial configuration."""
+    """Measured angles of driven joints, without the first sample, which defines the initial configuration."""
     joints, choice, system = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME), around.system
     names = system.driven if joints is not None else ()
     arm = [group.name for group in around.recording.points if is_point_group_measured_by_arm(group)]
@@ -110,7 +110,7 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
 
 @SENSOR_READERS.register(JOINT_EFFORT_GROUP_NAME)
 def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
-    """Measurements of prescribed joints' efforts, low-pass filtered and thinned out to independent samples."""
+    """Measured efforts of prescribed joints, low-pass filtered and thinned to independent samples."""
     joints, choice = around.recording.joints, around.sensor_usage(JOINT_EFFORT_GROUP_NAME)
     if joints is None or joints.effort is None or choice.use is False:
         return []
@@ -141,10 +141,9 @@ def smoothed_effort_data(
 ) -> SensorData:
     """Low-pass filter an effort sensor's measurements and thin them until their noise is nearly independent.
 
-    `values`, shape (M, k), are in the sensor's unit, `std` and `bias`, shape (k,), those of their white noise and of an
-    error that is constant in the recording; `is_sample` says whether a value is that at its time, not of the interval
-    until the next. `DataError` of a recording too short for the filter.
-    """
+    `values` (M, k) are in the sensor's unit. `std` (k,) is that of their white noise, `bias` (k,) that of a constant
+    error. With `is_sample`, a value belongs to its time, otherwise it is the mean of the interval until the next value.
+    Raises `DataError` if the recording is too short for the filter."""
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
     # the mean of an interval belongs to its middle
     late = 0.0 if is_sample else 0.5 * period
@@ -160,11 +159,11 @@ def smoothed_effort_data(
 def nodes_and_decorrelated_values(
     around: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
 ) -> tuple[IntArray, Array]:
-    """Low-pass filter values (K, k) at nodes (K,) so far apart that noise is nearly independent.
+    """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
 
-    `values` (M, k) belong to the times `t` + `late` [s] and are called `noun` in a `DataError` of a recording too short
-    for the filter: that of efforts, whose prediction is smoothed again, or the one of the path.
-    """
+    `values` (M, k) belong to the times `t` + `late` [s]. The filter is that of the path (`like_path`) or of efforts,
+    whose prediction is smoothed again. Raises `DataError`, with the name `noun`, if the recording is too short for the
+    filter."""
     low_pass = around.path_filter if like_path else around.effort_filter
     times, smooth = around.node_times, low_pass(t, values)
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
@@ -185,17 +184,16 @@ def nodes_and_decorrelated_values(
 
 
 def is_noise_std_stated(joints: RecordedJointGroup, group: str, choice: SensorOptions) -> bool:
-    """Whether the recording or the settings specify the noise of `group`, `joints.effort` or `joints.position`.
+    """Whether recording or settings specify the noise of `group` (`joints.effort` or `joints.position`).
 
-    The step of the encoders, where the recording states it, is a statement of their noise.
-    """
+    A recorded encoder resolution also specifies the noise of joint positions."""
     names = [CHANNEL_KINDS[group].std_attribute_names[0]]
     names += ["position_resolution"] if group == JOINT_POSITION_GROUP_NAME else []
     return choice.std is not None or any(getattr(joints, name) is not None for name in names)
 
 
 def quantization_step(values: Array) -> float:
-    """Estimate a channel's quantization step from the gaps between sorted values. Zero if not quantized."""
+    """Estimate a channel's quantization step from the gaps between sorted values. Zero if it is not quantized."""
     levels = np.unique(values)
     apart = np.diff(levels)
     step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
@@ -248,7 +246,7 @@ def joint_torque_bias_std(joints: RecordedJointGroup, names: Sequence[str], choi
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """Noise of channels (N, k) from high-order differences, (k,); all that is as fast as the sampling counts."""
+    """Noise (k,) of channels (N, k) from high-order differences; any change as fast as the sampling counts as noise."""
     order = NOISE_DIFFERENCE_ORDER
     if len(values) <= order:
         what, allowed = f"{len(values)} samples are too few to see the noise of {group}", f"more than {order}"
@@ -260,14 +258,11 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
 def _smoothed_effort_noise(
     around: SensorDataInputs, names: tuple[str, ...], std: Array, period: float, times: Array
 ) -> tuple[Array, Array | None]:
-    """Noise of filtered efforts at some times, from the effort sensors and from accelerations of noisy encoders.
+    """Noise std (M, k) and correlation (M, k, k) of filtered efforts at `times` (M,).
 
-    An acceleration that is wrong at one joint asks for a torque at every joint whose inertia is coupled with it, so
-    that their errors are correlated: with M the mass matrix, the covariance is diag(s^2) + M diag(a^2) M.
-
-    Returns the standard deviation, shape (M, k), and the correlation, shape (M, k, k), None where the encoders' noise
-    is not stated.
-    """
+    An error of the acceleration of one joint, from encoder noise, changes the torques of all inertially coupled joints.
+    With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. The correlation is None if encoder noise is
+    unknown."""
     value_gain, _, second_gain = around.effort_filter.noise_gains_of_value_and_rates(period)
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None

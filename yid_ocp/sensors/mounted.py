@@ -1,4 +1,4 @@
-"""Common base of sensors mounted on a link's frame, which read vectors along its axes, and inertial units."""
+"""Base of sensors that are mounted on a link's frame and read vectors along its axes, and inertial units."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _Kind = TypeVar("_Kind", bound="MountedSensor")
 
 @dataclass(frozen=True)
 class MountedSensor(Sensor):
-    """Base class of sensors mounted on frames. Each has three components along its frame's axes."""
+    """Base class of sensors mounted on frames. Each sensor has three components along its frame's axes."""
 
     naive_prediction: ClassVar = "stays"
     has_paper_weight = False
@@ -53,7 +53,7 @@ class MountedSensor(Sensor):
 
 
 def register_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
-    """Register the reader of a kind of mounted sensor. It makes one `SensorData` per recorded group."""
+    """Register the reader of a kind of mounted sensor, which makes one `SensorData` per recorded group."""
     SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
     return kind
 
@@ -117,9 +117,8 @@ def _with_encoder_noise(
 ) -> tuple[Array, Array | None]:
     """Noise std (M, k) and correlation (M, k, k) of smoothed readings that are predicted from noisy encoders.
 
-    The path of prescribed joints is smoothed, and so are the errors of its angles, rates and accelerations, to which
-    the reading responds with its slopes in the recorded posture, at rest. Other coordinates are taken at zero.
-    """
+    The smoothed path of prescribed joints has errors of angles, velocities and accelerations. The readings respond to
+    them linearly at the recorded joint angles, at standstill, with all other coordinates at zero."""
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     known = None if joints is None else encoders.std if encoders.std is not None else joints.position_std
     names = () if joints is None else tuple(name for name in around.system.prescribed if name in joints.names)
@@ -161,7 +160,7 @@ _SPECIFIC_FORCE = CHANNEL_KINDS.register("imu.specific_force")(
 
 @register_mounted_sensor
 class _Gyroscope(MountedSensor):
-    """Angular velocity of a frame against the world."""
+    """Angular velocity of a frame relative to the world."""
 
     channel = _ANGULAR_VELOCITY
 

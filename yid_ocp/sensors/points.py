@@ -95,7 +95,7 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
 def _clock_offset_std(
     around: SensorDataInputs, sensor: PointSensor, group: RecordedPointGroup, choice: SensorOptions
 ) -> float:
-    """Standard deviation of the clock's offset [s]; zero where an effect of the model makes the group late."""
+    """Standard deviation of the clock's offset [s]; zero if an effect of the model delays the group."""
     if choice.clock_std is not None:
         return choice.clock_std
     seen = [(channel, sensor.camera_pose is not None) for channel in sensor.channel_names]
@@ -107,7 +107,7 @@ def _clock_offset_std(
 
 
 def _rates(t: Array, values: Array) -> Array:
-    """Rates of change (M, k) of outputs, by central differences of what was measured; zero where nothing was."""
+    """Rates of change (M, k) of outputs, by central differences of the measurements; zero if not measured."""
     rates = np.zeros(values.shape)
     for column, rate in zip(values.T, rates.T, strict=True):
         if np.count_nonzero(seen := np.isfinite(column)) > 1:
@@ -116,11 +116,9 @@ def _rates(t: Array, values: Array) -> Array:
 
 
 def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
-    """Pose of the camera that measured a point group, shape (4, 4). None if no camera measured it.
+    """Pose (4, 4) of the camera that measured a point group. None if no camera measured it.
 
-    A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera
-    then counts as standing in the world's origin.
-    """
+    A camera's group has a pose, or `camera` in its name or sensor. Without a pose the camera is at the world origin."""
     if group.pose is not None:
         return tuple(tuple(float(x) for x in row) for row in group.pose)
     if "camera" in group.name.lower() or "camera" in group.sensor.lower():

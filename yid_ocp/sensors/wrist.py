@@ -1,12 +1,11 @@
-"""Wrist force/torque sensors. They read the wrench that bodies and grasps beyond a frame exert there.
+"""Wrist force/torque sensors, which read the wrench that bodies and grasps beyond their frame exert on them.
 
-The model is cut at the frame, and what is beyond hangs on six locked joints there: three that slide along the frame's
-axes, three that turn about them. What these joints must hold, by the Euler-Lagrange equations of the cut model,
+The model is cut at the frame. The part beyond hangs on six locked joints, three along and three about the frame's axes.
+By the Euler-Lagrange equations of the cut model, the efforts of these joints are
 
-    d/dt dL/dv - dL/dq - F + Dphi(q)' lam,
+    d/dt dL/dv - dL/dq - F + Dphi(q)' lam.
 
-is the force and the torque that the sensor exerts on what is beyond it. The reading is the opposite.
-"""
+They are the force and torque of the sensor on the part beyond. The reading has the opposite sign."""
 
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ class _WristTorqueSensor(MountedSensor):
 
 
 def _wrench_on_sensor(state: NodeState, frame: str) -> ca.SX:
-    """Force and torque that what is beyond a frame exerts on a sensor there, along the frame's axes, shape (6, 1)."""
+    """Force and torque (6, 1), along the frame's axes, that the part beyond a frame exerts on a sensor there."""
     system, first = _cut_at_frame(state.system, frame)
     locked, n = slice(first, first + _N_LOCKED_JOINTS), system.n_coordinates
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
@@ -74,7 +73,7 @@ def _wrench_on_sensor(state: NodeState, frame: str) -> ca.SX:
 
 
 def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
-    """The system with all that is beyond a frame on six locked joints there, and the index of the first of them."""
+    """The system with the part beyond a frame on six locked joints, and the index of the first of these joints."""
     tree = system.mechanism
     frame = tree.frame(name)
     before, first = frame.joint_index, frame.joint_index + 1

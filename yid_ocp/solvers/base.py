@@ -60,7 +60,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class Iterate:
-    """One accepted iterate of a solver, with cost, gradient norm, evaluations and seconds since the start."""
+    """One accepted iterate of a solver: cost, gradient norm, evaluations and seconds since the start."""
 
     iteration: int
     cost: float
@@ -77,18 +77,18 @@ EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
 
 @dataclass(frozen=True)
 class EstimateChecks:
-    """Checks of an estimate beyond its fit, by finer discretisations, held-out recordings and step stability.
+    """Checks of an estimate beyond its fit: finer discretisations, held-out recordings and step stability.
 
     Attributes
     ----------
     data_std : mapping of str to float
-        Standard deviation of every free parameter without the discretisation's error.
+        Standard deviation of every free parameter, without discretisation error.
     discretisation_shifts : mapping of str to EstimateShiftByLinksAndTimeStep
-        Shift of every free parameter in a finer model, for those that were tried.
+        Shift of every free parameter in each finer model that was tried.
     notes, uncounted_errors : tuple of str
-        Why a shift is not known; discretisations whose error the standard deviations leave out.
+        Why a shift is unknown; discretisations whose error the standard deviations do not include.
     expected_prediction_errors : mapping of recording to mapping of channel to float
-        Root mean square error of each held-out prediction that noise of sensors and torques makes, in its unit.
+        Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
     step_stability : mapping
         Growth of alternating errors at the `start` of the search and at the `estimate`.
     """
@@ -111,29 +111,29 @@ class Solution(ReprMixin):
     Attributes
     ----------
     message : str
-        Why it ended, and what to try where it did not converge.
+        Why the search ended, and what to try if it did not converge.
     x : ndarray, shape (nx,)
         The unknown vector of lowest cost, in the order of `unknown_names`: parameters in their own units, initial
         coordinates [rad or m], initial momenta [N m s or N s].
     covariance : ndarray, shape (nx, nx)
-        In products of the units of `x`. From the data and stated priors (the weak prior excluded), scaled by
-        chi2 per degree of freedom above one, and counting the misfit where the model does not explain the data
+        Covariance of `x` from the data and stated priors, without the weak prior. It is scaled by chi2 per degree of
+        freedom above one. If the model does not explain the data, it includes the misfit
         (`uncertainty.misfit_robust_covariance`).
     parameters : dict of str to ParameterEstimate
-        Free parameters shared by all recordings, and the fixed ones that the problem's model has.
-        Value, std, bounds and interval are in the estimate's `unit`.
+        Free parameters shared by all recordings, and the fixed parameters of the model. Value, std, bounds and interval
+        are in the estimate's `unit`.
     cost : float
         Half the sum of squared whitened residuals and priors [1].
     history : tuple of Iterate
-        Cost [1], unknowns (nx,) and seconds [s] of every accepted point.
+        Cost [1], unknowns (nx,) and seconds [s] of every accepted iterate.
     wall_time : float
-        [s]
+        Duration of the search [s].
     evaluation : Evaluation or None
-        At `x`.
+        Evaluation at `x`.
     problem : EstimationProblem, optional
-        Problem as solved, whitened at `x`.
+        The problem, whitened at `x`.
     checks : EstimateChecks, optional
-        Where made (`yid_ocp.solve`): without them standard deviations count the data and the misfit alone.
+        Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only.
     """
 
     status: Status
@@ -191,7 +191,7 @@ class Solution(ReprMixin):
         return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
-        """Measured and predicted samples of all recorded channels at the estimate. Empty if not evaluated."""
+        """Measured and predicted samples of all recorded channels at the estimate. Empty if it was not evaluated."""
         pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
         known = [(episode, result) for episode, result in pairs if not isinstance(result, str)]
         return tuple(sample for pair in known for sample in channel_predictions(*pair))
@@ -199,9 +199,8 @@ class Solution(ReprMixin):
     def to_dataframe(self) -> pandas.DataFrame:
         """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
-        `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known. Raises
-        `ConfigError` where pandas is not installed.
-        """
+        `lower` and `upper` are the 95 % interval, infinite at an open or unknown end. Raises `ConfigError` if pandas is
+        not installed."""
         try:
             pandas = importlib.import_module("pandas")
         except ImportError as error:
@@ -216,12 +215,12 @@ IterationCallback = Callable[[Iterate], None]
 
 
 class StopSearch(Exception):  # noqa: N818
-    """Raised by a callback to end a search at its last iterate. Its text is the solution's message."""
+    """Raised by a callback to end a search at its last iterate. Its text is the message of the solution."""
 
 
 @dataclass(frozen=True)
 class SolverResult:
-    """Raw result of a solver. It holds status, best unknown vector, history and equilibria there (None if unknown)."""
+    """Raw result of a solver: status, best unknown vector, history, and equilibria there (None if unknown)."""
 
     status: Status
     message: str
@@ -238,10 +237,9 @@ class SolverResult:
 class Solver(Protocol):
     """Interface of a solver. A solver is a frozen dataclass of settings, registered under its name.
 
-    It may say besides whether it needs a rollout from its start (`needs_rollout`, True), whether it can whiten
-    residuals by process noise (`uses_process_noise_covariance`, False) or has the errors of torques as unknowns
-    (`estimates_torque_errors`, False).
-    """
+    Optional class attributes, with their defaults: `needs_rollout` (True), whether the rollout must succeed at the
+    start; `uses_process_noise_covariance` (False), whether it can whiten residuals by process noise;
+    `estimates_torque_errors` (False), whether torque errors are unknowns."""
 
     @property
     def name(self) -> str:
@@ -256,7 +254,7 @@ class Solver(Protocol):
 
 
 class SolverWithCheckedSettings:
-    """Base of the package's own solvers. It checks settings against their annotated bounds."""
+    """Base of the package's own solvers, which checks settings against their annotated bounds."""
 
     name: ClassVar[str]
 
@@ -326,30 +324,29 @@ def solve(
 ) -> Solution:
     """Fit an estimation problem and return estimates with uncertainties and verdicts.
 
-    `yid_ocp.solve` (`analysis.estimation`) adds the discretisation's error and checks of the fit. Free effects
-    begin off their neutral value (`unknowns_with_neutral_effects_activated`) without a start. Where the rollout
-    fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only,
-    and then over longer and longer horizons. A poor fit is started again from other initial values. Where noise
-    drives the motion, methods that can weigh residuals by it do so in several passes, its covariance frozen in each
-    (`problem_whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
+    `yid_ocp.solve` (`analysis.estimation`) adds the discretisation error and checks of the fit. Without
+    `initial_unknowns`, free effects start off neutral (`unknowns_with_neutral_effects_activated`). If the rollout fails
+    at the start (a soft object snaps, an arm falls), the problem is first solved over a short horizon, which then
+    grows. With process noise, methods that can whiten by it run in several passes, each with a fixed covariance
+    (`problem_whitened_at`). The result of a method with torque errors as unknowns is judged in the same way.
 
     Parameters
     ----------
     solver : Solver, optional
-        `GaussNewton()` when absent.
+        Default: `GaussNewton()`.
     initial_unknowns : sequence of float, optional
-        The problem's when absent.
+        Default: the initial unknowns of the problem.
     callback : callable, optional
-        Receives every `Iterate`; it may raise `StopSearch`.
+        Receives every `Iterate`; it can raise `StopSearch`.
     limits : ExcessResidualCriteria
         Criteria for a residual that exceeds noise.
     restarts : bool
-        Whether a poor fit is started again from other initial values.
+        Whether a poor fit is repeated from other initial values.
 
     Returns
     -------
     Solution
-        Non-convergence raises nothing: see its status and message.
+        Its status and message report non-convergence, which raises no error.
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
@@ -365,7 +362,7 @@ def solve(
 
 @dataclass(frozen=True)
 class _Fit:
-    """End of one run of a solver from one start, evaluated, and the problem as it was weighted."""
+    """Evaluated end of one run of a solver from one start, and the problem with its whitening."""
 
     result: SolverResult
     evaluation: Evaluation
@@ -375,7 +372,7 @@ class _Fit:
 
 
 class _MultiStartSearch:
-    """Fits from several starts, of which the best is kept."""
+    """Fits from several starts; the best fit is kept."""
 
     def __init__(
         self, problem: EstimationProblem, solver: Solver, callback: IterationCallback | None, start: Array
@@ -389,7 +386,7 @@ class _MultiStartSearch:
         return min(self._fits, key=lambda fit: fit.evaluation.cost)
 
     def restart(self, first: Array, limits: ExcessResidualCriteria) -> None:
-        """Try other starts as far as the best fit so far gives reason to."""
+        """Try other starts, as far as the best fit so far suggests them."""
         noisy, most = self._problem.has_process_noise, 1 + len(INITIAL_VALUE_RESTART_FACTORS)
         for factor in INITIAL_VALUE_RESTART_FACTORS:
             if _good_fit(self._problem, self._best.evaluation):
@@ -485,7 +482,7 @@ def _minimize_cost(
 def _fit_from(
     problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None, known: Sequence[_Fit] = ()
 ) -> _Fit:
-    """The fit of one start, by shorter horizons where the rollout fails there."""
+    """The fit from one start, with shorter horizons first if the rollout fails there."""
     history: list[Iterate] = []
     evaluations, first = 0, problem.evaluate(x, False) if getattr(solver, "needs_rollout", True) else None
     warm = first.equilibrium_guesses or None if first is not None and first.ok else None
@@ -529,13 +526,13 @@ def _fit_from(
 
 
 def _is_at(fit: _Fit, x: Array) -> bool:
-    """Whether a point differs from a fit by d with |J d| next to nothing; no |d_i| / std_i is larger than that."""
+    """Whether a point differs from a fit by d with negligible |J d|, which bounds all |d_i| / std_i."""
     slopes = fit.evaluation.jacobian if fit.evaluation.ok else None
     return slopes is not None and float(np.linalg.norm(slopes @ (x - fit.result.x))) < _SAME_FIT_STDS
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:
-    """Positive unknowns that the data inform, but loosely, and those that have all but vanished."""
+    """Positive unknowns that the data inform poorly, and those that have nearly vanished."""
     x = fit.result.x
     if not fit.evaluation.ok or fit.evaluation.jacobian is None:
         return np.zeros(len(x), bool)
@@ -545,7 +542,7 @@ def _doubtful(fit: _Fit, first: Array) -> BoolArray:
 
 
 def _other_minima(fit: _Fit) -> list[Array]:
-    """Starts from which a loosely known unknown may go to another value than the one found, the likeliest first."""
+    """Starts from which a poorly known unknown may reach another minimum, the most likely start first."""
     problem, finish, x = fit.weighted, fit.evaluation, fit.result.x
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []
@@ -578,13 +575,13 @@ def _accounts_for_process_noise(solver: Solver) -> bool:
 
 
 def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
-    """Whether a fit needs no other start: good, or with a cost that says nothing of noise."""
+    """Whether a fit needs no other start: it is good, or its cost has no noise level."""
     if problem.options.weighting == "paper" or not finish.ok:
         return finish.ok
     return unknowns_covariance_and_reduced_chi2(problem, finish)[1] < _POOR_CHI2_PER_DOF
 
 
 def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
-    """Infinity norm of the scaled gradient, without components that push against a bound."""
+    """Infinity norm of the scaled gradient, without components that push against an active bound."""
     free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))

@@ -46,12 +46,11 @@ _LOWEST = "the cost cannot be lowered any further"
 class GaussNewton(SolverWithCheckedSettings):
     """Gauss-Newton method with bounded, damped linear least-squares steps on the cost 1/2 |r(x)|^2.
 
-    Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
-    falls by a fair part of what the linear model promised (Nocedal and Wright 2006, Numerical Optimization, chapter 10,
-    doi:10.1007/978-0-387-40065-5). A short step, or one that damping keeps from promising anything, is no end
-    (`is_stationary_point`). Many steps that gain nothing beside the noise are an end: where the cost is rough
-    (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
-    """
+    Each iteration solves min |J d + r|^2 + mu |d/s|^2 subject to lower <= x + d <= upper. It accepts d if the cost
+    falls by a sufficient part of the predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10,
+    doi:10.1007/978-0-387-40065-5). A short step, or a damped step with a small predicted decrease, does not end the
+    search; only `is_stationary_point` does. The search also ends after many steps with a decrease that is small against
+    the noise. This happens if the cost is not smooth (friction that changes sign, fast waves over many seconds)."""
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
     step_tolerance: Annotated[
@@ -75,7 +74,7 @@ class GaussNewton(SolverWithCheckedSettings):
         callback: IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the cost from `start` by Gauss-Newton steps. `evaluate` may replace `problem.evaluate`."""
+        """Minimize the cost from `start` by Gauss-Newton steps. `evaluate` replaces `problem.evaluate`."""
         evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
         recorder, x = AcceptedIterateRecorder(callback), start.copy()
@@ -134,7 +133,7 @@ class GaussNewton(SolverWithCheckedSettings):
 
 
 def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluation) -> float | None:
-    """What the last steps saved of the cost together, if that is worth nothing; else None."""
+    """Decrease of the cost over the last steps together if it is negligible, else None."""
     if len(history) <= _PATIENCE_STEPS:
         return None
     before, last = history[-1 - _PATIENCE_STEPS], history[-1]
@@ -204,12 +203,12 @@ class SingleShooting(SolverWithCheckedSettings):
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
 class SteepestDescent(SolverWithCheckedSettings):
-    """Projected steepest descent with Armijo backtracking. The iterates are x <- P(x - s g), P projects on the bounds.
+    """Projected steepest descent with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
 
-    The gradient comes from the adjoint. Unscaled on purpose, as in the paper. The first length tried in an
-    iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's from the change of the gradient
-    (`spectral`), which needs far fewer iterations; most of these pay only a few steps later and want a
-    `nonmonotone_memory` of about 10.
+    The gradient comes from the adjoint and is not scaled, as in the paper (Caldwell et al. 2014). The first trial step
+    s of an iteration is twice the last accepted one (`last`, as in the paper), or the Barzilai-Borwein step
+    (`spectral`). The latter needs far fewer iterations and a `nonmonotone_memory` of about 10, because its steps often
+    pay off later.
 
     References
     ----------

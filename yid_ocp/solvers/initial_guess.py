@@ -39,7 +39,7 @@ _EQUILIBRIUM_SPACING = 0.1
 
 @dataclass(frozen=True)
 class UnknownsAndNodeStateGuess:
-    """Guess of the unknowns, with each recording's initial state, node states and constraint multipliers."""
+    """Guess of the unknowns, and each recording's initial state, node states and constraint multipliers."""
 
     x: Array
     initial_states: tuple[InitialStateWithSensitivity, ...]
@@ -50,12 +50,11 @@ class UnknownsAndNodeStateGuess:
 def guess_unknowns_and_node_states(
     problem: EstimationProblem, nodes: Sequence[IntArray], x: Array, misfit: _MisfitFunction
 ) -> UnknownsAndNodeStateGuess:
-    """Guess unknowns and node states near a solution, from `x` or, if that fits poorly, from multiples of `x`.
+    """Guess unknowns and node states near a solution, from `x` or, if it fits poorly, from multiples of `x`.
 
-    A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
-    from what was measured, every node (`nodes`, (K + 1,) of every recording) at rest at the posture that the arms had
-    then, which has defects but follows the data.
-    """
+    The states of a recording come from a rollout with the tracking filter; they have no defects. If the rollout fails
+    or deviates from the measurements, each node in `nodes` (K + 1,) instead gets the equilibrium at the arms' measured
+    posture. This guess has defects but follows the data."""
     lower, upper = problem.bounds
     best: tuple[float, UnknownsAndNodeStateGuess] | None = None
     for factor in _PARAMETER_FACTORS:
@@ -85,7 +84,7 @@ def guess_unknowns_and_node_states(
 
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
-    """Mean square whitened residual of a trajectory without effort channels. It is (N + 1, nx) of recording `i`."""
+    """Mean square whitened residual, without effort channels, of a trajectory (N + 1, nx) of recording `i`."""
     shared, _ = problem.theta_and_initial_state_deviation(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
@@ -100,7 +99,7 @@ def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, tra
 def _tracked(
     problem: EstimationProblem, episode: Episode, nodes: IntArray, theta: Array, start: Array
 ) -> list[tuple[Array, Array]]:
-    """Node states and multipliers of the rollout under the tracking filter; none where it fails."""
+    """Node states and multipliers of the rollout with the tracking filter; empty if it fails."""
     feedback = episode.tracking_feedback
     if feedback is None and problem.system.driven and not problem.system.servos:
         smooth = LowPassFilter(problem.options.path_cutoff)(episode.grid.node_times, episode.measured_driven_angles)
@@ -114,7 +113,7 @@ def _tracked(
 def _resting(
     problem: EstimationProblem, episode: Episode, nodes: IntArray, theta: Array, start: Array
 ) -> tuple[Array, Array]:
-    """Node states at rest at the measured postures, with the momentum of moving from one to the next."""
+    """Node states at the equilibria of the measured postures, with the momenta of moving between them."""
     step, statics = problem.step, problem.model_functions.equilibrium_solver
     n, m, h = step.sizes["n"], step.sizes["m"], step.time_step
     state = np.tile(start, (len(nodes), 1))
@@ -144,15 +143,14 @@ def _resting(
 
 
 def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array) -> Array:
-    """Initial unknown vector with every free effect slightly active, shape (nx,).
+    """Initial unknown vector (nx,) with every free effect slightly active.
 
-    At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the
-    slope by its amplitude is that of whatever shape the settings name: a spring that would have to push from there
-    stays at its bound of zero. So each free effect that starts neutral, one after the other, is tried with several
-    shapes; the linear model at the best of them gives its amplitude, within the range that one would expect. Without a
-    shape the neutral value is kept, unless nothing is seen of the amplitude there. It is `x` itself where no free
-    effect starts neutral, or where nothing else can be rolled out.
-    """
+    At an effect's neutral amplitude, its shape parameters (where a spring is relaxed, how fast a branch creeps) change
+    no measurement, and the derivative by the amplitude depends on their initial values. A wrong shape can keep the
+    amplitude at its bound. Each free, initially neutral effect is therefore tried with several shapes. The linear model
+    at the best shape gives the amplitude, within the expected range. An effect without shape parameters stays neutral,
+    unless its amplitude is unobservable there. Returns `x` if no free effect is neutral or no other start can be rolled
+    out."""
     place = {name: i for i, name in enumerate(problem.unknown_names)}
     for effect in problem.system.effects:
         if not isinstance(effect, EffectBase):
@@ -174,7 +172,7 @@ def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array
 
 
 def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase, place: dict[str, int]) -> Array | None:
-    """The start with an effect at its best shape; None where only its amplitude is free, and seen at neutral."""
+    """The start with an effect at its best shape; None if only its amplitude is free, and observable at neutral."""
     amplitudes = [place[name] for name in effect.amplitude_names if name in place]
     shapes = [place[name] for name in effect.shape_parameter_names if name in place]
     expected = {place[name]: limits for name, limits in effect.prior_ranges.items() if name in place}
@@ -204,7 +202,7 @@ def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase,
 
 
 def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitudes: list[int]) -> tuple[Array, float]:
-    """Step of the amplitudes, all other unknowns moved along, and the fall of the cost that it promises."""
+    """Step of the amplitudes, with all other unknowns adapted, and its predicted decrease of the cost."""
     assert found.jacobian is not None
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)

@@ -1,4 +1,4 @@
-"""Multiple shooting with node states as unknowns, by IPOPT or condensed onto the parameters."""
+"""Multiple shooting with node states as unknowns, solved by IPOPT or condensed onto the parameters."""
 
 from __future__ import annotations
 
@@ -63,15 +63,15 @@ _CLOSED_DEFECT = 1e-7
 class MultipleShooting(SolverWithCheckedSettings):
     """Multiple shooting, which minimises 1/2 |r|^2 over parameters and node states under the equations of motion.
 
-    IPOPT solves the program of `transcribe`, with the DEL equations of every step as constraints. Defects are scaled to
-    order one, the cost by its initial value, and IPOPT's own scaling is off. In these units its first bound
-    multipliers, which are one, weigh as much as the cost, so that the first steps change no parameter by much more than
-    a factor. A barrier parameter much above the default pushes parameters that the data hardly inform off their bounds.
+    IPOPT solves the program of `transcribe`, whose constraints are the DEL equations of every step. Defects are scaled
+    to order one, the cost by its initial value, and IPOPT's own scaling is off. In these units IPOPT's initial bound
+    multipliers of one weigh as much as the cost, so that the first steps change no parameter by much more than a
+    factor. A much larger barrier parameter than the default pushes poorly informed parameters off their bounds.
 
-    With `condensing` the steps between nodes are rolled out, and Gauss-Newton iterates on node states s_j and
-    parameters x with defects d_j = F^n(s_j, x) - s_{j+1}. A linear step closes every defect; the recursion
-    S_{j+1} = A_j S_j + B_j,  c_{j+1} = A_j c_j + d_j  expresses all node steps by the parameters' step, so that an
-    iteration costs one sweep with one direction more than single shooting's. A step must improve the cost or the
+    With `condensing`, the steps between nodes are rolled out, and Gauss-Newton iterates on node states s_j and
+    parameters x with defects d_j = F^n(s_j, x) - s_{j+1}. A linear step closes every defect. The recursion S_{j+1} =
+    A_j S_j + B_j, c_{j+1} = A_j c_j + d_j expresses all node steps by the parameters' step. An iteration therefore
+    costs one sweep, with one direction more than in single shooting. A step is accepted if it improves the cost or the
     defects.
 
     References
@@ -236,7 +236,7 @@ class MultipleShooting(SolverWithCheckedSettings):
 
 
 class _AdaptiveRidge(ca.Callback):
-    """Factor of a ridge that rises where parameters swing to and fro, and falls where they keep going."""
+    """Factor of a ridge that rises if parameters oscillate, and falls if they keep their direction."""
 
     def __init__(self, scale: Array, size: int) -> None:
         ca.Callback.__init__(self)
@@ -304,7 +304,7 @@ class _Watch(ca.Callback):
 
 @dataclass(frozen=True)
 class _Linearization:
-    """Whitened residual, its slopes by unknowns and by closing the defects, and those of all node states."""
+    """Whitened residual, its derivatives by unknowns and by closing the defects, and those of all node states."""
 
     cost: float
     defect: float
@@ -315,18 +315,17 @@ class _Linearization:
 
 
 class _StepFilter:
-    """Accepts trial points that are better than every point so far in cost or in defects.
+    """Accepts trial points that improve on every point so far in cost or in defects.
 
-    A merit function has to weigh the two against each other; a weight that was needed far from the solution makes steps
-    short near it (Waechter and Biegler 2005, SIAM J. Optim. 16(1):1, doi:10.1137/S1052623403426556).
-    """
+    It replaces a merit function, whose weight between the two, once needed far from the solution, makes steps short
+    near it (Waechter and Biegler 2005, SIAM J. Optim. 16(1):1, doi:10.1137/S1052623403426556)."""
 
     def __init__(self, start: _Linearization) -> None:
         self._largest = 1e4 * max(start.defect, 1.0)
         self._points: list[tuple[float, float]] = []
 
     def accepts(self, now: _Linearization, trial: _Linearization, slope: float) -> bool:
-        """Whether to go on from `trial`, for which the linear model says that the cost changes by `slope`."""
+        """Whether to continue from `trial`; the linear model predicts a change of the cost by `slope`."""
         margin = _IMPROVEMENT_MARGIN
         if not trial.defect <= self._largest or not np.isfinite(trial.cost):
             return False
@@ -342,7 +341,7 @@ class _StepFilter:
 
 
 def _step_bounds(problem: EstimationProblem, x: Array, size: Array) -> tuple[Array, Array]:
-    """Bounds of a step in units of `size`; the linear model is good for a factor, not for a jump to a bound."""
+    """Bounds of a step in units of `size`: the linear model holds for changes by a factor, not to a bound."""
     lower, upper = problem.bounds
     largest = np.maximum(x, 1e-3 * problem.unknown_scales) * _MAX_CHANGE_FACTOR
     low = np.where(problem.positive_unknowns_mask, np.maximum(lower, x / _MAX_CHANGE_FACTOR), lower)
@@ -351,7 +350,7 @@ def _step_bounds(problem: EstimationProblem, x: Array, size: Array) -> tuple[Arr
 
 
 class _ShootingIntervals:
-    """Recordings cut at nodes, each interval a rollout from its node state; condensed onto the parameters."""
+    """Recordings cut at nodes into intervals, each rolled out from its node state, condensed onto the parameters."""
 
     def __init__(self, problem: EstimationProblem, node_interval: int) -> None:
         check_no_effect_changes_inputs(problem, "multiple shooting")
@@ -390,13 +389,13 @@ class _ShootingIntervals:
         return mean_square_residual_without_efforts(self.problem, i, trajectory, x)
 
     def moved(self, nodes: list[Array], now: _Linearization, step: Array, factor: float) -> list[Array]:
-        """Node states after a part of a step of the unknowns that also closes as large a part of the defects."""
+        """Node states after a fraction of a step, which also closes that fraction of the defects."""
         columns = map(self.problem.unknowns.unknown_indices_affecting_recording, range(len(nodes)))
         parts = zip(nodes, now.node_slopes, columns, strict=True)
         return [state + factor * (by_x @ step[own] + by_defect) for state, (by_x, by_defect), own in parts]
 
     def linearize(self, x: Array, nodes: list[Array]) -> _Linearization | str:
-        """Residual and derivatives about a point; the message of a rollout that failed."""
+        """Residual and derivatives at a point, or the message of a failed rollout."""
         problem = self.problem
         cost, defect, residuals, jacobians, changes, slopes = 0.0, 0.0, [], [], [], []
         for i, episode in enumerate(problem.episodes):
@@ -425,7 +424,7 @@ class _ShootingIntervals:
     def _condensed(
         self, i: int, theta: Array, start: InitialStateWithSensitivity, nodes: Array
     ) -> tuple[Array, Array, Array, Array, float] | str:
-        """Trajectory (N + 1, nx), its and the nodes' derivatives by unknowns and closing of defects; largest defect."""
+        """Trajectory (N + 1, nx), derivatives of it and of the nodes by unknowns and defects, largest defect."""
         wanted, by_start = self.problem.unknowns.free_parameters, start.state_sensitivity
         nx, width = by_start.shape
         steps = self.problem.episodes[i].grid.steps

@@ -2,10 +2,9 @@
 
     min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
 
-f is half the sum of squares (or Huber's loss) of residuals, g the values of constraint terms. Nothing here knows
-mechanics or recordings. A term is one local function at many places, with directly assembled derivatives: CasADi would
-find the same ones by colouring the whole Jacobian, many times more slowly.
-"""
+f is half the sum of squares (or the Huber loss) of residuals, g the values of constraint terms. The module does not
+depend on mechanics or recordings. A term is one local function evaluated at many places, with directly assembled
+derivatives. CasADi would obtain the same derivatives by colouring the whole Jacobian, many times more slowly."""
 
 from __future__ import annotations
 
@@ -47,12 +46,10 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function of local variables, with its derivatives. It is y(v; d, s) of variables v, data d, shared data
-    s.
+    """Symbolic function y(v; d, s) of local variables v, data d and shared data s, with its derivatives.
 
-    The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. Derivatives may be
-    compiled; the value stays CasADi's own, so that whoever builds upon it can differentiate it.
-    """
+    `jacobian` dy/dv (ny, nv) is derived from the value by default. Derivatives can be compiled. The value stays a
+    CasADi expression, so that terms built on it can be differentiated."""
 
     def __init__(
         self,
@@ -72,7 +69,7 @@ class LocalVariableFunction:
 
     @_ThreadSafeCachedProperty
     def _weighted_hessian_function(self) -> ca.Function | None:
-        """CasADi function (v, d, s, weight) of the sparse Hessian of weight . y by v; None where y is linear."""
+        """CasADi function (v, d, s, weight) of the sparse Hessian of weight . y by v; None if y is linear."""
         # one product with a direction, for each colour of the pattern: the whole would be millions of operations
         v, weight = self._inputs[0], ca.SX.sym("weight", self._expression.numel())
         gradient = ca.gradient(ca.dot(weight, self._expression), v)
@@ -107,7 +104,7 @@ class MappedFunctionTerm:
 
     @property
     def n_values(self) -> int:
-        """Number ny K of output values at all places together."""
+        """Number ny K of output values at all K places."""
         return len(self.row_names) * len(self.variable_indices)
 
     def _map_over_places(self, function: ca.Function, w: ca.MX, p: ca.MX, *more: ca.MX) -> ca.MX:
@@ -118,7 +115,7 @@ class MappedFunctionTerm:
         return mapped(*local, p[self.shared_data_indices.tolist()], *more)
 
     def _symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """The local function's ny outputs at all K places, one place after another, shape (ny K, 1)."""
+        """The local function's outputs (ny K, 1) at all K places, one place after another."""
         return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
     def _jacobian_nonzero_values(self, w: ca.MX, p: ca.MX) -> ca.MX:
@@ -132,7 +129,7 @@ class MappedFunctionTerm:
         return (first + row).ravel(), self.variable_indices[:, column].ravel()
 
     def _weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
-        """Entries, rows and columns (some may repeat) of the Hessian of weight . values in w; None if it is zero."""
+        """Entries, rows and columns (with repetitions) of the Hessian of weight . values in w; None if it is zero."""
         function = self.local_function._weighted_hessian_function
         if function is None:
             return None
@@ -158,7 +155,7 @@ class ResidualTerm:
         return self.term.n_values if self.combination is None else self.combination.size1()
 
     def _residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:
-        """Jacobian of the residuals r with respect to the program term's values, sparse; None for the identity."""
+        """Sparse Jacobian of the residuals r with respect to the term's values; None for the identity."""
         if self.combination is None and self.weight_indices is None:
             return None
         combination = ca.DM.eye(self.n_residuals) if self.combination is None else self.combination
@@ -169,7 +166,7 @@ class ResidualTerm:
         return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
 
     def _symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Residuals r at the program's unknowns w and parameters p, shape (nr, 1)."""
+        """Residuals r (nr, 1) at the program's unknowns w and parameters p."""
         matrix, value = self._residual_jacobian_by_term_values(p), self.term._symbolic_outputs(w, p)
         result = value if matrix is None else ca.mtimes(matrix, value)
         if self.target_indices is None:
@@ -178,7 +175,7 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Sparse Jacobian of the residuals with respect to the program's unknowns w, shape (nr, nw)."""
+        """Sparse Jacobian (nr, nw) of the residuals with respect to the program's unknowns w."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
         matrix = self._residual_jacobian_by_term_values(p)
@@ -197,8 +194,8 @@ class ResidualTerm:
     def loss_hessian_residual_weights(self, r: ca.MX, exact: bool) -> ca.MX | None:
         """Weight of each residual in the Hessian of the loss. None if all weights are one.
 
-        Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
-        """
+        With `exact`, it is the second derivative of the Huber loss: one up to the threshold, zero beyond. Otherwise it
+        is the weight of iteratively reweighted least squares, which has the same gradient and is never zero."""
         if math.isinf(self.huber_threshold):
             return None
         size = ca.fabs(r)
@@ -211,9 +208,8 @@ class ResidualTerm:
 class GaussNewtonHessianRidge:
     """Curvature added to the Gauss-Newton Hessian only, factor * mean square residual / max(|w_i|, scale_i)^2.
 
-    Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
-    The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.
-    """
+    For poorly informed unknowns, the curvature that Gauss-Newton neglects can be as large as its own. `factor` is a
+    number or a function of the unknowns, whose value can change between iterates."""
 
     index: IntArray
     scale: Array
@@ -244,7 +240,7 @@ def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: Int
 
 @dataclass(frozen=True)
 class _VectorBlock:
-    """Named block of a program's variables or parameters: indices in the vector, shape (rows, columns), rows' names."""
+    """Named block of variables or parameters: indices in the vector, (rows, columns), and names of the rows."""
 
     index: IntArray
     row_names: tuple[str, ...]
@@ -264,7 +260,7 @@ class ProgramVectorLayout:
     def append_values(
         self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf
     ) -> IntArray:
-        """Append values with their bounds. The result is their indices in the vector."""
+        """Append values with their bounds. Returns their indices in the vector."""
         self.values.append(values)
         self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
         self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
@@ -272,12 +268,12 @@ class ProgramVectorLayout:
         return np.arange(self.size - len(values), self.size)
 
     def register_block(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Register indices of the vector as a named block. No indices, no block."""
+        """Register indices of the vector as a named block. Without indices nothing is registered."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
     def append_block(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IntArray:
-        """Append a named block column by column. The result is its indices, shape (rows, columns)."""
+        """Append a named block column by column. Returns its indices (rows, columns)."""
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table
         index = self.append_values(table.ravel(order="F")).reshape(table.shape, order="F")
@@ -295,7 +291,7 @@ class _UserTerms(NamedTuple):
 
 
 def available_memory_bytes() -> float:
-    """Available memory [bytes]. Infinite where the system does not report it."""
+    """Available memory [bytes]. Infinite if the system does not report it."""
     told = Path("/proc/meminfo")
     lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
     found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
@@ -306,9 +302,8 @@ def available_memory_bytes() -> float:
 class NonlinearProgram(ReprMixin):
     """Nonlinear program in CasADi that minimises f(w, p) under bounds and constraints.
 
-    `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
-    is short for `nlp["q[NAME]"]`.
-    """
+    `nlp[name]` is a block of `variables` or `parameters`, an MX of the block's shape. With one recording, `nlp["q"]` is
+    short for `nlp["q[NAME]"]`."""
 
     variables: Mapping[str, _VectorBlock]  # what the column `w` of unknowns is made of
     parameters: Mapping[str, _VectorBlock]  # what the column `p` of parameters is made of
@@ -329,10 +324,9 @@ class NonlinearProgram(ReprMixin):
         return ReprLineAndTableRows(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
     def named_block(self, name: str) -> _VectorBlock:
-        """Find a named block's indices, row names and unit. With one recording, `[NAME]` may be left out.
+        """Find a named block's indices, row names and unit. With one recording, `[NAME]` can be omitted.
 
-        Raises `SolverError` where there is none, or more than one.
-        """
+        Raises `SolverError` if there is no such block, or more than one."""
         blocks = {**self.variables, **self.parameters}
         if name in blocks:
             return blocks[name]
@@ -358,7 +352,7 @@ class NonlinearProgram(ReprMixin):
         return tuple(named)
 
     def constraint_names(self) -> tuple[str, ...]:
-        """Names of all constraint rows by term, row and place. Rows of `with_user_terms` are `added.I`."""
+        """Names of all constraint rows by term, row and place. Rows of `with_user_terms` are named `added.I`."""
         places = ((t, k) for t in self.constraint_terms for k in range(len(t.variable_indices)))
         terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
@@ -381,7 +375,7 @@ class NonlinearProgram(ReprMixin):
 
     @property
     def solver_arguments(self) -> dict[str, Array]:
-        """Initial guess, parameter values and bounds with which a CasADi solver is called."""
+        """Initial guess, parameter values and bounds: the arguments for a call of a CasADi solver."""
         zero = np.zeros(sum(term.n_values for term in self.constraint_terms))
         low, high = ([zero, *(getattr(extra, side) for extra in self.user_terms)] for side in ("lower", "upper"))
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
@@ -401,7 +395,7 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def residual(self) -> ca.MX:
-        """Symbolic residuals r(w, p) of the objective's least-squares terms, shape (nr, 1)."""
+        """Symbolic residuals r(w, p) of the objective's least-squares terms, (nr, 1)."""
         return ca.vertcat(ca.MX(0, 1), *self._residuals)
 
     @_ThreadSafeCachedProperty
@@ -449,8 +443,7 @@ class NonlinearProgram(ReprMixin):
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
         """Sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
 
-        Gauss-Newton leaves out the curvature of residuals and of `constraint_terms`, not of what was added.
-        """
+        Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps that of user terms."""
         with CASADI_LOCK:
             if kind not in self._hessians:
                 self._hessians[kind] = self._data_curvature(kind == "exact") + self._other_curvature(kind == "exact")
@@ -507,11 +500,11 @@ class NonlinearProgram(ReprMixin):
         lower: ArrayLike = 0.0,
         upper: ArrayLike = 0.0,
     ) -> NonlinearProgram:
-        """Add an objective term and constraint rows, which are expressions of `w` and `p`.
+        """Program with an additional objective term and constraint rows, expressions of variables `w` and parameters
+        `p`.
 
-        Rows without bounds are equalities to zero. Raises `SolverError` for expressions of other symbols, or bounds of
-        another number than rows.
-        """
+        Rows without bounds are equalities to zero. Raises `SolverError` if an expression contains other symbols, or if
+        the number of bounds is neither one nor the number of rows."""
         rows = [constraints] if isinstance(constraints, ca.MX) else list(constraints)
         column = ca.vertcat(ca.MX(0, 1), *(ca.vec(ca.densify(row)) for row in rows))
         scalar = ca.MX(objective)
@@ -531,9 +524,8 @@ class NonlinearProgram(ReprMixin):
     def make_solver(self, plugin: str = "ipopt", hessian: HessianKind = "gauss_newton", **options: Any) -> ca.Function:
         """Make a `casadi.nlpsol` solver with the program's derivatives. Call it with `solver_arguments`.
 
-        `plugin` is any of CasADi's, `options` those of `casadi.nlpsol`. Raises `SolverError` where CasADi does not have
-        the plug-in, or refuses the options.
-        """
+        `plugin` is the name of a CasADi plug-in, `options` are options of `casadi.nlpsol`. Raises `SolverError` if
+        CasADi lacks the plug-in or refuses the options."""
         with CASADI_LOCK:
             options = {**QUIET_NLPSOL_OPTIONS, **options}
             try:
@@ -564,7 +556,7 @@ class NonlinearProgram(ReprMixin):
 
 
 def _asked_for(plugin: str, options: Mapping[str, Any]) -> dict[str, tuple[list[str], list[str]]]:
-    """Inputs and outputs of the functions that a plug-in asks for, learnt on a program of one unknown."""
+    """Inputs and outputs of the functions that a plug-in requests, found with a program of one unknown."""
     x, p = ca.MX.sym("x"), ca.MX.sym("p")
     fitting = {name: value for name, value in options.items() if name not in _SIZE_DEPENDENT_OPTIONS}
     tiny = ca.nlpsol("tiny", plugin, {"x": x, "p": p, "f": x**2, "g": x}, fitting)

@@ -4,13 +4,12 @@ The unknowns are, in this order,
 
     (shared parameters | recording 1: local parameters, its rest, x_0, lam_0, x_1, lam_1, ... x_N | recording 2: ... )
 
-with x = (q, p, z). `rest` is the equilibrium at the first posture (coordinates sought, internal ones, forces of the
-grasps), of which x_0 is a function; it is absent where a start is given. The constraints are the equations of that
-equilibrium and the rows of every `NlpStepConstraints`; the objective has the whitened samples, interpolated between
-nodes, and the priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too,
-after the states of their recording, with their standard deviations as priors: at the optimum this is the likelihood of
-`inference.whitening`, but for what that linearises.
-"""
+with x = (q, p, z). `rest` is the equilibrium at the first posture (free coordinates, internal coordinates, grasp
+forces), and x_0 is a function of it; a given initial state has no `rest`. The constraints are the equations of the
+equilibrium and the rows of every `NlpStepConstraints`. The objective contains the whitened samples, interpolated
+between nodes, and the priors. Recorded inputs and measurements are parameters. With process noise, its errors are
+unknowns too, after the states of their recording, with their standard deviations as priors. At the optimum this is the
+likelihood of `inference.whitening`, up to the linearisation there."""
 
 from __future__ import annotations
 
@@ -57,27 +56,27 @@ def transcribe(
 ) -> NonlinearProgram:
     """Transcribe an estimation problem into a nonlinear program with a node at every step.
 
-    The equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+    Equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
 
     Parameters
     ----------
     initial_unknowns : array_like, optional, shape (nx,)
-        Unknown vector near which the guess of the program's unknowns is made; the problem's when absent.
+        Unknown vector from which the program's initial guess is made. Default: the problem's initial unknowns.
     use_compiler : bool, optional
-        Whether the derivatives of a stage are compiled where that is possible; as the problem's step when absent.
+        Whether derivatives of a stage are compiled if possible. Default: as in the problem's step.
 
     Returns
     -------
     NonlinearProgram
-        With the variables `theta`, and of every recording `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]`
-        and `lam[NAME]`; with the parameters `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`,
-        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md.
+        Variables: `theta` and, per recording, `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]` and
+        `lam[NAME]`. Parameters: `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`, `value.GROUP[NAME]`,
+        `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md.
 
     Raises
     ------
     SolverError
-        An effect on recorded inputs or times is at work, a free parameter has a known value in a recording, or two
-        recordings have one name.
+        An effect changes recorded inputs or times, a free parameter has a known value in a recording, or two recordings
+        have the same name.
     """
     problem = _about_zero(problem)
     _check_transcribable(problem)
@@ -88,7 +87,7 @@ def transcribe(
 
 
 def _about_zero(problem: EstimationProblem) -> EstimationProblem:
-    """The problem with torques as recorded: no offset of theirs is known yet, as it is an unknown."""
+    """The problem with the recorded torques and zero torque offsets, because the offsets are unknowns here."""
     known = [episode.input_errors for episode in problem.episodes]
     if not any(e is not None and np.any(e.torque_bias) for e in known):
         return problem
@@ -98,7 +97,7 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
-    """Reject effects on recorded inputs or times (`SolverError`). Solvers with node states do not support them."""
+    """Raise `SolverError` if an effect changes recorded inputs or times, which node-state solvers do not support."""
     if not problem.has_no_input_corrections:
         message = "an effect changes recorded inputs, times or what the tracking filter follows"
         allowed = "effects of the mechanics and of what sensors read"
@@ -121,7 +120,7 @@ def _check_transcribable(problem: EstimationProblem) -> None:
 
 
 def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
-    """Convert the program's variables `w` to the unknown vector of the estimation problem, shape (nx,)."""
+    """Convert the program's variables `w` to the unknown vector (nx,) of the estimation problem."""
     x = problem.initial_unknowns.copy()
     shared, own = len(problem.shared_parameters), len(problem.local_parameters)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
@@ -140,7 +139,7 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
 
 
 class _Places(NamedTuple):
-    """Places of a recording's unknowns and inputs; `errors` of each step's torque, `first` of the first angles."""
+    """Indices of a recording's unknowns and inputs; `errors` of each step's torque, `first` of the first angles."""
 
     free: IntArray
     rest: IntArray
@@ -165,7 +164,7 @@ class _Places(NamedTuple):
 
 
 class _FreeParameterSymbols(NamedTuple):
-    """Symbols of the parameters theta: of free ones, nominal values of all, and theta, free symbols where free."""
+    """Symbols of the parameters theta: free ones, nominal values of all, and theta with free symbols inserted."""
 
     names: tuple[str, ...]
     free: ca.SX
@@ -176,8 +175,7 @@ class _FreeParameterSymbols(NamedTuple):
 class _DrivenStage(NamedTuple):
     """One stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data (ubar, K, xbar).
 
-    `function` gives the stage's rows; `effort` of prescribed joints and `torque` of driven ones have their slopes by v.
-    """
+    `function` gives the rows; `effort` (prescribed joints) and `torque` (driven joints) include derivatives by v."""
 
     function: LocalVariableFunction
     v: ca.SX
@@ -196,13 +194,11 @@ def _driven_stage(
     noisy: bool,
     use_compiler: bool,
 ) -> _DrivenStage:
-    """The stage with its tracking filter and torque errors, where it has them.
+    """The stage with its tracking filter and torque errors, if it has them.
 
-    The torque that acts is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k, without K_k where encoders
-    are measurements, and without the errors where torques are taken as true: the two forms of `inference.whitening`,
-    with the errors themselves in the place of their covariance. `momentum` (nu, nu) is what torques of the step before
-    add to the momenta that the filter follows.
-    """
+    The applied torque is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k. K_k is absent if encoders are
+    measurements, the errors if torques are exact. These are the two forms of `inference.whitening`, with the errors in
+    place of their covariance. `momentum` (nu, nu) is the derivative of the followed momenta by the previous torque."""
     nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
     before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
     nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))
@@ -239,7 +235,7 @@ def _driven_stage(
 
 
 class _Maker:
-    """Lays out unknowns and parameters of a problem, and makes the terms about them."""
+    """Lays out unknowns and parameters of a problem, and makes its terms."""
 
     def __init__(self, problem: EstimationProblem, compiled: bool) -> None:
         self._problem, self._compiled = problem, compiled
@@ -257,7 +253,7 @@ class _Maker:
         self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalVariableFunction, bool]] = {}
 
     def program(self, x: Array) -> NonlinearProgram:
-        """The program, its guess made near the problem's unknown vector `x`."""
+        """The program, with a guess near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
         nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
         found = guess_unknowns_and_node_states(
@@ -294,7 +290,7 @@ class _Maker:
         return NonlinearProgram(self._w.blocks, self._p.blocks, *terms, *vectors, ridge, *symbols)
 
     def _laid_out(self, i: int, found: UnknownsAndNodeStateGuess, free: IntArray) -> tuple[_Places, list[ResidualTerm]]:
-        """The unknowns of a recording at their guess and what drives it; priors of errors."""
+        """The unknowns of a recording at their guess, its inputs, and the priors of its errors."""
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
@@ -340,7 +336,7 @@ class _Maker:
         return gain, self._p.append_block(f"reference[{episode.name}]", feedback.reference.T, followed)
 
     def _driven(self, episode: Episode) -> _DrivenStage:
-        """The stage as a recording drives it."""
+        """The stage with the inputs of a recording."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
             feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_shift_functions
@@ -351,7 +347,7 @@ class _Maker:
         return self._stages[key]
 
     def _erring(self, episode: Episode) -> tuple[IntArray, IntArray, list[ResidualTerm]]:
-        """Places of the torque's errors at every step and of the first angles', and their priors."""
+        """Indices of each step's torque errors and of the errors of the first angles, and their priors."""
         errors, steps, name = episode.input_errors, episode.grid.steps, episode.name
         if errors is None:
             return np.zeros((steps, 0), np.int64), np.zeros(0, np.int64), []
@@ -430,7 +426,7 @@ class _Maker:
         return term, [ResidualTerm(free, ca.DM.eye(len(loose)), weight[:, 0])]
 
     def _sampled(self, episode: Episode, samples: SensorMeasurements, places: _Places) -> ResidualTerm:
-        """Samples of one sensor, predicted linearly between the two nodes beside them."""
+        """Samples of one sensor, predicted by linear interpolation between the two adjacent nodes."""
         sensor, nodes, n = samples.sensor, samples.evaluation_nodes, self._sizes["n"]
         (read, loaded), smooth = self._reading(sensor, episode), None
         if sensor.effort_joints:
@@ -464,7 +460,7 @@ class _Maker:
         return ResidualTerm(term, _constant(between), weight.T[seen], value.T[seen], threshold)
 
     def _reading(self, sensor: Sensor, episode: Episode) -> tuple[LocalVariableFunction, bool]:
-        """Reading of a sensor at a node, and whether it depends on efforts, that is, on the next step."""
+        """Reading of a sensor at a node, and whether it depends on efforts, and so on the next step."""
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
             function = sensor_reading_function(self._problem.system, sensor, self._names)
@@ -539,7 +535,7 @@ class _Maker:
 
 
 def _kind(episode: Episode) -> tuple[bool, bool]:
-    """Whether a recording's stage is under the tracking filter, and whether errors of torques are unknowns."""
+    """Whether a recording's stage has the tracking filter, and whether torque errors are unknowns."""
     feedback, errors = episode.tracking_feedback, episode.input_errors
     return feedback is not None and not (errors and errors.has_encoder_measurements), errors is not None
 
@@ -551,7 +547,7 @@ def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
 
 
 def _between(samples: SensorMeasurements, nodes: IntArray) -> scipy.sparse.csc_matrix:
-    """Interpolation of the used samples from readings at nodes, node by node."""
+    """Interpolation matrix from readings at nodes to the used samples."""
     width = samples.value.shape[1]
     sample, column = np.nonzero(samples.positive_weight_mask)
     row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
