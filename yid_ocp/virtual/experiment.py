@@ -1,4 +1,4 @@
-"""Virtual experiments in which a robot moves a flexible object in MuJoCo, with known noise and sensor errors."""
+"""Virtual experiments, in which a robot moves a flexible object in MuJoCo with known noise and sensor errors."""
 
 from __future__ import annotations
 
@@ -49,9 +49,8 @@ _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 def baxter_foam_y_system(arms: int) -> System:
     """Build the system of Caldwell (ISER 2014). One or two arms of Baxter hold the foam Y by point grasps.
 
-    The left arm holds the tip of T2 (43 coordinates), the right one that of T3 (50); every arm joint is driven, viscous
-    damping is 0.05 N m s/rad on every coordinate. `ConfigError` of another number of arms.
-    """
+    The left arm holds the tip of T2 (43 coordinates), the right arm that of T3 (50). Every arm joint is driven, and
+    every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms."""
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="paper_system", allowed="1 or 2")
     sides = ("left", "right")[:arms]
@@ -65,10 +64,9 @@ def baxter_foam_y_system(arms: int) -> System:
 class ArmSensorNoise:
     """Standard deviations of the arm's sensor noise. Noise is drawn per sample, the effort bias per recording.
 
-    Of a joint's reading [rad], [rad/s], of a recorded (not the applied) torque, white and constant, one or nj [N m],
-    and of each coordinate of a grasped point [m]. The recording always states the others, torques' where
-    `records_effort_std` says so.
-    """
+    Angles are in rad, velocities in rad/s, points (per coordinate of a grasped point) in m. Efforts are in N m, one
+    value or one per joint; their noise is in the recording, not in the applied torque. The recording states all
+    standard deviations, those of efforts only with `records_effort_std`."""
 
     position_std: float = 2e-4
     velocity_std: float = 5e-3
@@ -82,10 +80,9 @@ class ArmSensorNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualArmOptions:
-    """What the arms of the virtual experiments of `blind` have beyond their description.
+    """Properties of the arms in virtual experiments of `blind` beyond their description.
 
-    The nominal model knows the law of friction, with free amplitudes, and that the links' masses are uncertain.
-    """
+    The nominal model contains the friction law, with free amplitudes, and uncertain link masses."""
 
     friction: Annotated[
         Literal["none", "varied", "coulomb", "stribeck", "load", "load_stribeck"],
@@ -110,8 +107,8 @@ class VirtualArmOptions:
 class PointCamera:
     """A slow camera that measures positions of the object's points that no arm holds.
 
-    Its pose (4, 4) in the world (x right, y down, z ahead) is 2 m from the object, opposite the robot, where absent.
-    """
+    `pose` (4, 4) is in the world (x right, y down, z forward). By default it is 2 m from the object, opposite the
+    robot."""
 
     point_std: float = 5e-3  # of the white noise on each coordinate of a point [m]
     frame_rate: float = 3.0  # on average; periods vary by a quarter either way [Hz]
@@ -122,10 +119,9 @@ class PointCamera:
 
 @dataclass(frozen=True)
 class VirtualExperimentSettings:
-    """Settings of a virtual experiment for motion, simulation, sensors and noise.
+    """Settings of a virtual experiment: motion, simulation, sensors and noise.
 
-    Each sensor's noise has its own stream of the `seed`, so that leaving one out changes no other.
-    """
+    Each sensor's noise has its own random stream from `seed`, so removing a sensor does not change the others."""
 
     motion: MultisineMotion | None = None  # `random_multisine_motion` with `seed` where absent
     initial_joint_angles: Mapping[str, float] | None = None  # [rad or m]; `grasping_joint_angles` where absent
@@ -142,12 +138,11 @@ class VirtualExperimentSettings:
 def run_virtual_experiment(
     system: System, values: Mapping[str, float] | None = None, experiment: VirtualExperimentSettings | None = None
 ) -> Recording:
-    """Simulate a robot that moves the object and record encoders, torques, points and camera.
+    """Simulate a robot that moves the object, and record encoders, torques, points and camera.
 
-    `points_arm` has the grasped points at the times of the joints, `points_camera` its own clock, `true_parameters` all
-    stiffness, damping and mass parameters: `values`, nominal where absent. `ConfigError` of noise of other joints'
-    torques, else as `simulate_in_mujoco`.
-    """
+    `points_arm` holds the grasped points at the joints' sample times; `points_camera` has its own clock.
+    `true_parameters` holds all stiffness, damping and mass parameters (`values`, by default nominal). Raises
+    `ConfigError` if torque noise does not match the joints; other errors are those of `simulate_in_mujoco`."""
     chosen = experiment or VirtualExperimentSettings()
     duration = chosen.simulation.duration
     posture = chosen.initial_joint_angles
@@ -188,7 +183,7 @@ def _random_generators(seed: int) -> _Generators:
 
 
 def _held_and_visible_points(system: System) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The system's points that grippers hold, and the others, which a camera sees."""
+    """The system's points that grippers hold, and the other points, which a camera sees."""
     held = tuple(dict.fromkeys(grasp.held_frame for grasp in system.grasps if grasp.held_frame in system.point_frames))
     return held, tuple(point for point in system.point_frames if point not in held)
 
@@ -304,7 +299,7 @@ _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[st
 def recording_with_sensor_error(
     recording: Recording, system: System, kind: str, place: str, values: Mapping[str, float]
 ) -> Recording:
-    """Copy a recording with one sensor error, the sensor effect `kind` at `place` with parameters `values`."""
+    """Copy of a recording with one sensor error: the sensor effect `kind` at `place` with parameters `values`."""
     if kind.startswith("camera") or kind == "surface_offset":
         last = recording.duration
         points = (g if g.pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)

@@ -1,11 +1,10 @@
 """Add unmodelled effects to a virtual experiment in MuJoCo's own terms, independently of `yid_ocp.effects`.
 
-Whatever MuJoCo has a term of its own for (joint damping, armature, inertias, sites) is set in its model; other forces
-are worked out here in NumPy at every inner step; errors of sensors and clocks are put into the finished recording. None
-of the equations of `yid_ocp.effects` take part, except for effects that only change the description of the system
-(masses, lengths, rest angles, gravity, where a grasp sits). Effects outside the library, whose correct verdict is
-`unknown`, exist here alone.
-"""
+Effects for which MuJoCo has a term (joint damping, armature, inertias, sites) are set in its model. Other forces are
+computed here in NumPy at every inner step. Sensor and clock errors are applied to the finished recording. The equations
+of `yid_ocp.effects` are not used, except for effects that only change the description of the system (masses, lengths,
+rest angles, gravity, grasp positions). Effects outside the library, whose correct verdict is `unknown`, exist only
+here."""
 
 from __future__ import annotations
 
@@ -58,7 +57,7 @@ _SENSOR_ERROR_KINDS = (
 
 
 class _EffectContext:
-    """What forces read of the experiment; until the motion has begun the object comes to rest."""
+    """Properties of the experiment for forces; until the motion starts, the object settles to equilibrium."""
 
     def __init__(self, system: System, values: Mapping[str, float]) -> None:
         self.system, self.has_motion_begun = system, False
@@ -84,7 +83,7 @@ class _EffectContext:
         return [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in links]
 
     def end_body_id(self, model: Any, place: str) -> int:
-        """Id of the body at the end of a segment, or of the body on an arm's joint."""
+        """Id of the body at the end of a segment, or of the body that an arm's joint carries."""
         named = {segment.name: segment.link_joints[-1][-1] for segment in self.system.segment_layouts}
         return int(model.jnt_bodyid[model.joint(named.get(place, place)).id])
 
@@ -100,7 +99,7 @@ _MAX_RATED_EFFORT = 100.0  # beyond which a limit is no motor's rating [N m]
 
 
 def ordinary_friction_range(effect: EffectBase, system: System) -> tuple[float, float]:
-    """Least and largest amplitude of an ordinary dry friction of a joint, in the amplitude's unit."""
+    """Smallest and largest amplitude of the ordinary dry friction of a joint, in the amplitude's unit."""
     low, high = _ORDINARY_FRICTION[effect.kind]
     if effect.definitions[0].unit == "1":
         return low, high
@@ -113,7 +112,7 @@ _ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]  # of 
 
 
 def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallback:
-    """A force law(q, v, t) at some joints by their angles and speeds and the time."""
+    """A force law(q, v, t) at some joints, as a function of their angles, velocities and time."""
 
     def push(_: Any, data: Any) -> None:
         data.qfrc_passive[at] += law(data.qpos[at], data.qvel[at], data.time)
@@ -122,12 +121,12 @@ def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallba
 
 
 def _joint_law(law: Callable[[Any, float, float, float], float]) -> _ForceBuilder:
-    """An effect that is a force law(size, q, v, t) of one joint."""
+    """An effect with the force law(size, q, v, t) of one joint."""
     return lambda scene, model, joint, size: _joint_force(model.joint(joint).id, lambda q, v, t: law(size, q, v, t))
 
 
 def _spring_law(law: Callable[[Any, Array, Array, float], Array]) -> _ForceBuilder:
-    """An effect that is a force law(size, angles from rest, stiffnesses, t) of the elastic joints of a segment."""
+    """An effect with the force law(size, angles from rest, stiffnesses, t) of a segment's elastic joints."""
 
     def made(scene: _EffectContext, model: Any, segment: str, size: Any) -> _ForceCallback:
         at, stiffness, rest = scene.segment_springs(model, segment)
@@ -137,14 +136,14 @@ def _spring_law(law: Callable[[Any, Array, Array, float], Array]) -> _ForceBuild
 
 
 def _bend_law(law: Callable[[float, Array], Array]) -> _ForceBuilder:
-    """An effect that is a force law(size, q) of the bends of a segment, those about x first."""
+    """An effect with the force law(size, q) of a segment's bends, those about x first."""
     return lambda scene, model, segment, size: _joint_force(
         scene.bend_joint_ids(model, segment), lambda q, v, t: law(size, q)
     )
 
 
 def _body_forces(forces: Mapping[int, Callable[[Any], Array]]) -> _ForceCallback:
-    """Forces [N] on the centres of bodies, in the world, by MuJoCo's data."""
+    """Forces [N] at the centres of mass of bodies, in the world, as functions of MuJoCo's data."""
     mujoco = import_mujoco()
 
     def push(model: Any, data: Any) -> None:
@@ -155,10 +154,9 @@ def _body_forces(forces: Mapping[int, Callable[[Any], Array]]) -> _ForceCallback
 
 
 def _attached(offset: Sequence[float], pull: Callable[[float, Array], Array]) -> _ForceBuilder:
-    """An effect pull(size, way) on a tip or an arm's link by its way to a point of the world [m].
+    """An effect with the force pull(size, way) on a tip or an arm's link; `way` [m] leads to a fixed anchor point.
 
-    The point is `offset` from where the tip began, and on the other side of an arm's link.
-    """
+    The anchor is the start position plus `offset` for a tip, minus `offset` for an arm's link."""
 
     def made(scene: _EffectContext, model: Any, place: str, size: float) -> _ForceCallback:
         body, anchors = scene.end_body_id(model, place), list[Array]()
@@ -188,10 +186,9 @@ def _in_motion(build: _ForceBuilder) -> _ForceBuilder:
 def _memory_law(
     start: Callable[[Any], Any], advance: Callable[..., Any], law: Callable[[Any, Any, Any, Any], Any]
 ) -> _ForceBuilder:
-    """An effect that is a force law(size, stiffnesses, q, z) of a segment's elastic joints, or of one joint.
+    """An effect with the force law(size, stiffnesses, q, z) of a segment's elastic joints, or of one joint.
 
-    The memory is z = start(q) when the motion begins, then advance(size, z, q, v, step).
-    """
+    The internal state is z = start(q) at the start of the motion, then advance(size, z, q, v, step)."""
 
     def made(scene: _EffectContext, model: Any, place: str, size: Any) -> _ForceCallback:
         is_tube = any(segment.name == place for segment in scene.system.segment_layouts)
@@ -243,17 +240,16 @@ def _gravity_scale(scene: _EffectContext, model: Any, place: str, size: _Values)
 
 
 def _slid(size: _Values, s: float, q: float, v: float, step: float) -> float:
-    """Friction's share of its largest value after a step."""
+    """Friction after a step, as a fraction of its largest value."""
     way = math.copysign(1.0, v)
     return way + (s - way) * math.exp(-abs(v) * step / size["yield_angle"])
 
 
 def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[InjectedEffect]) -> _ForceCallback:
-    """Dry friction of joints as MuJoCo's own `frictionloss`, whose size is set anew at every inner step.
+    """Dry friction of joints as MuJoCo's own `frictionloss`, whose size is updated at every inner step.
 
-    It begins with the motion, and is at most tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|, the load being the
-    motor's torque less that of weights and grasps.
-    """
+    It starts with the motion and is at most tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|. The load is the motor
+    torque minus that of weights and grasps."""
     names = list(dict.fromkeys(effect.location for effect in effects))
     at = np.array([model.joint(name).id for name in names])
     sizes = {key: np.zeros(len(names)) for key in ("tau_c", "tau_s", "share")}
@@ -283,7 +279,7 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
 
 
 def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], Array]:
-    """Torque through the gears of some joints [N m]: that of the motor, less that of weights and grasps beyond it."""
+    """Torque through the gears of some joints [N m]: motor torque minus that of weights and grasps beyond."""
     value, servos, drag = scene.value, scene.system.servos, np.zeros(len(at))
     for i, joint in enumerate(at):
         servo = servos.get(model.joint(int(joint)).name)
@@ -324,7 +320,7 @@ def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) ->
 
 
 def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None:
-    """Put a point of some mass, or take it, at (mx, my, mz)/mass in a frame."""
+    """Add a point mass, possibly negative, at (mx, my, mz)/mass in a frame."""
     mujoco, value, where = import_mujoco(), scene.value, f"payload@{place}"
     frame, reach = scene.system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
     body = int(model.jnt_bodyid[model.joint(scene.system.mechanism.joints[frame.joint_index].name).id])
@@ -483,8 +479,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
 class InjectedEffect:
     """An effect in the simulated data that the model lacks, with kind, location and parameter values.
 
-    `values` are as in the vocabulary; for kinds outside it `size`, in the unit of the force that it makes.
-    """
+    `values` are the effect's parameters; a kind outside the library has `size`, in the unit of its force."""
 
     kind: str
     location: str
@@ -505,12 +500,11 @@ def run_experiment_with_effects(
 ) -> Recording:
     """Record a virtual experiment with effects that the system's description lacks.
 
-    `system` is nominal, with driven joints; `true_parameters` of the recording are those `values`, and the experiment's
-    own `injected_terms` are replaced. Where there is `ordinary_friction` (effects of the ladder's laws, perhaps none),
-    MuJoCo's solver holds and slides it together with the joint friction among the effects; else these are smooth
-    forces. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that
-    is too far off or takes away what is not there, else as `run_virtual_experiment`.
-    """
+    `system` is the nominal system, with driven joints. The recording stores `values` as `true_parameters`. The
+    experiment's `injected_terms` are replaced. If `ordinary_friction` is given (it can be empty), MuJoCo's constraint
+    solver simulates it and the joint friction in `effects`, including sticking; otherwise joint friction is a smooth
+    force. Raises `ConfigError` if an effect kind cannot be simulated, and `ModelError` if a payload is too far from its
+    frame or removes more mass than its link has. Other errors are those of `run_virtual_experiment`."""
     known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_FORCE_BUILDERS)
     known = known if ordinary_friction is None else tuple(dict.fromkeys((*known, *_ORDINARY_FRICTION)))
     for effect in (*effects, *(ordinary_friction or ())):
@@ -538,8 +532,7 @@ def run_experiment_with_effects(
 class _InjectedTerms:
     """Effects of `_MUJOCO_MODEL_KINDS`, `_FORCES` or `OUT_OF_LIBRARY_FORCE_BUILDERS` as `InjectedSimulatorTerms`.
 
-    Of `held_frictions`, joint frictions that the engine's solver holds at rest, the amplitudes at a joint add up.
-    """
+    Amplitudes of `held_frictions` (joint friction that the engine's solver simulates) at one joint add up."""
 
     def __init__(
         self,

@@ -30,23 +30,22 @@ _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
 
 class JointMotion(Protocol):
-    """Interface of a motion of the driven joints about their initial angles, from rest."""
+    """Interface of a motion of the driven joints about their initial angles, from standstill."""
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the nj joints that the motion moves."""
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays (nj,)."""
+        """Offset (nj,) from the initial angles at time t [s], with its first and second time derivative."""
 
 
 @dataclass(frozen=True)
 class MultisineMotion:
-    """Multisine motion of the driven joints about their initial angles, from rest.
+    """Multisine motion of the driven joints about their initial angles, from standstill.
 
-    offset_j(t) = r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji), with the ramp
-    r = 10 s^3 - 15 s^4 + 6 s^5, s = min(t / ramp, 1), twice continuously differentiable.
-    """
+    offset_j(t) = r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji), with the ramp r = 10 s^3 - 15 s^4 + 6
+    s^5, s = min(t / ramp, 1), which is twice continuously differentiable."""
 
     joints: tuple[str, ...]
     amplitude: Array  # shape (nj, nf) [rad or m]
@@ -55,7 +54,7 @@ class MultisineMotion:
     ramp_time: float = 1.0  # [s]
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays (nj,)."""
+        """Offset (nj,) from the initial angles at time t [s], with its first and second time derivative."""
         omega = 2 * math.pi * self.frequency
         angle = omega * t + self.phase
         sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
@@ -71,10 +70,9 @@ class MultisineMotion:
 class MultisineOptions:
     """Amplitude, speed and frequency limits of a random multisine motion.
 
-    Every arm is scaled to the gripper's travel by itself; much more than the default, on two arms, lets the foam Y snap
-    from one shape to another. One sine is in each of as many equal parts (in log frequency) of each band, that of those
-    that shake being well below half the rate of what records the torque.
-    """
+    Each arm is scaled separately to the gripper's travel. Much more travel than the default, with two arms, makes the
+    foam Y snap between shapes. Each band is divided into equal parts in log frequency, with one sine in each. The band
+    of `shake` sines should be well below half the sample rate of the torque."""
 
     gripper_travel: float = 0.11  # largest distance of a gripper from its start [m]
     max_joint_speed: float = 1.4  # an arm that would exceed it travels less [rad/s]
@@ -99,9 +97,8 @@ def random_multisine_motion(
 ) -> MultisineMotion:
     """Draw a random multisine motion, scaled to the requested travel of the grippers.
 
-    Amplitudes fall in inverse proportion to the frequency and towards the base. Where absent, parameter values are
-    nominal and initial angles [rad or m] those of `grasping_joint_angles`.
-    """
+    Amplitudes decrease with frequency (as 1/frequency) and towards the base. By default, parameter values are nominal
+    and initial angles [rad or m] are those of `grasping_joint_angles`."""
     chosen = excitation or MultisineOptions()
     rng = np.random.default_rng(seed)
     shape = len(system.driven), chosen.sines_per_joint
@@ -147,7 +144,7 @@ def _scaled(motion: MultisineMotion, joints: Sequence[int], factors: Array) -> M
 
 
 def _drawn_frequencies(band: tuple[float, float], shape: tuple[int, int], rng: np.random.Generator) -> Array:
-    """One frequency in each of as many equal parts, in log frequency, of a band."""
+    """One random frequency in each of equal parts, in log frequency, of a band."""
     edges = np.linspace(math.log(band[0]), math.log(band[1]), shape[1] + 1)
     return np.exp(rng.uniform(edges[:-1], edges[1:], shape))
 
@@ -155,7 +152,7 @@ def _drawn_frequencies(band: tuple[float, float], shape: tuple[int, int], rng: n
 def _shaken(
     motion: MultisineMotion, excitation: MultisineOptions, inertia: Array, rng: np.random.Generator
 ) -> MultisineMotion:
-    """The motion with fast sines added; `inertia` of the driven joints, shape (nj,) [kg m^2]."""
+    """The motion with fast sines added; `inertia` (nj,) of the driven joints [kg m^2]."""
     shape = motion.frequency.shape
     frequency = _drawn_frequencies(excitation.shake_frequency_band, shape, rng)
     omega = 2 * math.pi * frequency
@@ -167,7 +164,7 @@ def _shaken(
 
 
 def _scale(excitation: MultisineOptions, tip: ca.Function, q0: Array, columns: Sequence[int], waves: Array) -> float:
-    """Factor with which an arm's waves (N, 2, nj), offset and velocity, take the tip as far as wanted."""
+    """Factor on an arm's waves (N, 2, nj), offset and velocity, at which the tip reaches the requested travel."""
 
     def distance(scale: float) -> float:
         path = np.tile(q0, (len(waves), 1))
@@ -192,20 +189,20 @@ def grasping_joint_angles(
 ) -> dict[str, float]:
     """Find arm joint angles at which every gripper meets the end of the undeformed object, or a point near it.
 
-    They are those of every driven joint and of all that carry a grasp's holder and are not elastic, which are sought,
-    in configuration order [rad or m]. Only positions are matched, by the solution near the start. `ModelError` where
+    Returns the angles [rad or m], in configuration order, of all driven joints and of all non-elastic joints that carry
+    a grasp's holder. Only positions are matched, and the solution nearest to the start is taken. Raises `ModelError` if
     the grasped points cannot be reached within the joint limits.
 
     Parameters
     ----------
     values : mapping of str to float, optional
-        Parameter values; nominal where absent.
+        Parameter values. Default: nominal.
     start_angles : mapping of str to float, optional
-        Start of the search by joint [rad or m]; where absent elbow up for Baxter, else the middle of the joint's range
-        (zero when it has none).
+        Start of the search by joint [rad or m]. Default: elbow up for Baxter, else the middle of the joint's range (zero
+        if unlimited).
     offsets : mapping of grasp to array_like, shape (3,), optional
-        Where each gripper stands beside the undeformed tube end, in the world [m]. Two arms that hold a straight Y are
-        at its full stretch, a singular posture: moving them towards it makes the start well defined.
+        Position of each gripper relative to the undeformed tube end, in the world [m]. Two arms that hold a straight Y
+        are fully stretched, a singular posture; offsets towards each other make the start well defined.
     """
     tree = system.numeric_mechanism(values)
     value = ParameterEvaluator(system, values)
@@ -222,7 +219,7 @@ def grasping_joint_angles(
 
 
 def _undeformed(system: System, tree: Mechanism, value: ParameterEvaluator, start: Mapping[str, float]) -> Array:
-    """Configuration with the object at rest and the other joints where the search starts, shape (n,)."""
+    """Configuration (n,) with an undeformed object and the other joints at the start of the search."""
     posture, elastic = np.zeros(system.n_coordinates), {spring.joint_name for spring in system.elastic_joints}
     for spring in system.elastic_joints:
         posture[tree.joint_index(spring.joint_name)] = value(spring.rest_angle)[0]
@@ -237,7 +234,7 @@ def _undeformed(system: System, tree: Mechanism, value: ParameterEvaluator, star
 def _gap_function(
     system: System, tree: Mechanism, value: ParameterEvaluator, offsets: Mapping[str, ArrayLike], sought: Sequence[int]
 ) -> ca.Function:
-    """From q to the gaps between grippers and what they hold [m], and their derivatives by the joints sought."""
+    """Function of q: gaps [m] between grippers and the held points, and their derivatives by the searched joints."""
     q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(tree, q)
     gaps = []

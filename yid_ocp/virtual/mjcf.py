@@ -1,8 +1,7 @@
-"""Express a system in the terms of a rigid-body engine and as a MuJoCo model (MJCF).
+"""Express a system in the terms of a rigid-body engine, and as a MuJoCo model (MJCF).
 
-An effect is classified by the parts of the description it changes and by its equations, so kinds from outside the
-package are treated like those of the library.
-"""
+An effect is classified by its equations and the parts of the description that it changes, so kinds from plug-ins are
+treated like those of the library."""
 
 from __future__ import annotations
 
@@ -91,7 +90,7 @@ class JointDynamicsTerms:
 
 
 class ParameterEvaluator:
-    """Evaluates CasADi expressions at parameter values, nominal by default. Matrices are flattened by columns."""
+    """Evaluates CasADi expressions at parameter values (default: nominal). Matrices are flattened by columns."""
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
         self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
@@ -101,7 +100,7 @@ class ParameterEvaluator:
         return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
 
     def _is_zero_at_parameter_values(self, expression: ca.SX) -> bool:
-        """Whether an expression, with the parameters at their values, is zero for all values of its other symbols."""
+        """Whether an expression, at the parameter values, is zero for all values of its other symbols."""
         return bool(ca.sparsify(self._substitute_parameter_values(expression)).is_zero())
 
     def _substitute_parameter_values(self, expression: ca.SX) -> ca.SX:
@@ -165,7 +164,7 @@ def effect_joint_terms_and_changed_aspects(
 
 
 def system_joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
-    """Springs, dampers, rotor inertia and friction by joint, from the system's description and effects at one joint."""
+    """Springs, dampers, rotor inertia and friction by joint, from the description and single-joint effects."""
     found: dict[str, JointDynamicsTerms] = {}
 
     def add(joint: str, own: JointDynamicsTerms) -> None:
@@ -192,11 +191,10 @@ def system_joint_dynamics_terms(system: System, value: ParameterEvaluator) -> di
 def _actuation(
     system: System, effects: Sequence[Effect], joint: str, value: ParameterEvaluator
 ) -> tuple[float, float, float, float]:
-    """A joint's torque (or a servo's command) from its record, as the estimation has it: gain, offset, delay, lag.
+    """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
 
-    It is gain x recorded - offset, late by the delay [s] and with a first-order lag [s]; the last effect is the nearest
-    to the reading.
-    """
+    The true value is gain x recorded - offset, delayed and with a first-order lag. The last effect acts on the
+    reading."""
     true = reading = ca.SX.sym("reading")
     channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
     for effect in reversed(effects):
@@ -209,7 +207,7 @@ def _actuation(
 
 
 def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms] | None:
-    """Springs, dampers and rotors that an effect's equations are, by joint; None where they are something else."""
+    """Springs, dampers and rotors equivalent to an effect's equations, by joint; None if there is no equivalent."""
     n = system.n_coordinates
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
     u, reaction = ca.SX.sym("u", len(system.driven)), ca.SX.sym("reaction", system.n_constraints)
@@ -267,30 +265,30 @@ def mujoco_xml(
 ) -> str:
     """Write the MuJoCo model of a system as MJCF, an XML text.
 
-    Joints keep their names. Consecutive joints that carry no mass and sit at one place become one body with several
-    joints, which is the same kinematics. Every point and every end of a grasp is a site: points under their own name,
-    grasps as `grasp_NAME_holder` and `grasp_NAME_held`. There are no contacts or limits. All stands in one body
-    `world_base` that does not move, since some readers take no more than one root.
+    Joints keep their names. Consecutive massless joints at one location become one body with several joints, which is
+    kinematically equivalent. Every point and grasp end is a site: points under their own name, grasps as
+    `grasp_NAME_holder` and `grasp_NAME_held`. There are no contacts or limits. Everything is inside one fixed body
+    `world_base`, because some readers require a single root.
 
     Parameters
     ----------
     time_step : float
-        Of the simulator [s]; grasps are held with a time constant of two steps.
+        Time step of the simulator [s]. Grasps are constraints with a time constant of two steps.
     emulate : bool
-        Whether approximations are allowed: sticking dry friction for a smoothed one, a tendon for a compliant point
-        grasp. Refused otherwise.
+        Whether approximations are allowed: sticking for smoothed dry friction, a tendon for a compliant point grasp.
+        Otherwise they raise an error.
     actuators : bool
-        Whether every driven joint has an actuator of its name whose control is the recorded torque, with gain, offset,
-        delay and lag between that and the torque that acts; without, true torques go in as `qfrc_applied`. A servo
-        always is an actuator, whose control is the command.
+        Whether each driven joint has an actuator of its name. Its control is the recorded torque, and gain, offset,
+        delay and lag give the applied torque. Otherwise true torques are applied as `qfrc_applied`. A servo always is
+        an actuator, whose control is the command.
     gear_play : mapping of joint name to float, optional
-        Backlash of gears, full width [rad]: the joint is then the motor's side, and a joint `NAME_play` follows it.
+        Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
 
     Raises
     ------
     ModelError
-        What MuJoCo cannot express: a moving body without mass, more than six massless joints at one place, a frame on
-        one of them, a compliant grasp, a cubic spring beside a rest angle, an effect beyond `_NATIVE_ASPECTS`.
+        MuJoCo cannot express the system: a moving body without mass, more than six massless joints at one location, a
+        frame on one of them, a compliant grasp, a cubic spring with a rest angle, an effect beyond `_NATIVE_ASPECTS`.
     """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml", allowed="a positive number of seconds")
@@ -331,10 +329,9 @@ def _bodies(
     world: Element,
     gears: Mapping[str, Mapping[str, str]],
 ) -> dict[int, Element]:
-    """Add bodies with their joints and masses; the body of every joint by its index, -1 for the world.
+    """Add bodies with joints and masses. Returns the body of each joint by its index, with -1 for the world.
 
-    `gears` has attributes of the joint between a motor and what it moves, by the motor's joint.
-    """
+    `gears` holds, by motor joint, the attributes of the joint between the motor and its load."""
     carried = {frame.joint_index: name for name, frame in reversed(sites)}
     elements: dict[int, Element] = {-1: world}
     for j, joint in enumerate(tree.joints):
@@ -373,7 +370,7 @@ def _bodies(
 
 
 def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
-    """The tree with bodies of their whole weight, and by joint the part of it that those have which have not all."""
+    """The tree with bodies of full weight, and by joint the gravity fraction of bodies that have less."""
     weights: dict[str, float] = {}
     for joint in tree.joints:
         shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
@@ -455,7 +452,7 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
 
 
 def import_mujoco() -> ModuleType:
-    """Import the mujoco package. `DataError` if it is not installed."""
+    """Import the mujoco package. Raises `DataError` if it is not installed."""
     try:
         import mujoco
     except ImportError as error:
@@ -465,7 +462,7 @@ def import_mujoco() -> ModuleType:
 
 
 def mujoco_model_from_mjcf(text: str) -> Any:
-    """Compile MJCF text to a `mujoco.MjModel`. `ModelError` if MuJoCo rejects it."""
+    """Compile MJCF text to a `mujoco.MjModel`. Raises `ModelError` if MuJoCo rejects it."""
     try:
         return import_mujoco().MjModel.from_xml_string(text)
     except ValueError as error:
@@ -498,7 +495,7 @@ def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bo
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:
-    """Whether joint j turns at the same place as its parent, which carries nothing but it."""
+    """Whether joint j is at the same location as its parent, which carries nothing else."""
     joint = tree.joints[j]
     if joint.parent_index < 0 or merge_bodies(tree.joints[joint.parent_index].bodies) is not None:
         return False
@@ -542,5 +539,5 @@ def _inertial(body: Inertia) -> dict[str, str]:
 
 
 def format_xml_numbers(numbers: Iterable[float]) -> str:
-    """Format numbers for an XML attribute with all their digits, separated by spaces."""
+    """Format numbers with all their digits, separated by spaces, for an XML attribute."""
     return " ".join(f"{float(number):.17g}" for number in numbers)

@@ -1,8 +1,7 @@
 """Simulate in MuJoCo a controller that moves driven joints along a motion, or the replay of a recording.
 
-The simulator shares the description of the system with the estimator and nothing else: its equations, its integrator
-and its treatment of the grasps are MuJoCo's own, so that an estimate is never checked against its own mistakes.
-"""
+Simulator and estimator share only the description of the system. Equations, integrator and grasps are MuJoCo's own, so
+that estimates are not tested against the estimator's own errors."""
 
 from __future__ import annotations
 
@@ -45,10 +44,10 @@ class InjectedSimulatorTerms(Protocol):
         """Edit the compiled `mujoco.MjModel`."""
 
     def start_motion(self, data: Any) -> None:
-        """Prepare for a motion that begins at rest. This is called once per motion."""
+        """Prepare for a motion that starts at equilibrium. Called once per motion."""
 
     def add_forces(self, model: Any, data: Any) -> None:
-        """Add generalized forces to `data.qfrc_passive`. This is called at every inner step."""
+        """Add generalized forces to `data.qfrc_passive`. Called at every inner step."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class SimulationOptions:
         return round(1.0 / (self._controller_rate * self.time_step))
 
     def _tick_steps(self) -> IntArray:
-        """Inner steps before every tick of the controller, shape (ticks + 1,); the first and last are on time."""
+        """Inner steps before every tick of the controller, (ticks + 1,); the first and last tick are on time."""
         ticks = round(self.duration * self.sample_rate) * self.controller_periods_per_sample
         inner = self._steps_per_period
         late = np.random.default_rng(self.jitter_seed).normal(0.0, self.period_jitter_std / self.time_step, ticks - 1)
@@ -106,11 +105,10 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Noise-free result of a simulation, with q, v, efforts and points at times `t` and camera frame times.
+    """Noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
 
-    `effort` is the torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were
-    commanded at t_k; its last row was computed and not applied. Points are `system.point_frames` in the world.
-    """
+    `effort` is, by `effort_kind`, the torque at t_k or its mean from t_k to t_{k+1} [N m], or the servo command at t_k.
+    Its last row was computed but not applied. Points are `system.point_frames` in the world."""
 
     t: Array  # shape (N + 1,) [s]
     q: Array  # shape (N + 1, n)
@@ -134,26 +132,26 @@ def simulate_in_mujoco(
 ) -> SimulationResult:
     """Simulate a controller that follows a motion in MuJoCo, from equilibrium at the initial joint angles.
 
-    Position servos are MuJoCo's own: they are commanded the motion about the posture, and rest where that leaves them.
+    Position servos are MuJoCo's own. They are commanded the motion about the initial angles and start at equilibrium.
 
     Parameters
     ----------
     motion : JointMotion
-        Of exactly the driven joints.
+        Motion of exactly the driven joints.
     initial_joint_angles : mapping of str to float, optional
-        [rad or m]; `grasping_joint_angles` where absent.
+        Initial angles [rad or m]. Default: `grasping_joint_angles`.
     frame_times : array_like, shape (M,)
-        When a camera looks [s], increasing, in [0, duration].
+        Increasing times of camera frames in [0, duration] [s].
     injected : InjectedSimulatorTerms, optional
-        What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
-        simulation may run meanwhile in another thread.
+        Forces and model changes beyond the system's description. MuJoCo has one callback for the whole process, so no
+        other simulation may run at the same time in another thread.
     gear_play : mapping of joint to float, optional
-        Width of the play of gears behind servos [rad].
+        Full backlash width of gears behind servos [rad].
 
     Raises
     ------
     ModelError
-        The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not rest, or diverges.
+        The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not settle, or diverges.
     """
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
@@ -197,7 +195,7 @@ class MujocoScene:
 
     @staticmethod
     def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoScene:
-        """Make the scene of a compiled model. Its driven joints are moved, or its prescribed ones if none is driven."""
+        """Make the scene of a compiled model. It moves the driven joints, or else the prescribed joints."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
@@ -207,7 +205,7 @@ class MujocoScene:
 
 @contextlib.contextmanager
 def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | None) -> Iterator[None]:
-    """Let injected terms act inside MuJoCo while the block runs."""
+    """Activate injected terms inside MuJoCo for the duration of the block."""
     if injected is None:
         yield
         return
@@ -222,8 +220,7 @@ def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | 
 def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
     """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
 
-    `damping` replaces the joints' own damping meanwhile, which could decide which of several equilibria is found.
-    """
+    Joint damping can decide which of several equilibria is found; `damping` replaces it while the scene settles."""
     data, driven, held = scene.data, scene.moved_joint_ids, _settling_model(scene, damping)
     target = data.qpos[driven].copy()
     held.dof_damping[driven] += _HOLD_DAMPING
@@ -241,7 +238,7 @@ def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
 
 
 def _settling_model(scene: MujocoScene, damping: Array) -> Any:
-    """A copy of the model with more damping of what is not driven."""
+    """A copy of the model with more damping of the joints that are not driven."""
     held = copy.copy(scene.model)
     held.dof_damping[:] = damping
     held.dof_damping[np.setdiff1d(np.arange(held.nv), scene.moved_joint_ids)] *= _SETTLING_FACTOR
@@ -254,10 +251,9 @@ def _lost(scene: MujocoScene) -> bool:
 
 
 class TrackingController:
-    """Computed-torque controller with inverse dynamics along the motion, the grasps' load at rest, and feedback.
+    """Computed-torque controller: inverse dynamics along the motion, the grasps' load at equilibrium, and feedback.
 
-    The scene is at rest, before the motion; `balance` (nu,) are the torques that hold it there [N m].
-    """
+    The scene is at equilibrium before the motion, held by the torques `balance` (nu,) [N m]."""
 
     def __init__(self, scene: MujocoScene, motion: JointMotion, balance: Array) -> None:
         self._scene, self._motion = scene, motion
@@ -269,7 +265,7 @@ class TrackingController:
         self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
 
     def apply_input(self, t: float) -> Array:
-        """Apply and return the torques at time t [s], from the scene's state then, shape (nu,) [N m]."""
+        """Apply and return the torques (nu,) [N m] at time t [s], computed from the scene's present state."""
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
         reference = self._rest[driven] + offset
@@ -301,7 +297,7 @@ class _ServoCommander:
 
 
 def _initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
-    """Set the commands of all actuators and fill the history of delayed ones with them."""
+    """Set the commands of all actuators and fill the history of delayed actuators with them."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
     if hasattr(scene.mujoco, "mj_initCtrlHistory") and hasattr(model, "actuator_delay"):
@@ -311,7 +307,7 @@ def _initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
 
 
 def _settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Array) -> None:
-    """Bring the scene to rest under constant servo commands, with `damping` increased meanwhile."""
+    """Bring the scene to equilibrium under constant servo commands, with `damping` increased meanwhile."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
     held = _settling_model(scene, damping)
@@ -325,11 +321,11 @@ def _settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: A
 
 
 def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
-    """Let a scene settle as `held` says, and yield its largest velocity [rad/s] every tenth of a second.
+    """Let a scene settle with the model `held`, and yield its largest velocity [rad/s] every 0.1 s.
 
-    A grasp's time constant is two steps: at a short one a gripper beside what it holds may throw a fine chain about.
-    Where that loses the state it begins again, and grasps close in the first of those tenths as with the usual step.
-    """
+    With short steps, a gripper that is not at its grasped point can throw a fine chain about, because the time constant
+    of a grasp is two steps. If the state is lost, the scene restarts, and grasps close at the usual rate in the first
+    0.1 s."""
     data, step = scene.data, scene.mujoco.mj_step
     start, commands = data.qpos.copy(), data.ctrl.copy()
     block = max(1, round(0.1 / held.opt.timestep))
@@ -358,7 +354,7 @@ def _play(
     simulation: SimulationOptions,
     frames: IntArray,
 ) -> SimulationResult:
-    """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
+    """Simulate controller period by period, with constant torque in each; `frames` are simulator steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
     periods, ticks = simulation.controller_periods_per_sample, simulation._tick_steps()
     steps_per_second = simulation._steps_per_period * periods * simulation.sample_rate
@@ -398,10 +394,9 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 @dataclass(frozen=True)
 class ReplayErrorAgainstRecording:
-    """RMS error of a replayed model against the recording in one channel or group. Points count by distance.
+    """RMS error of a replayed model against the recording, in one channel or group; of points, the distance.
 
-    `noise_rms` is expected from sensor noise alone, zero if the recording does not state it.
-    """
+    `noise_rms` is expected from sensor noise alone, zero if the recording does not state it."""
 
     rmse: float
     noise_rms: float
@@ -409,24 +404,23 @@ class ReplayErrorAgainstRecording:
 
     @property
     def rmse_beyond_noise(self) -> float:
-        """Root mean square deviation beyond the noise. Zero if noise explains all."""
+        """Root mean square deviation beyond noise. Zero if noise explains all."""
         return float(np.sqrt(max(self.rmse**2 - self.noise_rms**2, 0.0)))
 
 
 def replay_mismatch_by_channel(
     text: str, system: System, recording: Recording
 ) -> dict[str, ReplayErrorAgainstRecording]:
-    """Replay a recording with a system's MJCF text and measure deviations. The text is `mujoco_xml` with actuators.
+    """Replay a recording in MuJoCo and measure deviations. `text` is the output of `mujoco_xml` with actuators.
 
-    Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
-    angles (`REPLAY_FEEDBACK_BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos
-    get what they were commanded and nothing else. Prescribed joints follow the recorded angles; the torque that this
-    takes is compared with the recorded one.
+    Driven joints are actuated by the recorded torque plus weak feedback to the recorded angles
+    (`REPLAY_FEEDBACK_BANDWIDTH`). Without feedback, small torque errors would let the arm drift away. Position servos
+    receive their recorded commands only. Prescribed joints follow the recorded angles, and the required torque is
+    compared with the recorded torque.
 
-    Returns `joints.position` of driven joints [rad] or `joints.effort` of prescribed ones [N m], all joints together,
-    and `GROUP.POINT` of every point of the model [m]. `ModelError` where nothing moves the model as recorded, it does
-    not come to rest, or it diverges; `DataError` where MuJoCo is not installed.
-    """
+    Returns `joints.position` of driven joints [rad] or `joints.effort` of prescribed joints [N m], all joints together,
+    and `GROUP.POINT` of every point [m]. Raises `ModelError` if the recording lacks the channels that drive the model,
+    the model does not settle, or it diverges; `DataError` if MuJoCo is not installed."""
     mujoco, model = import_mujoco(), mujoco_model_from_mjcf(text)
     moved = system.driven or system.prescribed
     joints = recording.joints
@@ -459,7 +453,7 @@ def replay_mismatch_by_channel(
 
 
 class _Path:
-    """Recorded angles, smoothed over some samples, as a motion from the first of them."""
+    """Recorded angles, smoothed over some samples, as a motion relative to the first angles."""
 
     def __init__(self, joints: tuple[str, ...], t: Array, position: Array, smoothed: float) -> None:
         from scipy.ndimage import gaussian_filter1d  # slow to import
@@ -475,7 +469,7 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Played:
-    """Times of all steps, shape (K,), angles or torques of the moved joints (K, nj), points (K, np, 3)."""
+    """Times (K,) of all steps, angles or torques (K, nj) of the moved joints, and points (K, np, 3)."""
 
     t: Array
     values: Array
@@ -488,7 +482,7 @@ def _step_times(scene: MujocoScene, end: float) -> Array:
 
 
 def _played(scene: MujocoScene, end: float, control: Callable[[int, float], Array | None]) -> _Played:
-    """Step to a time; `control` sets inputs at a step and its time, and may return the values of the moved joints."""
+    """Step up to a time. `control` sets inputs by step and time, and can return values of the moved joints."""
     mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
     times = _step_times(scene, end)
     values, points = np.empty((len(times), len(at))), np.empty((len(times), len(scene.point_site_ids), 3))
@@ -538,7 +532,7 @@ def _commanded(scene: MujocoScene, system: System, t: Array, commands: Array) ->
 
 
 def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
-    """The mass matrix; MuJoCo changed the order of the arguments."""
+    """The mass matrix, with either argument order of MuJoCo versions."""
     try:
         mujoco.mj_fullM(model, data, full)
     except TypeError:

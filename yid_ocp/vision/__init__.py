@@ -1,4 +1,4 @@
-"""Measure an object's points in a depth camera's clouds, and simulate such clouds with a virtual camera."""
+"""Measure points of an object in the clouds of a depth camera, and simulate such clouds with a virtual camera."""
 
 from yid_ocp.vision.calibration import CameraCalibration as CameraCalibration
 from yid_ocp.vision.calibration import CameraCalibrationOptions as CameraCalibrationOptions

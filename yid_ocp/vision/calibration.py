@@ -1,9 +1,8 @@
-"""Calibrate a sequence's camera in pose, depth and clock from the visible arm, and find late frame stamps.
+"""Calibrate the pose, depth and clock of a sequence's camera from the visible arm, and find late frame stamps.
 
-What stays uncertain is an error common to all frames, and enters the standard deviation of every point. A frame whose
-own clock offset is another than the common one was stamped late. Offset and latency are one number, stamp minus joint
-time.
-"""
+The remaining uncertainty is an error common to all frames; it is part of the standard deviation of every point. A frame
+whose own clock offset differs from the common offset was stamped late. Offset and latency cannot be separated: both are
+stamp minus joint time."""
 
 from __future__ import annotations
 
@@ -92,11 +91,10 @@ class _StampDelay(NamedTuple):
 def stamp_delay_beyond_clock_offset(
     arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
-    """Estimate a frame's stamp delay beyond the common clock offset [s] from the robot in world points (N, 3) [m].
+    """Estimate the delay [s] of a frame's stamp beyond the common clock offset, from its world points (N, 3) [m].
 
-    None where the arm is not in view. Where the misfit is not much larger than the `usual` one of other frames [m^2],
-    the offset is looked for nearby only.
-    """
+    None if the arm is not in view. If the misfit is close to the `usual` misfit of other frames [m^2], only nearby
+    delays are searched."""
     t, origin = float(state.stamps_to_joint_clock(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_MAX_START_POINTS]]
     chosen = points[arm.is_near_moving_surface_off_grasps(points, t, 2 * _OFF_ARM_DISTANCE)][:_MAX_ARM_POINTS]
@@ -117,7 +115,7 @@ def stamp_delay_beyond_clock_offset(
 
 
 def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: float) -> _StampDelay:
-    """The offset not far from a start, by Gauss and Newton's method within one reach after the other."""
+    """The delay near a start, by Gauss-Newton with successively shorter reach."""
     x = np.array([start, 0.0, 0.0, 0.0])
     hessian, sigma = np.zeros((4, 4)), _OFF_ARM_DISTANCE
     for share in _REACH_FACTORS:
@@ -143,7 +141,7 @@ def _mean_square(error: Array, count: int) -> float:
 
 
 def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], float]:
-    """Frames whose delays agree, so that frames stamped late do not bias the others, and the usual misfit [m^2]."""
+    """Frames with consistent delays, so that late stamps do not bias the others, and their usual misfit [m^2]."""
     known = {i: entry for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)}
     if not known:
         return [], 0.0
@@ -154,7 +152,7 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
 
 
 def is_frame_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
-    """Whether a frame's stamp is significantly late or early, beyond the offset common to all frames."""
+    """Whether a frame's stamp is significantly late or early relative to the common offset."""
     return abs(own.delay) > max(options.max_frame_offset_deviation, _STAMP_ERROR_STDS * own.std)
 
 
@@ -211,7 +209,7 @@ class CameraCalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """Result of a camera calibration, with camera state, covariance, prior and arm visibility."""
+    """Result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
 
     camera_state: CameraState  # what is used: pose, depth, clock
     prior_state: CameraState
@@ -225,14 +223,13 @@ class CameraCalibration:
 
     @property
     def camera_position(self) -> Array:
-        """The camera's position, shape (3,) [m]."""
+        """Position of the camera in the world, (3,) [m]."""
         return self.camera_state.pose[:3, 3]
 
     def point_std_from_calibration(self, points: Array, velocity: Array, stamps: Array) -> Array:
-        """Standard deviations of points from the camera's uncertain pose, depth and clock, (N, 3) [m].
+        """Standard deviations (N, 3) [m] of points due to the camera's uncertain pose, depth and clock.
 
-        The same error for all of them, as far as they stand at one place; `velocity` (N, 3) [m/s], `stamps` (N,) [s].
-        """
+        The error is the same for all points at one location. `velocity` (N, 3) is in m/s, `stamps` (N,) in s."""
         slopes = np.empty((len(points), 3, CAMERA_STATE_SIZE))
         slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.world_point_jacobian_by_pose_and_depth(points)
         # a point that is dated too early is where it came to be later
@@ -246,7 +243,7 @@ class CameraCalibration:
 
 
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
-    """Make a calibration from the given pose and clock offset without estimation. `reason` says why."""
+    """Make a calibration from the given pose and clock offset, without estimation. `reason` says why."""
     text = f"clock offset {1e3 * options.initial_offset:.0f} ms as given" + (f": {reason}" if reason else "")
     state = CameraState(pose, clock_offset=options.initial_offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
@@ -264,10 +261,9 @@ def calibrate_camera(
 ) -> CameraCalibration:
     """Estimate a camera's pose, depth and clock from frames that show the arm, starting at a pose (4, 4).
 
-    The frames are thinned, the robot and what is about it among the points; `source` says where they come from.
-    `DataError` where the arm is not seen, does not lie where the camera sees something, or moves too little to tell the
-    time.
-    """
+    `glimpses` are thinned frames that include the robot and its surroundings; `source` names their origin in messages.
+    Raises `DataError` if the arm is not in view, does not match the clouds, or moves too little to determine the
+    clock."""
     about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
     told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:
@@ -281,7 +277,7 @@ def calibrate_camera(
 
 
 class _UntoldError(Exception):
-    """Why the arm does not tell."""
+    """Reason why the arm does not determine the calibration."""
 
     def __init__(self, reason: str, hint: str) -> None:
         super().__init__(reason)
@@ -300,7 +296,7 @@ class _Calibrator:
 
     @cached_property
     def precision(self) -> Array:
-        """Inverse covariance of the prior, shape (10, 10)."""
+        """Inverse covariance (10, 10) of the prior."""
         own = self.options
         pose = [*[own.rotation_prior_std] * 3, *[own.translation_prior_std] * 3]
         # a uniform distribution over what is searched; taken as it is where nothing is
@@ -346,7 +342,7 @@ class _Calibrator:
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
     def _about_the_arm(self, glimpse: CalibrationFrame) -> CalibrationFrame | None:
-        """The points in the directions of the arm by the stated camera; None where it is out of view."""
+        """The points around the arm, as seen by the specified camera; None if the arm is out of view."""
         own = self.told.world_to_measured_points(self.arm.visible_surface_points(self.told, glimpse.stamp)[0])
         points = glimpse.points[glimpse.points[:, 2] > 0]
         if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):
@@ -358,7 +354,7 @@ class _Calibrator:
         return CalibrationFrame(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
     def _start(self, glimpses: Sequence[CalibrationFrame]) -> CameraState:
-        """The state near which most of the arm is where the camera sees something."""
+        """The state at which most of the arm's surface coincides with measured points."""
         few = []
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
@@ -382,7 +378,7 @@ class _Calibrator:
     def _rounds(
         self, state: CameraState, frames: Sequence[CalibrationFrame], reach: float, along: bool, most: int, rounds: int
     ) -> tuple[CameraState, RobustCostDerivatives, list[CalibrationFrame]]:
-        """The state after some steps on a limited number of points of each frame, the sum there, and these points."""
+        """The state after some steps on a limited number of points per frame, its cost, and these points."""
         chosen = []
         for glimpse in frames:
             points = state.measured_to_world_points(glimpse.points)

@@ -1,17 +1,17 @@
-"""Register a camera's pose, depth and clock to the robot that it sees.
+"""Register a camera's pose, depth and clock to the robot in its view.
 
 A point p that the camera measured at its time s should lie on the robot's surface at the joint angles of that time:
 
-    P = t + R (g + o/z) p,      e = n . (P - surface(q(s - tau0 - beta (s - s0)))),
+    P = t + R (g + o/z) p,      e = n . (P - surface(q(s - tau0 - beta (s - s0)))).
 
-with the camera's pose (R, t), a factor g and an offset o on its depth z along the ray, and its clock, ahead by tau0 and
-by beta in every second. The surface's point is where the camera's ray through P meets the robot, or the nearest one,
-which leads from further away. Steps are those of Gauss and Newton on a robust sum (Geman and McClure) of e, with the
-stated values as the mean of a normal prior.
+(R, t) is the camera's pose, g a factor and o an offset of its depth z along the ray. Its clock is ahead by tau0, and by
+beta in every second. The surface point is the intersection of the robot with the camera's ray through P, or the nearest
+surface point, which converges from further away. Gauss-Newton minimises a robust sum (Geman and McClure) of e, with a
+normal prior about the specified values.
 
-Errors are alike from pixel to pixel of a frame, and from frame to frame at one place of a link. The covariance is the
-sandwich H^-1 B H^-1 with B summed over frames and over patches of the links as wholes, less what each patch has in each
-frame; data weigh against the prior by how much larger B is than H.
+Errors are correlated between pixels of a frame, and between frames at one location of a link. The covariance is the
+sandwich H^-1 B H^-1. B is summed over frames and over patches of the links as clusters, minus the sum over patches in
+each frame. The data are weighted against the prior by the ratio of H to B.
 
 References
 ----------
@@ -63,7 +63,7 @@ _MIN_CURVATURE_FRACTION = 0.2  # of the robust sum, of that of its weights
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Estimated camera state, with pose, depth scale and offset, and clock offset and drift."""
+    """Estimated camera state: pose, depth scale and offset, clock offset and drift."""
 
     pose: Array  # (4, 4), camera in the world, R and t
     depth_scale: float = 1.0  # on a measured depth, g
@@ -73,7 +73,7 @@ class CameraState:
     clock_reference_stamp: float = 0.0  # s0 [s]
 
     def measured_to_world_points(self, points: Array) -> Array:
-        """Transform measured points from the camera's frame to the world, shape (N, 3) [m]."""
+        """Transform measured points (N, 3) [m] from the camera's frame to the world."""
         placed = np.asarray(points @ self.pose[:3, :3].T)
         if self.depth_scale != 1.0 or self.depth_offset != 0.0:
             placed *= (self.depth_scale + self.depth_offset / points[:, 2])[:, None]
@@ -81,7 +81,7 @@ class CameraState:
         return placed
 
     def world_to_measured_points(self, points: Array) -> Array:
-        """Transform world points to the camera's measurements, shape (N, 3) [m]."""
+        """Transform world points (N, 3) [m] to the camera's measurements."""
         own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         return np.asarray(own * ((1.0 - self.depth_offset / own[:, 2:3]) / self.depth_scale))
 
@@ -91,7 +91,7 @@ class CameraState:
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
     def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
-        """Jacobian of world points with respect to pose and depth, shape (N, 3, 8)."""
+        """Jacobian (N, 3, 8) of world points with respect to pose and depth."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
@@ -104,7 +104,7 @@ class CameraState:
         return result
 
     def with_state_increment(self, change: Array) -> CameraState:
-        """Add rotation (world axes), translation, log depth scale, depth and clock offset, and drift to the state."""
+        """Camera state after a change of rotation (world axes), translation, log depth scale, depth and clock."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
@@ -115,7 +115,7 @@ class CameraState:
         )
 
     def difference_from(self, other: CameraState) -> Array:
-        """Subtract another state from this one, shape (10,)."""
+        """Difference (10,) of this state from another one."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
         clock = self.clock_offset - other.clock_offset, self.clock_drift - other.clock_drift
@@ -124,7 +124,7 @@ class CameraState:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFrame:
-    """One frame with its stamp [s] and points in the camera's frame, shape (N, 3) [m]."""
+    """One frame: its stamp [s] and its points (N, 3) [m] in the camera's frame."""
 
     stamp: float
     points: Array
@@ -160,7 +160,7 @@ class ArmSurface:
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
     def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
-        """World points on moving surfaces that an unobstructed camera sees, and the surface part of each."""
+        """World points on moving surfaces that an unobstructed camera sees, and the surface part of each point."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _MIN_INCIDENCE_COSINE) & (part >= 0) & self._moving[part]
@@ -178,7 +178,7 @@ class ArmSurface:
     def match_points_to_surface(
         self, points: Array, origin: Array, t: float, reach: float, along: bool
     ) -> _SurfaceMatches:
-        """Match world points to the arm's surface, along camera rays or to the nearest surface."""
+        """Match world points to the arm's surface, along camera rays (`along`) or to the nearest surface point."""
         q = self.configuration_at(t)
         if along:
             ahead = points - origin
@@ -217,7 +217,7 @@ class ArmSurface:
 
 
 class _SurfaceMatches(NamedTuple):
-    """Points matched to the arm: indices, normal distance e [m], normal, normal velocity [m/s], part, local place."""
+    """Points matched to the arm: index, normal distance e [m], normal, normal velocity [m/s], part, local position."""
 
     point_indices: IntArray
     normal_distance: Array
@@ -247,7 +247,7 @@ class RobustCostDerivatives:
         return weight * self.hessian, weight * self.gradient, weight
 
     def state_covariance(self, precision: Array) -> Array:
-        """Covariance of the state that minimises data and prior cost, shape (10, 10)."""
+        """Covariance (10, 10) of the state that minimises data and prior cost."""
         hessian, _, weight = self.data_hessian_gradient_and_weight(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
@@ -277,7 +277,7 @@ def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: fl
 
 
 def _at_least(least: Array, matrix: Array) -> Array:
-    """A symmetric matrix that is in no direction below another one, which is positive."""
+    """A symmetric matrix that is in no direction smaller than another, positive definite one."""
     base = least + 1e-12 * np.diag(np.diag(least)) + 1e-300 * np.eye(len(least))
     values, vectors = eigh(matrix, base)
     back = vectors.T @ base  # the inverse of the vectors, which are orthonormal in the base
@@ -289,9 +289,8 @@ def initial_camera_states(
 ) -> list[CameraState]:
     """Candidate camera states that place the arm's visible surface on the clouds, best first.
 
-    So many at most, at least `_MIN_START_SEPARATION` from one another, with clock offsets up to `search` [s] from the
-    stated one.
-    """
+    Returns at most `most` states, at least `_MIN_START_SEPARATION` apart, with clock offsets within `search` [s] of the
+    specified state `told`."""
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
     sides, ahead = (np.arange(-n, n + 1, _CELL_STRIDE) for n in (_SIDEWAYS_CELLS, _FORWARD_CELLS))
@@ -319,7 +318,7 @@ def initial_camera_states(
 def _add_costs(
     total: Array, arm: ArmSurface, told: CameraState, glimpse: CalibrationFrame, delays: Array, cells: IntArray
 ) -> None:
-    """Add to `total` (delays, cells) costs of the arm's points as they were `delays` [s] earlier, shifted by cells."""
+    """Add the costs of the arm's points, `delays` [s] earlier and shifted by cells, to `total` (delays, cells)."""
     from scipy.ndimage import distance_transform_edt  # slow to import, and only for a camera whose place is sought
 
     points, part = arm.visible_surface_points(told, glimpse.stamp)
@@ -372,7 +371,7 @@ class SurfaceVisibilityFractions:
 def pooled_surface_visibility_fractions(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
 ) -> SurfaceVisibilityFractions:
-    """Fractions of the arm's visible surface that clouds contain, occlude or see through. `within` is in metres."""
+    """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)
     for glimpse in glimpses:
         points, _ = arm.visible_surface_points(state, glimpse.stamp)

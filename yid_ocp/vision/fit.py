@@ -2,11 +2,10 @@
 
     q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
 
-p_i: point of the cloud (f = 1), or node of its skeleton, the mean of the visible half of a tube (f = pi/4); c_i:
-nearest point of the model's line segments, r_i the radius of its tube. rho is Geman and McClure's loss. g: distance of
-held frames from the grippers. b: bends, in proportion to the square root of their stiffness. Twists about the tubes'
-axes move no centre line and stay at rest.
-"""
+p_i is a point of the cloud (f = 1), or a node of its skeleton, the mean of a tube's visible half (f = pi/4). c_i is the
+nearest point of the model's line segments, r_i the radius of its tube, rho the Geman-McClure loss. g is the distance of
+held frames from the grippers. b are bends times the square root of their stiffness. Twists about a tube's axis do not
+move its centre line and stay at zero."""
 
 from __future__ import annotations
 
@@ -103,11 +102,10 @@ class ShapeFitOptions:
 
 
 class ShapeFitter:
-    """Fits an object's configuration to camera points. Parameters that are not given are nominal.
+    """Fits an object's configuration to camera points. Parameters default to their nominal values.
 
-    Beside the bends, `loose` joints are sought with next to no prior: see `initial_shapes.system_with_free_root`.
-    `DataError` for a system without an object.
-    """
+    The `loose` joints are fitted with the bends and nearly without prior (`initial_shapes.system_with_free_root`).
+    Raises `DataError` if the system has no object."""
 
     def __init__(
         self,
@@ -181,11 +179,11 @@ class ShapeFitter:
         return np.array(self._corners(q)[0]).reshape(-1, 2, 3)
 
     def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
-        """Fit the object's shape in one frame, from guesses `starts` and the robot's configuration `q_known` (n,).
+        """Fit the object's shape in one frame, from the guesses `starts` and the robot's configuration `q_known` (n,).
 
-        The passes on the nodes, which cost little, run from all starts (rest where absent), the others from the best
-        that was found. `DataError` where there is no point.
-        """
+        The fit has two stages. The cheap passes on skeleton nodes run from every guess (default: the undeformed shape).
+        The passes on points run from the best result. `sight` is the filtered cloud. Raises `DataError` if it has no
+        points."""
         if not len(sight.points) or not len(sight.skeleton_nodes):
             raise DataError("there is no point to fit to", where="fit")
         free = list(self.free_joints)
@@ -215,7 +213,7 @@ class ShapeFitter:
         return trial
 
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
-        """A configuration with some tubes as at rest."""
+        """A configuration with some tubes undeformed."""
         free = list(self.free_joints)
         again = np.array([owner in tubes for owner in self._free_joint_segments])
         return self._with_free(q, np.where(again, self.rest_configuration[free], q[free]))
@@ -226,7 +224,7 @@ class ShapeFitter:
     def _rivals(
         self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud
     ) -> list[Array]:
-        """Other shapes that the cloud speaks for as much, where a thing touches a tube."""
+        """Other shapes that fit the cloud equally well, if a foreign object touches a tube."""
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
         tubes = self.tube_links_at_configuration(best.q)
@@ -243,7 +241,7 @@ class ShapeFitter:
         return found
 
     def _failed(self, evidence: ShapeFitQualityAndPointClasses) -> set[str]:
-        """Tubes of which too much is seen to be empty."""
+        """Tubes of which too large a part is visibly empty."""
         own = {name: self._lengths * self._links_of({name}) for name in self.link_segments}
         return {
             name
@@ -255,7 +253,7 @@ class ShapeFitter:
     def _without(
         self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud, links: BoolArray
     ) -> _Left:
-        """All nodes and points but those on which some links lie."""
+        """All nodes and points except those on some links."""
         tubes, nodes = self.tube_links_at_configuration(best.q), sight.skeleton_nodes
         link = tube_link_projections(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (evidence.is_own | evidence.is_contested)
@@ -265,7 +263,7 @@ class ShapeFitter:
     def _attempt(
         self, sight: ProcessedFrameCloud, starts: Sequence[Array], left: _Left
     ) -> tuple[_Minimum, ShapeFitQualityAndPointClasses]:
-        """The best shape through some of the nodes and points, then through those that belong to it."""
+        """The best shape through some of the nodes and points, refined with the points that belong to it."""
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
         tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
@@ -282,7 +280,7 @@ class ShapeFitter:
 
     @property
     def max_informative_surface_distance(self) -> float:
-        """Distance from the surface beyond which points carry no information on the shape [m]."""
+        """Distance [m] from the surface beyond which points carry no information on the shape."""
         return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _MAX_POINT_DISTANCE_SCALES
 
     def _tasks(
@@ -301,7 +299,7 @@ class ShapeFitter:
         return nodes_first, points_then
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
-        """Minimum after several passes, each starting at the end of the one before."""
+        """Minimum after several passes, each starting at the result of the previous one."""
         end, most = start, self.options.max_iterations
         for task in tasks:
 
@@ -325,7 +323,7 @@ class ShapeFitter:
         rivals: Sequence[Array],
         sight: ProcessedFrameCloud,
     ) -> FrameShapeFit:
-        """The shape with its standard deviations, and what speaks for and against it."""
+        """The shape with its standard deviations and fit quality."""
         q, on_shape = best.q, evidence.is_own | evidence.is_contested
         points, jacobian = (np.array(x) for x in self._seen(q))
         places = points.reshape(-1, 3)
@@ -368,7 +366,7 @@ class ShapeFitter:
         )
 
     def _quadratic(self, q: Array, task: _Task) -> LocalQuadraticModel:
-        """Cost, gradient and Gauss-Newton Hessian by the free bends."""
+        """Cost, gradient and Gauss-Newton Hessian with respect to the free bends."""
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
         seen = task.points, task.camera, task.share
@@ -409,7 +407,7 @@ class ShapeFitter:
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
     ) -> FrameTubeDimensionCost:
-        """Cost of lengths and radii by a frame's points at its shape."""
+        """Cost of lengths and radii by the points of a frame at its fitted shape."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
         corners, jacobian = self._links_at(q), self._corners(q)[1]
@@ -456,11 +454,11 @@ class ShapeFitter:
         return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
     def gripper_positions_at_configuration(self, q: ArrayLike) -> Array:
-        """Gripper positions at a configuration, shape (grasps, 3) [m]."""
+        """Gripper positions (grasps, 3) [m] at a configuration."""
         return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
 
     def points_at_configuration(self, q: ArrayLike) -> Array:
-        """Positions of the system's points at a configuration, shape (np, 3) [m]."""
+        """Positions (np, 3) [m] of the system's points at a configuration."""
         return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
 
 
@@ -473,7 +471,7 @@ class _Minimum(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, seen ends."""
+    """One pass: points, their weights, their location on the tubes, loss scale, camera, observed ends."""
 
     points: Array
     weight: Array
@@ -484,7 +482,7 @@ class _Task(NamedTuple):
 
 
 def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOptions) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Corners of the links, the system's points, what grasps hold in standard deviations, and their gaps."""
+    """Corners of the links, points of the system, grasp errors in standard deviations, and grasp gaps."""
     tree = kinematics.mechanism
     corners = []
     for segment in system.segment_layouts:

@@ -1,7 +1,7 @@
 """Read and write folders of clouds or depth images with time stamps and a camera (`yid-frames/1`).
 
-PLY files are read without a library in C: damage must not end the process. Turk (1994), The PLY polygon file format.
-"""
+PLY files (Turk 1994, The PLY polygon file format) are read in Python, because a damaged file must not end the
+process."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _Cloud = tuple[Array, PointColourArray | None]
 
 
 def _read_cloud(path: Path, coloured: bool = False) -> _Cloud:
-    """A cloud; colours of PLY files only where asked for."""
+    """A cloud; colours of PLY files only if requested."""
     files.check_input_file(path, _MAX_FRAME_BYTES)
     if path.suffix.lower() == ".ply":
         return _read_ply(path, coloured)
@@ -109,7 +109,7 @@ def _read_pcd(path: Path) -> _Cloud:
 
 
 def _read_depth_image(path: Path) -> Array:
-    """A depth image in the file's unit, shape (height, width); `DataError` where it is no grey PNG of 16 bits."""
+    """A depth image (height, width) in the file's unit. `DataError` if it is not a grey 16-bit PNG."""
     o3d = import_open3d()
     with files.check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
         head = file.read(24)  # whose last eight bytes are a PNG's width and height
@@ -135,7 +135,7 @@ _Element = tuple[str, int, list[tuple[str, str]]]
 
 
 def _read_ply(path: Path, coloured: bool) -> _Cloud:
-    """Positions and colours of the vertices; other properties and later elements are left out."""
+    """Positions and colours of the vertices; other properties and later elements are ignored."""
     head, end, body = path.read_bytes().partition(b"end_header")
     line, _, body = body.partition(b"\n")
     if not end or len(head) > _MAX_HEADER_BYTES or line.strip() or not head.startswith(b"ply"):
@@ -158,7 +158,7 @@ def _damaged(path: Path, why: str) -> DataError:
 
 
 def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
-    """Byte order (empty for ASCII), and the elements in the order of the file."""
+    """Byte order (empty for ASCII), and the elements in file order."""
     order: str | None = None
     found: list[_Element] = []
     for line in text.splitlines()[1:]:
@@ -218,12 +218,11 @@ def read_frame_folder(
 ) -> FrameSequence:
     """Read a folder of point clouds or depth images as a frame sequence, one frame at a time.
 
-    The folder holds `camera.json` (`yid-frames/1`: `pose` 4x4, `frame` "camera" or "world" of the clouds, `unit` "m" or
-    "mm" of the clouds, `intrinsics` and `depth_unit` [m] of depth images), `timestamps.csv` (columns `file`, `t` [s])
-    and the files that it names: PLY, PCD, NPZ or XYZ clouds, or 16-bit PNG depth images, in any order. They are read
-    when they are needed. A `pose`, shape (4, 4), or a `unit` that is given replaces the folder's. `DataError` for no
-    such folder, no time stamps, no pose, an unknown key or unit, depth images without intrinsics.
-    """
+    `camera.json` (`yid-frames/1`) holds `pose` (4x4), `frame` ("camera" or "world") and `unit` ("m" or "mm") of clouds,
+    `intrinsics` and `depth_unit` [m] of depth images. `timestamps.csv` has the columns `file` and `t` [s]. The files
+    are PLY, PCD, NPZ or XYZ clouds, or 16-bit PNG depth images, in any order; each is read on demand. The arguments
+    `pose` (4, 4) and `unit` replace the folder's values. Raises `DataError` if the folder, its time stamps or pose are
+    missing, a key or unit is unknown, or depth images have no intrinsics."""
     path = Path(folder)
     if not path.is_dir():
         raise DataError("there is no such folder of frames", where=str(path), hint="check the path")
@@ -254,7 +253,7 @@ def read_frame_folder(
 
 
 def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) -> None:
-    """Write a frame sequence as binary PLY clouds for `read_frame_folder`. `OutputError` where that is not possible."""
+    """Write a frame sequence as binary PLY clouds for `read_frame_folder`. Raises `OutputError`."""
     path, o3d = files.make_folder(folder), import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):
@@ -276,7 +275,7 @@ def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) 
 
 
 def metres_per_unit(unit: str, where: str) -> float:
-    """Convert a cloud's length unit to metres [m]. `DataError` for an unknown one."""
+    """Length of a cloud's unit in metres [m]. Raises `DataError` for an unknown unit."""
     if unit not in _METRES_PER_UNIT:
         raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_error_arguments(unit, _METRES_PER_UNIT))
     return _METRES_PER_UNIT[unit]

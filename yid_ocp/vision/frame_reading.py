@@ -1,8 +1,7 @@
 """Read frame sequences from a folder, a ROS bag, an MCAP file, or a RealSense or Azure Kinect recording.
 
-Of a bag, `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`; its messages
-are read when they are needed.
-"""
+Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`. Messages are
+read on demand."""
 
 from __future__ import annotations
 
@@ -101,7 +100,7 @@ def _first(bag: OpenBag, topic: str) -> Any:
 
 
 def _depth_unit(bag: OpenBag, topic: str) -> float:
-    """Factor on the usual unit of depth images, from the file of a RealSense camera; 1 where it says nothing."""
+    """Factor on the usual unit of depth images, from the file of a RealSense camera; 1 if not stated."""
     for name in (entry.name for entry in bag.topics):
         if name.endswith(_PER_METRE) and name.split("/")[:3] == topic.split("/")[:3]:
             return float(_first(bag, name).data) / _DEPTH_ENCODINGS["mono16"][1]
@@ -132,7 +131,7 @@ def _is_depth(bag: OpenBag, topic: str) -> bool:
 
 
 def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
-    """Intrinsics from the camera's messages that stand nearest to an image's topic."""
+    """Intrinsics from the camera messages whose topic is most similar to an image's topic."""
     infos = bag.topic_names_of_types(_CAMERA_INFO_MESSAGE)
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
@@ -171,7 +170,7 @@ def _depth(content: Any, per_metre: float, where: str) -> Array:
 
 
 def _cloud_columns(content: Any, names: Iterable[str], where: str) -> list[NDArray[Any]] | None:
-    """Some fields of a PointCloud2, each shape (N,); None where one is missing."""
+    """Some fields (N,) of a PointCloud2; None if one is missing."""
     fields = {str(field.name): field for field in content.fields}
     height, width, step, row = (int(getattr(content, k)) for k in ("height", "width", "point_step", "row_step"))
     data = np.asarray(content.data, np.uint8).tobytes()
@@ -212,11 +211,10 @@ def read_frames(
 ) -> FrameSequence:
     """Read a frame sequence from a folder or file of a depth camera, one frame at a time.
 
-    `path`: a folder (`read_frame_folder`), a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file, of which `topic`
-    names the clouds or depth images, or an Azure Kinect's `.mkv`, where the build of Open3D reads it. The camera's
-    `pose` (4, 4) in the world and the `unit` of clouds replace the folder's; others do not say them. `DataError` where
-    what is there cannot be read, or lacks time stamps, pose or intrinsics.
-    """
+    `path` is a folder (`read_frame_folder`), a ROS 1 or ROS 2 bag, an MCAP or RealSense file with clouds or depth
+    images under `topic`, or an Azure Kinect `.mkv` (if the Open3D build reads it). `pose` (4, 4) of the camera in the
+    world and `unit` of clouds replace a folder's values and are needed for other formats. Raises `DataError` if the
+    input cannot be read, or lacks time stamps, pose or intrinsics."""
     place = Path(path)
     ending = place.suffix.lower()
     if place.is_dir():
@@ -238,7 +236,7 @@ _FILM_HINT = "write its depth images as 16-bit PNG into a folder with camera.jso
 
 
 class _Film:
-    """Video file of an Azure Kinect, read frame by frame; the last frame is kept."""
+    """Video file of an Azure Kinect, read frame by frame; the last frame is cached."""
 
     reader: Any = None
     _kind: Any
@@ -287,7 +285,7 @@ class _Film:
 
 
 def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
-    """Depth registered to the colour camera, as Open3D gives it."""
+    """Depth registered to the colour camera, as returned by Open3D."""
     camera, film = validated_camera_pose(pose, f"{path}: give track.camera_pose"), _Film(path)
     metadata = film.reader.get_metadata()
     inner = metadata.intrinsics

@@ -1,4 +1,4 @@
-"""Select good frames, the object's root end in them, and the uncertainty of their points."""
+"""Select good frames, determine the object's root end in them, and the uncertainty of their points."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _RootPlacement = Literal["model", "fixed", "free"]
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Settings for turning a frame sequence into measured points and selecting its good frames."""
+    """Settings for the conversion of a frame sequence to measured points, and the selection of good frames."""
 
     filters: Annotated[CloudFilterOptions, OptionInfo("what counts as the object")] = field(
         default_factory=CloudFilterOptions
@@ -127,7 +127,7 @@ _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # of a normal variable, in stand
 
 
 def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
-    """Reason to reject a frame by its own fit, without comparison with other frames. Empty for a good one."""
+    """Reason to reject a frame because of its own fit, without comparison with other frames. Empty if good."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
@@ -152,7 +152,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
 
 
 def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
-    """Mark frames that deviate from the other good frames as dropped. All frames are returned."""
+    """Mark frames that deviate from the other good frames as dropped. Returns all frames."""
     fits = _good_fits(frames)
     if not fits:
         return list(frames)
@@ -172,7 +172,7 @@ def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -
 
 
 def _good_fits(frames: Sequence[FrameReport]) -> dict[int, FrameShapeFit]:
-    """Shapes of the good frames by the frames' places."""
+    """Shapes of the good frames, by position in the sequence."""
     return {k: frame.shape_fit for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None}
 
 
@@ -184,11 +184,10 @@ def tracked_states_and_points(
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Collect times, configurations, positions, their standard deviations and the shared part for `TrackResult`.
+    """Times, configurations, positions, their standard deviations and the shared part, for `TrackResult`.
 
-    Of the points in `columns` of the system's in the good frames. `DataError` without a good frame, or where no point
-    is known well enough in any.
-    """
+    The result covers good frames, and the system's points with the indices `columns`. Raises `DataError` if no frame is
+    good, or if no point is known well enough in any frame."""
     good, sizes, calibration = _good_fits(frames), common.dimensions, common.camera_calibration
     if not good:
         raise _none_good(frames, sizes, things, source)
@@ -239,7 +238,7 @@ def _because(sizes: TubeDimensionEstimates, matters: bool) -> str:
 
 
 def _hint(sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], otherwise: str) -> str:
-    """Advice of a refusal: known errors of the object and things near it first, then general advice."""
+    """Advice in an error message: first known errors of the object and foreign objects near it, then general advice."""
     notes = [*sizes.messages, *(thing.text for thing in things)]
     return "; ".join([*notes[:_MAX_NOTES], otherwise])
 
@@ -255,11 +254,10 @@ _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends, by which one i
 
 
 def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
-    """Make the object's root the same end in all fits. A text says how that end was chosen.
+    """Make the object's root the same end in all fits. Also returns a text that says how the end was chosen.
 
-    Where a shape fits as well with its root at another end, the ends are followed from frame to frame first. Then the
-    root is the one that stays in its place, if it is fixed, or the higher one.
-    """
+    If a shape fits equally well with its root at another end, ends are first followed from frame to frame. The root is
+    then the end that does not move (if it is fixed) or the higher end."""
     if options.root_placement == "model":
         return list(frames), ""
     fitted = _good_fits(frames)
@@ -311,7 +309,7 @@ def _ends(fits: Iterable[FrameShapeFit | None]) -> tuple[Array, Array]:
 
 
 def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
-    """Drop frames whose root is not where it is in the others, where it is fixed."""
+    """Drop frames whose root position differs from the other frames, if the root is fixed."""
     good, made = _good_fits(frames), list(frames)
     if options.root_placement == "fixed" and good:
         roots = _ends(good.values())[0]

@@ -1,6 +1,6 @@
-"""Frames of a depth camera, with clouds, time stamps, the lens and occlusion.
+"""Frames of a depth camera: clouds, time stamps, lens and occlusion.
 
-With x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and theta = atan r, a point appears at u = fx x' + cx, v = fy y' + cy, where
+With x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and theta = atan r, a point has the pixel u = fx x' + cx, v = fy y' + cy, where
 
     plumb_bob, rational    x' = c x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = c y + p1 (r^2 + 2 y^2) + 2 p2 x y,
                            c = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
@@ -40,10 +40,10 @@ _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """Intrinsics of a camera with x right, y down and z ahead. `DataError` for an unknown distortion model.
+    """Intrinsics of a camera with axes x right, y down, z forward. `DataError` for an unknown distortion model.
 
-    Focal lengths and principal point [pixels] of  u = fx x/z + cx,  v = fy y/z + cy  without distortion.
-    """
+    Focal lengths fx, fy and principal point (cx, cy) are in pixels; without distortion u = fx x/z + cx, v = fy y/z +
+    cy."""
 
     width: int
     height: int
@@ -76,14 +76,13 @@ class CameraIntrinsics:
 
     @property
     def pixel_rays_at_unit_depth(self) -> Array:
-        """Direction of every pixel with z = 1, shape (height, width, 3). NaN where the lens shows none."""
+        """Direction (height, width, 3) of every pixel, with z = 1. NaN for pixels outside the lens."""
         return _rays(self)
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
-        """Convert a depth image to points in the camera's frame, row by row, (height, width) to (N, 3) [m].
+        """Convert a depth image (height, width) to points (N, 3) [m] in the camera's frame, row by row.
 
-        Zero or NaN is where nothing was measured; errors as `measured_depth_mask`.
-        """
+        Zero or NaN marks missing depth. Errors are as in `measured_depth_mask`."""
         image = np.asarray(depth, float)
         seen = np.flatnonzero(self.measured_depth_mask(image))
         # a third of the time that a mask over rows takes
@@ -92,7 +91,7 @@ class CameraIntrinsics:
         return points
 
     def measured_depth_mask(self, depth: Array) -> BoolArray:
-        """Mask of measured pixels in a depth image, shape (height, width). `DataError` for another size."""
+        """Mask (height, width) of measured pixels in a depth image. Raises `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
         return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays_at_unit_depth[..., 0]))
@@ -123,7 +122,7 @@ def _rays(lens: CameraIntrinsics) -> Array:
 
 
 def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[Array, Array]:
-    """Solution of distort(x, y) = aim by Newton's method; NaN where the lens's formula does not reach."""
+    """Solution of distort(x, y) = aim by Newton's method; NaN outside the range of the distortion model."""
     x, y, h = aim_x, aim_y, 1e-6
     if lens.model == "equidistant":  # the aim is an angle, which is nearer to the answer as one
         bent = np.maximum(np.hypot(aim_x, aim_y), 1e-9)
@@ -149,7 +148,7 @@ XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58
 
 @cache
 def import_open3d() -> ModuleType:
-    """Import the open3d package. `DataError` where it is not installed or cannot be loaded."""
+    """Import the open3d package. Raises `DataError` if it is not installed or cannot be loaded."""
     hint = "pip install 'yid-ocp[vision]'"
     with contextlib.suppress(ImportError, OSError):  # the system may have its own
         # the wheel of open3d wants the system's libusb, which a bare machine does not have
@@ -181,14 +180,14 @@ class FrameSequence:
         return len(self.frame_names)
 
     def load_world_cloud(self, index: int) -> Array:
-        """Load a frame's cloud in the world, shape (N, 3) [m]. `DataError` where it cannot be read."""
+        """Load a frame's cloud (N, 3) [m] in the world. Raises `DataError` if it cannot be read."""
         return self.load_cloud(index) @ self.camera_pose[:3, :3].T + self.camera_pose[:3, 3]
 
     @staticmethod
     def from_clouds(
         t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence"
     ) -> FrameSequence:
-        """Make a frame sequence from clouds (N, 3) [m] in the camera's frame. The stamps are `t` (M,) [s]."""
+        """Make a frame sequence from clouds (N, 3) [m] in the camera's frame, with stamps `t` (M,) [s]."""
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
         camera = validated_camera_pose(pose, source)
@@ -196,7 +195,7 @@ class FrameSequence:
 
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """Pose of a camera at `eye` that looks at `target`, (4, 4) [m]. Its axes are x right, y down, z ahead."""
+    """Pose (4, 4) [m] of a camera at `eye` that looks at `target`, with axes x right, y down, z forward."""
     ahead = np.asarray(target, float) - np.asarray(eye, float)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, np.asarray(up, float))
@@ -205,7 +204,7 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 
 
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
-    """Check a camera's pose. `DataError` where it is missing or not a rigid transform."""
+    """Camera pose (4, 4) after checks. Raises `DataError` if it is missing or not a rigid transform."""
     hint = "give the camera in the world as a 4x4 matrix, x right, y down, z ahead, translation in metres"
     if pose is None:
         raise DataError("the pose of the camera is missing", where=where, hint=hint)
@@ -235,7 +234,7 @@ _MIN_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 @dataclass(frozen=True, eq=False)
 class OcclusionMap:
-    """Map of what the surfaces in a frame hide, computed from all measured points."""
+    """Map of the regions that surfaces in a frame hide, computed from all measured points."""
 
     points: Array  # (N, 3), in the world, before anything is left out [m]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world
@@ -245,11 +244,10 @@ class OcclusionMap:
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def is_hidden(self, places: Array, radius: Array, margin: float) -> BoolArray:
-        """Whether world places (S, 3) are occluded, shadowed by something nearer, or outside the image.
+        """Whether world positions (S, 3) are occluded, shadowed by something nearer, or outside the image.
 
-        What is nearer to the camera than a place by more than its radius (S,), by which it reaches about its line of
-        sight, and a margin stands before it, all in [m].
-        """
+        A surface occludes a position if it is nearer to the camera by more than `radius` (S,) plus `margin` [m].
+        `radius` is also the size of the position across the line of sight."""
         seen, depth = _picture(places, self.camera_pose)
         asked, wide = seen.T, radius / np.maximum(depth, _MIN_DEPTH)
         if self.intrinsics is not None:
@@ -277,7 +275,7 @@ class OcclusionMap:
 
     @cached_property
     def _borders(self) -> Array:
-        """Where the picture ends, lowest and highest, as far as points along all of a side show it; else infinite."""
+        """Lower and upper image borders, if points along a whole side show them; else infinite."""
         borders = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
         seen, _ = self._all
         if seen.size:
@@ -295,7 +293,7 @@ class OcclusionMap:
         return borders
 
     def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
-        """Points of the picture round about the places: where in the picture, and how deep."""
+        """Image points near the given positions: their image coordinates and depths."""
         # a shadow of the nearest point falls so far beside its place in the picture
         shadow, narrow = _MAX_STEREO_BASELINE / float(self._all[1].min(initial=np.inf)), float(wide.min())
         reach = max(float(wide.max()), shadow)
@@ -318,7 +316,7 @@ class OcclusionMap:
 
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
-        """Whether a nearer surface hides the point from the other camera of the pair."""
+        """Whether a nearer surface hides the point from the projector or second camera."""
         widest = (
             _MAX_STEREO_BASELINE * (1.0 / max(float(distance.min()), _MIN_DEPTH) - 1.0 / limit) if limit > 0 else 0.0
         )
@@ -331,7 +329,7 @@ class OcclusionMap:
 
 
 def _picture(points: Array, pose: Array) -> tuple[Array, Array]:
-    """Image coordinates of points, x/z and y/z, shape (2, N), and their depth z [m]."""
+    """Image coordinates x/z and y/z (2, N) of points, and their depth z [m]."""
     local = pose[:3, :3].T @ points.T
     local -= (pose[:3, :3].T @ pose[:3, 3])[:, None]
     local[:2] /= np.maximum(local[2], _MIN_DEPTH)

@@ -1,8 +1,8 @@
 """Find initial shapes for the shape fit from the object's centerline in the cloud.
 
-The graph of a cloud's nearest points is cut into slices of equal distance along it from one end; touching parts of
-neighbouring slices make a graph of their own (Reeb's), whose cycles are loops of the object. Its ends are given to the
-root and the tips of the object in every way in which their distances agree; each way is a start.
+The nearest-neighbour graph of a cloud is cut into slices of equal geodesic distance from one end. Touching parts of
+neighbouring slices form a Reeb graph, whose cycles are loops of the object. Its ends are assigned to the root and the
+tips of the object in every way that agrees with the path lengths between them. Each assignment gives an initial shape.
 
 References
 ----------
@@ -50,7 +50,7 @@ class _Centerline:
 
     @property
     def end_nodes(self) -> IntArray:
-        """Nodes at which only one edge ends."""
+        """Nodes with only one edge."""
         return np.flatnonzero(np.bincount(self.edges.ravel(), minlength=len(self.nodes)) <= 1)
 
     @property
@@ -60,7 +60,7 @@ class _Centerline:
         return CloudSkeleton(self.nodes, none, self.edges, np.zeros(len(self.nodes), dtype=np.int64))
 
     def outward_direction(self, end: int) -> Array:
-        """Unit vector along the object at one of its ends, away from it, shape (3,)."""
+        """Unit vector (3,) along the object at one of its ends, away from it."""
         far, _ = self.path_lengths_from(end)
         near = np.flatnonzero(
             (far > 0) & (far <= max(_END_DIRECTION_SLICES * self.slice_width, float(far[far > 0].min())))
@@ -69,12 +69,12 @@ class _Centerline:
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 
     def path_lengths_from(self, start: int) -> tuple[Array, IntArray]:
-        """Path length from a node to every other one [m], and the predecessor of each."""
+        """Path length [m] from a node to every other node, and the predecessor of each."""
         far, before = dijkstra(_graph(self.nodes, self.edges), directed=False, indices=start, return_predecessors=True)
         return np.asarray(far), np.asarray(before, dtype=np.int64)
 
     def path_between(self, start: int, end: int) -> Array:
-        """Positions of the nodes on the path between two nodes, shape (., 3) [m]."""
+        """Positions (., 3) [m] of the nodes on the path between two nodes."""
         _, before = self.path_lengths_from(start)
         way = [end]
         while way[-1] != start:
@@ -83,10 +83,9 @@ class _Centerline:
 
 
 def cloud_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
-    """Compute the centerline of the object in a cloud, a tree of nodes with loops. Empty for too few points.
+    """Compute the centerline of the object in a cloud, a tree of nodes plus loops. Empty if there are too few points.
 
-    `diameter` is that of its thickest tube [m]; parts further apart than `gap` [m] do not hang together.
-    """
+    `diameter` [m] is that of the thickest tube. Parts with a distance of more than `gap` [m] are not connected."""
     points = cloud.points
     if len(points) > _MAX_POINTS:
         points = points[np.sort(rng.choice(len(points), _MAX_POINTS, replace=False))]
@@ -108,7 +107,7 @@ def _graph(nodes: Array, edges: IntArray) -> csr_matrix:
 
 
 def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
-    """The points of parts that are large and near enough, and the graph that joins them."""
+    """The points of parts that are large and near enough, and the graph that connects them."""
     distance, index = cKDTree(points).query(points, k=_N_NEIGHBOURS + 1)
     rows = np.repeat(np.arange(len(points)), _N_NEIGHBOURS)
     columns, lengths = index[:, 1:].ravel(), distance[:, 1:].ravel()
@@ -153,7 +152,7 @@ def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, 
 
 
 def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
-    """Shortest edges that join all nodes, and where an edge left out closes a longer way than `loop` [m]."""
+    """Shortest edges that connect all nodes, and positions of omitted edges that close loops over `loop` [m]."""
     if not len(edges):
         return edges, np.empty((0, 3))
     forest = minimum_spanning_tree(_graph(nodes, edges)).tocoo()
@@ -165,7 +164,7 @@ def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
 
 
 def _pruned(trace: _Centerline, twig: float) -> _Centerline:
-    """The trace without branches that are shorter than `twig` [m], the shortest first, and chains kept whole."""
+    """The trace without branches shorter than `twig` [m], removed shortest first; chains are kept whole."""
     nodes, edges = trace.nodes, trace.edges
     while len(edges):
         count = np.bincount(edges.ravel(), minlength=len(nodes))
@@ -180,7 +179,7 @@ def _pruned(trace: _Centerline, twig: float) -> _Centerline:
 
 
 def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[float, list[int]]:
-    """Length of the branch from an end to where another one leaves [m], and its nodes with that one last."""
+    """Length [m] of the branch from an end to the next junction, and its nodes, the junction last."""
     order, _ = breadth_first_order(_graph(nodes, edges), end, directed=False)
     way, length = [end], 0.0
     for node in order[1:]:
@@ -199,7 +198,7 @@ _WHOLE_OBJECT_TOLERANCE = 0.08  # of the object, by which a course may be off th
 
 @dataclass(frozen=True, eq=False)
 class ObservedObjectEnd:
-    """Observed position of one end of an object, along its own direction."""
+    """Observed position of one end of an object, along the object's axis there."""
 
     link_end_index: int  # among the links' starts and ends, in this order link by link
     direction: Array  # (3,), unit vector along the object
@@ -216,7 +215,7 @@ class _InitialShape(NamedTuple):
 
 
 def system_with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
-    """Make a system without grasps whose object has six named free root joints (position [m], x-y-z angles)."""
+    """Make a system without grasps, whose object has six named free root joints (position [m], x-y-z angles)."""
     tree = system.numeric_mechanism(values)
     q = ca.SX.sym("q", system.n_coordinates)
     base = tree.joint_index(next(s for s in system.segment_layouts if s.parent_segment is None).link_joints[0][0])
@@ -236,7 +235,7 @@ class _Link(NamedTuple):
 
 
 class ShapeFitInitialGuesses:
-    """Finds object shapes along a centerline. Some joints are bent from rest (n,); `lengths` are of links [m]."""
+    """Finds object shapes along a centerline by bending joints from `rest` (n,); `lengths` are of links [m]."""
 
     def __init__(
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]
@@ -269,11 +268,10 @@ class ShapeFitInitialGuesses:
         np.fill_diagonal(self._end_distances, 0.0)
 
     def initial_shapes_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
-        """Find initial shapes that follow a centerline whose ends are as far apart as the object's.
+        """Find initial shapes that follow a centerline whose path lengths between ends match the object's.
 
-        `DataError` where it has other ends than the object, or is not as long: part of the object is hidden, or
-        something else hangs together with it.
-        """
+        Raises `DataError` if the number of ends or the lengths differ from the object's, because a part of the object
+        is hidden or something else is connected to it."""
         leaves, n_ends = trace.end_nodes, len(self._end_distances)
         if not n_ends <= len(leaves) <= _MAX_ENDS:
             counts = f"the cloud has {len(leaves)} ends, the object {n_ends}"
@@ -295,7 +293,7 @@ class ShapeFitInitialGuesses:
         return [self._along(trace, [int(leaves[k]) for k in chosen]) for chosen in kept]
 
     def _along(self, trace: _Centerline, ends: Sequence[int]) -> _InitialShape:
-        """The start whose root and tips lie at some nodes of the course."""
+        """The initial shape whose root and tips are at some nodes of the centerline."""
         reaches = zip(ends[1:], self._root_to_tip_lengths, strict=True)
         courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
         q, first = self._rest.copy(), self._links[0]
@@ -322,7 +320,7 @@ class ShapeFitInitialGuesses:
         return np.asarray(self._placed[joint] @ Rotation.from_rotvec(value * self._axis[joint]).as_matrix())
 
     def _bend(self, q: Array, joints: Sequence[int], aim: Array, turned: list[Array]) -> None:
-        """Set the bends of a link so that its z axis, by which it is long, looks where it should."""
+        """Set the bends of a link such that its z axis (its long axis) has the required direction."""
         bends, carrier = [j for j in joints if j in self._bends], self._parent[joints[0]]
         base, ahead = turned[carrier] if carrier >= 0 else np.eye(3), np.array([0.0, 0.0, 1.0])
         for j in joints:
@@ -340,7 +338,7 @@ class ShapeFitInitialGuesses:
 
 
 class _Course:
-    """A way through a cloud as a line, by length along it, which is stretched to that of the object."""
+    """A path through a cloud as a polyline, parameterised by length and scaled to the object's length."""
 
     def __init__(self, nodes: Array, length: float) -> None:
         steps = np.linalg.norm(np.diff(nodes, axis=0), axis=1)

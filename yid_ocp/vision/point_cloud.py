@@ -116,7 +116,7 @@ class CloudFilterOptions:
 
 
 class ReachableObjectRegion:
-    """Region that the object's branches can reach above the floor. For a root `anywhere` the options define it."""
+    """Region that the object's branches can reach above the floor. For a root `anywhere`, the options define it."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class ReachableObjectRegion:
         self._base = np.mean(bases, axis=0) if bases else None
 
     def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
-        """Make a test of which points (N, 3) are in the region, for a configuration (n,) and camera at (3,) [m]."""
+        """Test of whether points (N, 3) are in the region, for a configuration (n,) and a camera at (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:
@@ -194,12 +194,11 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
 def is_statistical_inlier(
     cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None
 ) -> BoolArray:
-    """Find the inliers of statistical outlier removal, shape (N,). False outside the mask `asked`.
+    """Find the inliers (N,) of statistical outlier removal. False outside the mask `asked`.
 
-    A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
-    median absolute deviation turned into a standard deviation. Both are weighted, so that wrong points, each alone in
-    its voxel, count for little, and are of points all over the cloud, whichever are asked.
-    """
+    A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + ratio s. s is the
+    median absolute deviation, scaled to a standard deviation. Both statistics use the whole cloud. They are weighted,
+    so that outliers, each alone in its voxel, have little influence."""
     if len(cloud) <= neighbours:
         return np.zeros(len(cloud), bool)
     tree = cKDTree(cloud.points, compact_nodes=False, balanced_tree=False)
@@ -218,17 +217,16 @@ def is_statistical_inlier(
 
 
 def has_wanted_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
-    """Whether each point has one of the wanted colours, shape (N,).
+    """Whether each point has one of the wanted colours, (N,).
 
-    Colours are red, green and blue, 0 to 255 (sRGB), shapes (N, 3) and (C, 3). `angle` is the largest between two of
-    them as directions of linear light, which brightness does not change [rad].
-    """
+    `colours` (N, 3) and `wanted` (C, 3) are red, green and blue, 0 to 255 (sRGB). `angle` [rad] is the largest angle
+    between matching colours as directions of linear light, which do not depend on brightness."""
     seen, asked = (_light_directions(np.asarray(entry, float) / 255.0) for entry in (colours, wanted))
     return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(angle))
 
 
 def _light_directions(colours: Array) -> Array:
-    """Unit directions of linear light; black, which has none, is grey."""
+    """Unit directions of linear light; black is treated as grey."""
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     linear = np.maximum(linear, 1e-6)
     return np.asarray(linear / np.linalg.norm(linear, axis=1)[:, None])
@@ -264,7 +262,7 @@ class SkeletonOptions:
 
 @dataclass(frozen=True, eq=False)
 class CloudSkeleton:
-    """Skeleton of a cloud, with nodes, a spanning forest between them, and the node of each point."""
+    """Skeleton of a cloud: nodes, a spanning forest between them, and the node of each point."""
 
     nodes: Array  # (K, 3), centroids of the kept segments, in the order of the walk [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
@@ -273,7 +271,7 @@ class CloudSkeleton:
 
     @property
     def is_point_assigned_to_node(self) -> BoolArray:
-        """Whether each point of the cloud belongs to a node, shape (N,)."""
+        """Whether each point (N,) of the cloud belongs to a node."""
         return self.node_of_point >= 0
 
 
@@ -307,7 +305,7 @@ def _thin_to_nodes(
 
 
 def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
-    """The nearest points of a centre within the radius, no more than a segment has."""
+    """The nearest points of a centre within the radius, at most as many as a segment has."""
     square, within = _square_distances(points, centre), options.neighbour_radius**2
     if len(square) > options.segment_neighbours:
         found = np.argpartition(square, options.segment_neighbours - 1)[: options.segment_neighbours]
@@ -338,7 +336,7 @@ _DEFAULT_OPTIONS = SkeletonOptions()
 def extract_skeleton(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULT_OPTIONS
 ) -> CloudSkeleton:
-    """Extract the skeleton of a cloud from the lowest point on. Connected parts with too few points are left out."""
+    """Extract the skeleton of a cloud, starting at its lowest point. Connected parts with few points are omitted."""
     nodes, size, label = _thin_to_nodes(cloud, rng, options)
     edges, part = _spanning_forest(nodes, options)
     if not len(nodes):

@@ -1,13 +1,12 @@
-"""Calibration shared by all frames of a sequence, for camera, background, foreign objects and dimensions.
+"""Calibration shared by all frames of a sequence: camera, background, foreign objects and dimensions.
 
-Of every frame the least cost about the sizes x (logarithms of lengths and radii over the model's), the bends following,
-is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). Together, with a wide prior P, the frames fitted anew at every x,
+x are the logarithms of tube lengths and radii relative to the model. The minimum over the bends of the cost of frame f
+is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). With a wide prior P, frames refitted at every x, and sums g and S:
 
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 
-The second term is the scatter between frames. b is what all frames share: the error of an end's place with the camera's
-pose, and noise along the sight, which changes a radius by as much as its square over it.
-"""
+The second term is the scatter between frames. b is the error shared by all frames: end positions shift with the
+camera's pose, and depth noise changes a radius by its square over the radius."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ class BackgroundPoints:
         return cKDTree(self.points)
 
     def is_near_background(self, points: Array, beyond: float = 0.0) -> BoolArray:
-        """Whether points lie within `match_distance + beyond` of the background [m]. Points (N, 3), result (N,)."""
+        """Whether points (N, 3) lie within `match_distance + beyond` [m] of the background, (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
@@ -66,9 +65,8 @@ class BackgroundPoints:
     ) -> BackgroundPoints:
         """Find background in world clouds: an empty scene, or points static in most frames and off fitted shapes.
 
-        Counted in cubes of an edge `voxel`, with points of standard deviation `noise`; what ever was nearer than `near`
-        to the surface of a tube may be the object's, all in [m].
-        """
+        Points are counted in cubes of edge `voxel` and have the standard deviation `noise`. Points that were ever
+        nearer than `near` to a tube's surface can belong to the object and are excluded. All are in [m]."""
         if not clouds or (shapes is not None and not shapes):
             return BackgroundPoints()
         cells = [np.unique(np.floor(cloud / voxel).astype(np.int64), axis=0) for cloud in clouds]
@@ -103,9 +101,9 @@ def group_foreign_clusters(
 ) -> tuple[ForeignObject, ...]:
     """Group the foreign clusters of all frames, each with its time [s], into foreign objects with advice.
 
-    `noise` is a point's standard deviation, `box` the corners (3,) in which the object ever was [m]; `links` gives the
-    poses (4, 4) of the robot's links at a time; `background` says that what stands still is left out already.
-    """
+    `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
+    `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already
+    removed."""
     groups: list[list[tuple[float, ForeignCluster]]] = []
     for t, thing in ((t, thing) for t, seen in things for thing in seen):
         home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
@@ -146,13 +144,13 @@ def group_foreign_clusters(
 
 
 def _apart(one: ForeignCluster, other: ForeignCluster) -> float:
-    """Distance of two things, in shares of their size in which they pass for the same."""
+    """Distance of two clusters, relative to the distance at which they count as the same object."""
     size = max(float(np.linalg.norm(one.extent)), float(np.linalg.norm(other.extent)), 1e-6)
     return float(np.linalg.norm(one.centre - other.centre)) / (_SAME_THING_DISTANCE * size)
 
 
 def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
-    """Link within which places wander much less than in the world; empty for none."""
+    """Link relative to which positions move much less than in the world; empty if none."""
 
     def wandering(own: Array) -> float:
         return _MAD_TO_STD * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
@@ -189,23 +187,23 @@ class TubeDimensionEstimates:
 
     @property
     def dimension_log_ratio_std(self) -> Array:
-        """Standard deviation of the logarithm of estimated over model dimension, shape (2 s,)."""
+        """Standard deviation (2 s,) of the logarithm of estimated over model dimension."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def determined_dimension_mask(self) -> BoolArray:
-        """Mask of the dimensions of s tubes that the frames determine, shape (2 s,)."""
+        """Mask (2 s,) of the dimensions of s tubes that the frames determine."""
         return np.asarray((self.dimension_log_ratio_std < _MAX_KNOWN_LOG_STD) & (self.n_frames > 0))
 
     @property
     def contradicted_model_value_mask(self) -> BoolArray:
-        """Mask of the model's dimensions of s tubes that contradict the frames, shape (2 s,)."""
+        """Mask (2 s,) of the model's dimensions of s tubes that contradict the frames."""
         off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
         return np.asarray(self.determined_dimension_mask & off)
 
     @property
     def contradiction_message(self) -> str:
-        """Describe model values that contradict the frames and are not estimated instead. Empty if there are none."""
+        """Describe model dimensions that contradict the frames and are not estimated. Empty if there are none."""
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
             f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
@@ -230,10 +228,10 @@ class TubeDimensionEstimates:
         return tuple(lines)
 
     def point_std_due_to_dimensions(self, points: Array) -> Array:
-        """Stds of points from wrong or uncertain tube dimensions, (np, 3) [m]. `points`: derivatives (np, 3, 2 s).
+        """Standard deviations (np, 3) [m] of points due to wrong or uncertain tube dimensions.
 
-        The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.
-        """
+        `points` (np, 3, 2 s) are derivatives. A contradicted dimension that is not estimated contributes its whole
+        displacement, an estimated dimension its standard deviation."""
         used = np.array(self.estimated_dimension_mask)
         wrong = np.where(self.contradicted_model_value_mask & ~used, self.log_ratio, 0.0)
         chosen = points[..., used]
@@ -241,7 +239,7 @@ class TubeDimensionEstimates:
         return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
 
     def parameter_values(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
-        """Replace the model's sizes in the parameter values by the estimated ones."""
+        """Parameter values with the model's dimensions replaced by the estimated ones."""
         return _changed(system, given, np.where(self.estimated_dimension_mask, self.log_ratio, 0.0))
 
 
@@ -254,9 +252,8 @@ def estimate_and_check_dimensions(
 ) -> TubeDimensionEstimates:
     """Estimate the tubes' dimensions from some frames and compare them with the model.
 
-    `std` are the standard deviations of a point's distance from the surface, and of the places' error that all frames
-    share [m]; `fitted` makes the fits of the frames from parameter values and the configurations of the round before.
-    """
+    `std` holds the standard deviations [m] of a point's distance from the surface and of the position error shared by
+    all frames. `fitted` fits the frames, given parameter values and the configurations of the previous round."""
     sizes = tube_link_lengths_and_radii(system, given).values()
     told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
     count, many = len(told), len(told) // 2
@@ -290,7 +287,7 @@ def estimate_and_check_dimensions(
 
 
 def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
-    """Fits whose free ends agree with those of the others, relative to the shape."""
+    """Fits whose free ends agree with those of other fits, relative to the shape."""
     if not fits:
         return []
     ends, noise = np.array([fit.end_offsets for fit in fits]), float(np.median([fit.noise_std for fit in fits]))
@@ -302,7 +299,7 @@ def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
 
 
 def _changed(system: System, given: Mapping[str, float] | None, change: Array) -> dict[str, float]:
-    """Parameter values with the sizes changed by logarithms (2 s,)."""
+    """Parameter values with dimensions changed by the logarithms (2 s,)."""
     values = dict(zip(system.parameters.names, system.parameters.vector(given).tolist(), strict=True))
     lengths, radii = zip(*((ca.vertcat(*s.link_lengths), s.radius) for s in system.segment_layouts), strict=True)
     for entry, by in zip((*lengths, *radii), change, strict=True):

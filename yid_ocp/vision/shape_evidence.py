@@ -1,9 +1,8 @@
-"""Assess a shape by a frame's cloud, from own points, foreign points, and links without points.
+"""Assess a shape by a frame's cloud: own points, foreign points, and links without points.
 
-Of the points that are not near the tubes' surface, those that hang together and are as many as a piece of tube as long
-as it is wide would have are a thing. Where a thing's surface goes on from the shape's, points within two tubes' reach
-are contested and say nothing. A station of a tube that no own point lies on is hidden, or visibly empty.
-"""
+Points away from the tubes' surface form a foreign cluster if they are connected and as many as on a piece of tube as
+long as its diameter. If the cluster's surface continues the shape's, points within two tube radii of the contact are
+contested and not used. A tube station without own points is either hidden or visibly empty."""
 
 from __future__ import annotations
 
@@ -50,11 +49,11 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Project points (N, 3) on the nearest of links (K, 2, 3). Nearness is to `share` of the radius (K,) [m].
+    """Project points (N, 3) on the nearest of links `corners` (K, 2, 3), with radii (K,) [m].
 
-    Index of the link and place along it from 0 to 1, both (N,), unit vectors (N, 3) from the centre line to the points,
-    and distances (N,) from it [m].
-    """
+    The nearest link has the smallest distance minus `share` times its radius. Returns link index (N,), position along
+    the link from 0 to 1 (N,), unit vectors (N, 3) from centre line to point, and distances (N,) from the centre line
+    [m]."""
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
     # (p - a).d and |p - a|^2 for all points and links at once, by products of matrices
@@ -70,13 +69,13 @@ def tube_link_projections(
 
 
 def link_axes(link_ends: Array) -> Array:
-    """Unit vectors along links, shape (K, 3). The links are (K, 2, 3)."""
+    """Unit vectors (K, 3) along links (K, 2, 3)."""
     edge = link_ends[:, 1] - link_ends[:, 0]
     return np.asarray(edge / np.linalg.norm(edge, axis=1)[:, None])
 
 
 def link_normals_perpendicular_to_sight(link_ends: Array, camera: Array) -> Array:
-    """Unit vectors perpendicular to links (K, 2, 3) and to a camera's line of sight, shape (K, 3)."""
+    """Unit vectors (K, 3) perpendicular to links (K, 2, 3) and to the camera's lines of sight."""
     across = np.cross(link_ends[:, 1] - link_ends[:, 0], link_ends.mean(axis=1) - camera)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None])
 
@@ -96,7 +95,7 @@ class ForeignCluster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQuality:
-    """Fit quality of a shape in one frame, with noise, distances, link coverage, end offsets and foreign clusters."""
+    """Fit quality of a shape in one frame: noise, distances, link coverage, end offsets, foreign clusters."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
@@ -108,7 +107,7 @@ class ShapeFitQuality:
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
     def covered_fraction_of_visible_links(self, lengths: Array) -> float:
-        """Fraction of the visible length of links with own points. Lengths are (K,) [m]. 0 if none is visible."""
+        """Fraction of the visible length of links (`lengths` (K,) [m]) with own points; 0 if none is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
@@ -147,7 +146,7 @@ class ProcessedFrameCloud:
         return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
     def _is_hidden_or_filtered(self, places: Array, radius: Array, margin: float) -> BoolArray:
-        """Whether places are hidden from the camera or removed by filters, shape (S,)."""
+        """Whether positions (S,) are hidden from the camera or removed by filters."""
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
             hidden |= self.occlusion_map.is_hidden(places, radius, margin)
@@ -211,11 +210,10 @@ def fit_quality_and_point_classes(
 
 
 def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
-    """Masks of skeleton nodes and points where the cloud is as narrow as the tube, (K,) and (N,).
+    """Masks of skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube.
 
-    About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
-    spread as far in two.
-    """
+    Around a tube, points have a large spread in one direction and r/sqrt(3) across. On a table, wall or body they have
+    a large spread in two directions."""
     within = _SURROUNDING_RADII * radius
     thin = np.zeros(len(sight.skeleton_nodes), bool)
     for i, around in enumerate(sight._point_tree.query_ball_point(sight.skeleton_nodes, within)):
@@ -228,7 +226,7 @@ def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) ->
 
 
 def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> IntArray:
-    """Connected parts of some of the points that are large enough, the largest 0; -1 for all other points."""
+    """Component index of points in large connected parts, 0 for the largest; -1 for all other points."""
     part, index = np.full(len(chosen), -1), np.flatnonzero(chosen)
     if not len(index):
         return part
@@ -247,7 +245,7 @@ def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> In
 def _contacts(
     tree: cKDTree, seen: ProcessedFrameCloud, shape: BoolArray, foreign: BoolArray, within: float
 ) -> BoolArray:
-    """Points of the shape from which a thing's surface goes on, nearly as dense as the shape's."""
+    """Points of the shape from which a foreign surface continues, nearly as dense as the shape's."""
     contact = np.zeros(len(shape), bool)
     if not foreign.any():
         return contact
@@ -262,7 +260,7 @@ def _contacts(
 def _coverage(
     tubes: TubeLinks, seen: ProcessedFrameCloud, own: BoolArray, link: IntArray, along: Array, gate: float
 ) -> tuple[Array, Array]:
-    """Shares of each link that have own points, and that visibly have none."""
+    """Fractions of each link with own points, and visibly without points."""
     lengths = np.linalg.norm(tubes.link_ends[:, 1] - tubes.link_ends[:, 0], axis=1)
     count = np.maximum(_MIN_LINK_STATIONS, np.ceil(lengths / (2 * tubes.radius))).astype(np.int64)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
@@ -279,7 +277,7 @@ def _coverage(
 
 
 def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link: IntArray, offset: Array) -> Array:
-    """Variance of points across each link, seen from the camera, beyond that of a tube of its radius."""
+    """Variance of points across each link, in the camera's view, beyond that of a tube of its radius."""
     across, count = link_normals_perpendicular_to_sight(tubes.link_ends, seen.camera_position), len(tubes.link_ends)
     square = np.einsum("ij,ij->i", offset, across[link]) ** 2
     weight = np.bincount(link[counted], seen.point_weights[counted], minlength=count)
@@ -289,7 +287,7 @@ def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link
 
 
 def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: float) -> tuple[float, BoolArray]:
-    """Where points end along a tube's last link, from its tip [m], NaN if unseen, and which lie in between."""
+    """Offset [m] of the last point along a tube's last link from its tip, NaN if unseen, and the points between."""
     (start, tip), radius, axis = tubes.link_ends[link], float(tubes.radius[link]), link_axes(tubes.link_ends)[link]
     thick = max(radius, 2 * seen._point_spacing)
     behind = max(3, int(float(np.linalg.norm(tip - start)) / thick))
@@ -327,11 +325,10 @@ class _SurfaceResiduals(NamedTuple):
 def nearest_surface_residuals(
     corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
 ) -> _SurfaceResiduals:
-    """Residuals e = |p - c| - f r of points p (N, 3). c is the nearest axis point, f = `share` of the radius r.
+    """Residuals e = |p - c| - f r of points p (N, 3); c is the nearest axis point, f = `share` of the radius r.
 
-    Links are (K, 2, 3), radii (K,), the camera (3,) [m]. A point that only the far side of a tube is near to counts
-    from the near side.
-    """
+    Links `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest to a tube's far side is assigned to
+    the near side."""
     link, along, normal, distance = tube_link_projections(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
     error = sign * distance - share * radius[link]
@@ -342,12 +339,11 @@ def nearest_surface_residuals(
 
 
 def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
-    """Errors of points along the line of sight from the tubes. Parameters are those of `nearest_surface_residuals`.
+    """Errors of points from the tubes along the line of sight. Parameters are as in `nearest_surface_residuals`.
 
-    Across the sight a point stands where its pixel does, by u from the axis; towards the camera the surface lies at
-    sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it
-    appear thinner by several times noise^2/r. Points near the rim, where depth says little, are not compared.
-    """
+    At a distance u from the axis across the line of sight, the surface is sqrt(r^2 - u^2) nearer to the camera than the
+    axis. Errors along the surface normal would give the same tube position, but a radius too small by several times
+    noise^2/r. Points near the rim, where depth is not informative, are omitted."""
     link, along, normal, distance = tube_link_projections(corners, radius, points)
     axis = link_axes(corners)[link]
     sight = camera - points
@@ -369,8 +365,7 @@ def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera
 class FrameTubeDimensionCost:
     """Quadratic cost g'x + x'Sx/2 of tube dimensions x in one frame, minimised over the joint angles.
 
-    The sizes x are the logarithms of all lengths and then of all radii, segment by segment, relative to the fit's.
-    """
+    x holds the logarithms of all lengths, then of all radii, segment by segment, relative to the fit's dimensions."""
 
     gradient: Array  # (2 s,)
     hessian: Array  # (2 s, 2 s)
@@ -392,7 +387,7 @@ class FrameShapeFit(ShapeFitQuality):
 
     @property
     def visible_length_coverage(self) -> float:
-        """Fraction of the shape's visible length that has points."""
+        """Fraction of the shape's visible length with points."""
         return self.covered_fraction_of_visible_links(
             np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
         )

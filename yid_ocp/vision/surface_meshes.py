@@ -1,7 +1,7 @@
-"""Surface meshes of robot, tubes and surroundings, and a virtual depth camera that sees them.
+"""Surface meshes of robot, tubes and surroundings, and a virtual depth camera that renders them.
 
-Each surface is in a joint's moving frame. Noise and steps of the camera, a structured-light sensor, are even in the
-pattern's disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
+Each surface is in a joint's moving frame. Noise and quantization of the structured-light camera are uniform in the
+disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
 
 References
 ----------
@@ -85,7 +85,7 @@ class TriangleMesh:
     faces: IntArray
 
     def transformed(self, pose: ArrayLike) -> TriangleMesh:
-        """Transform the mesh by a pose, shape (4, 4)."""
+        """Mesh transformed by a pose (4, 4)."""
         matrix = np.asarray(pose, float)
         return TriangleMesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
 
@@ -127,10 +127,9 @@ class TriangleMesh:
 
 
 class ArticulatedSurfaces:
-    """Surface meshes on the joints of a numeric mechanism, with ray and distance queries. -1 is the world.
+    """Surface meshes on the joints of a numeric mechanism, with ray and distance queries. Joint -1 is the world.
 
-    Every joint keeps one scene in its own frame, to which rays and points are brought: nothing is rebuilt as it moves.
-    """
+    Each joint has a scene in its own frame. Rays and points are transformed to it, so motion needs no new scene."""
 
     def __init__(self, mechanism: Mechanism, meshes: Mapping[int, TriangleMesh]) -> None:
         o3d = import_open3d()
@@ -151,12 +150,12 @@ class ArticulatedSurfaces:
         self._poses = ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))])
 
     def part_poses_at_configuration(self, q: ArrayLike) -> Array:
-        """Pose of every part in the world at a configuration, shape (parts, 4, 4)."""
+        """World poses (parts, 4, 4) of all parts at a configuration."""
         stacked = np.array(self._poses(np.asarray(q, float)))
         return np.asarray(stacked.reshape(4, len(self.part_joints), 4).transpose(1, 0, 2))
 
     def _near(self, points: Array, part: int, pose: Array, margin: float) -> tuple[IntArray, Array]:
-        """Points of the world in a part's box, widened by a margin [m]: their indices, and they in the part's frame."""
+        """World points in a part's box, widened by a margin [m]: indices, and positions in the part's frame."""
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         (low, high), inside = self._boxes[part], np.ones(len(local), bool)
         for axis in range(3):  # column by column, which is quicker than whole rows
@@ -167,7 +166,7 @@ class ArticulatedSurfaces:
     def is_within_surface_distance(
         self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
     ) -> BoolArray:
-        """Whether world points (N, 3) are within `reach` [m] of any, or any moving, surface at a configuration."""
+        """Whether world points (N, 3) are within `reach` [m] of any (or any moving) surface at a configuration."""
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
             asked = np.flatnonzero(~result)
@@ -204,8 +203,8 @@ class ArticulatedSurfaces:
     ) -> tuple[Array, Array, IntArray]:
         """Render noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
 
-        All have shape (height, width): infinite, 0 and -1 where there is nothing. `pose` (4, 4) is in the world.
-        """
+        All have shape (height, width), with inf, 0 and -1 for pixels without a surface. `pose` (4, 4) is in the
+        world."""
         rays, camera = pinhole.pixel_rays_at_unit_depth, np.asarray(pose, float)
         size = rays.shape[:2]
         depth, cosine, owner = np.full(size, np.inf), np.zeros(size), np.full(size, -1)
@@ -224,12 +223,11 @@ class ArticulatedSurfaces:
         return depth, cosine, owner
 
     def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, IntArray]:
-        """Find the first intersection of rays with any surface. They leave one world place (3,) along directions (N,
-        3).
+        """Find the first intersection of rays, from `origin` (3,) in the world along `directions` (N, 3), with any
+        surface.
 
-        Distances (N,) in lengths of the directions, unit normals (N, 3) towards the origin, and parts (N,); infinite,
-        zero and -1 for rays that meet nothing.
-        """
+        Returns distances (N,) in multiples of the direction vectors, unit normals (N, 3) that face the origin, and part
+        indices (N,). A ray without intersection has distance inf, normal zero and part -1."""
         distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
         owner = np.full(len(directions), -1)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
@@ -241,7 +239,7 @@ class ArticulatedSurfaces:
         return distance, np.where(away[:, None], -normal, normal), owner
 
     def _cast(self, part: int, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """Distances in lengths of the directions, and normals, where rays of a part's frame meet it."""
+        """Distances, in multiples of `directions`, and normals at the intersections of rays in a part's frame."""
         packed = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
         answer = self._scenes[part].cast_rays(_tensor(packed), nthreads=1)
         return answer["t_hit"].numpy().astype(np.float64), answer["primitive_normals"].numpy()
@@ -249,7 +247,7 @@ class ArticulatedSurfaces:
     def _window(
         self, pinhole: CameraIntrinsics, rotation: Array, origin: Array, part: int
     ) -> tuple[slice, slice] | None:
-        """Rows and columns of the image in which a part may be seen."""
+        """Rows and columns of the image that can show a part."""
         seen = (np.array(list(product(*self._boxes[part].T))) - origin) @ rotation
         if (seen[:, 2] < _MIN_PROJECTED_DISTANCE).all():
             return None
@@ -269,11 +267,10 @@ def _tensor(values: NDArray[Any]) -> Any:
 def load_robot_meshes_by_joint(
     urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual"
 ) -> dict[int, TriangleMesh]:
-    """Load meshes of a robot's links by the joint that carries them, in its frame. -1 stands for immobile links.
+    """Load meshes of a robot's links by joint index, in the joint's frame. Index -1 is the fixed base.
 
-    The numeric mechanism was read from the URDF file, or `package:baxter`, alone or joined with others. `ModelError`
-    where there is no such file, a mesh is missing or cannot be read, or there is no mesh at all.
-    """
+    `urdf` is a file or `package:baxter`. `mechanism` (numeric) contains this robot, alone or within a larger mechanism.
+    Raises `ModelError` if the file or a mesh is missing or unreadable, or if there is no mesh at all."""
     import yourdfpy
 
     path = resolve_urdf_path(urdf)
@@ -303,13 +300,13 @@ def load_robot_meshes_by_joint(
 
 
 def _carrier(mechanism: Mechanism, frame: str) -> tuple[int, Array]:
-    """Joint that carries a frame, and the frame's pose in it."""
+    """Joint that carries a frame, and the frame's pose relative to it."""
     found = mechanism.frames[frame]
     return found.joint_index, np.array(ca.DM(found.placement.homogeneous_matrix()))
 
 
 def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: float | None) -> TriangleMesh | None:
-    """A box of a size, a cylinder of radius and length, or a sphere of a radius about the origin; None for none."""
+    """A box of a size, a cylinder of radius and length, or a sphere of a radius, centred at the origin; else None."""
     if box is not None:
         return TriangleMesh.box(box)
     if cylinder is not None:
@@ -318,10 +315,10 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
 
 
 def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
-    """Load meshes missing from the URDF by the index of their joint. The world has -1.
+    """Load meshes missing from the URDF, by joint index (-1: the world).
 
-    `ConfigError` where there is no such link, or not exactly one shape; `ModelError` for a file that cannot be read.
-    """
+    Raises `ConfigError` if a link does not exist or an entry has not exactly one shape, `ModelError` if a file is
+    unreadable."""
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
         where = f"model: extra_meshes: {number}"
@@ -382,7 +379,7 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
 def tube_link_lengths_and_radii(
     system: System, values: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Array, float]]:
-    """Link lengths and radius of every tube, by segment name [m]."""
+    """Link lengths and radius [m] of every tube, by segment name."""
     segments, theta = system.segment_layouts, system.parameters.vector(values)
     sizes = [ca.densify(ca.vertcat(*segment.link_lengths, segment.radius)) for segment in segments]
     numbers = [
@@ -392,7 +389,7 @@ def tube_link_lengths_and_radii(
 
 
 def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
-    """Cylinders along the object's links with balls between them, by joint, in its frame; `DataError` without tubes."""
+    """Cylinders along the object's links, joined by balls, in joint frames by joint. `DataError` without tubes."""
     if not system.segment_layouts:
         raise DataError("the model has no object to see", hint="give it segments")
     meshes, sizes = dict[int, TriangleMesh](), tube_link_lengths_and_radii(system, values)
@@ -413,7 +410,7 @@ _PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
 
 @dataclass(frozen=True)
 class DepthSensorModel:
-    """Sensor model of a structured-light depth camera. The defaults are an Asus Xtion Pro Live."""
+    """Sensor model of a structured-light depth camera. The defaults represent an Asus Xtion Pro Live."""
 
     intrinsics: CameraIntrinsics = XTION_INTRINSICS
     baseline: float = 0.075  # between projector and camera, along x [m]
@@ -435,7 +432,7 @@ class DepthSensorModel:
     outlier_depth_range: float = 0.4  # [m], to either side of the true depth
 
     def _simulate_depth_image(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
-        """Measured depth [m], NaN for none, from true depth, infinite for none, and the cosine of ray and normal."""
+        """Measured depth [m] (NaN: none) from true depth (inf: none) and the cosine between ray and normal."""
         from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter  # slow to import
 
         scale, shape = self.intrinsics.fx * self.baseline, depth.shape
@@ -463,7 +460,7 @@ class DepthSensorModel:
         return np.where(lost, np.nan, measured)
 
     def _shadow(self, depth: Array) -> BoolArray:
-        """Pixels that the projector, on the camera's left, does not reach: another one of its line is nearer."""
+        """Pixels not lit by the projector, on the camera's left, because another surface of the image row is nearer."""
         if self.baseline <= 0:
             return np.zeros(depth.shape, bool)
         disparity = self.intrinsics.fx * self.baseline / depth
@@ -479,7 +476,7 @@ class DepthSensorModel:
 
 @dataclass(frozen=True)
 class CameraTimingModel:
-    """Timing model of a camera with frame rate, dropped frames and errors of time stamps."""
+    """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
 
     mean_rate: float = 3.0  # [Hz]
     dropped_fraction: float = 0.0  # of the frames, which never arrive
@@ -487,7 +484,7 @@ class CameraTimingModel:
     latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
 
     def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
+        """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
         if not self.mean_rate > 0:
             raise ConfigError(f"mean_rate = {self.mean_rate}", allowed="mean_rate > 0")
         count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
@@ -499,7 +496,7 @@ class CameraTimingModel:
 
 @dataclass(frozen=True, eq=False)
 class VirtualFramesWithTruth:
-    """Frame sequence of a virtual camera with the true times and configurations."""
+    """Frame sequence of a virtual camera, with the true times and configurations."""
 
     sequence: FrameSequence
     capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
@@ -508,7 +505,7 @@ class VirtualFramesWithTruth:
 
 @dataclass(frozen=True, eq=False)
 class VirtualCameraSetup:
-    """Virtual depth camera with sensor model, pose and frame timing."""
+    """Virtual depth camera: sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # an Asus Xtion Pro Live where absent
@@ -521,10 +518,9 @@ def render_virtual_frames(
 ) -> VirtualFramesWithTruth:
     """Render the frames that a virtual camera takes of a motion. A frame is rendered on loading, reproducibly.
 
-    Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
-    Where there is a robot, the foam Y stands on a floor, and a wall stands behind Baxter. `DataError` or
-    `ModelError` for no Open3D, no object, an unreadable mesh, or an invalid pose.
-    """
+    The configurations `q` (N, n) at times `t` (N,) [s] can come from any simulator; a cubic spline interpolates them.
+    With a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or `ModelError` if
+    Open3D or an object is missing, a mesh is unreadable, or the pose is invalid."""
     lens, pose = camera.sensor_model.intrinsics, validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
     taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)

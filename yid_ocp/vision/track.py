@@ -1,8 +1,7 @@
 """Track an object's points in a frame sequence, from filtering to shape fit and frame selection.
 
-A first pass over some frames finds what is common to the sequence. A second one takes frame by frame and keeps no
-cloud; every frame ends as a fitted shape or with the reason why it was dropped.
-"""
+A first pass over some frames estimates the calibration shared by the sequence. A second pass processes each frame and
+keeps no cloud. Each frame gets a fitted shape or a reason why it was dropped."""
 
 from __future__ import annotations
 
@@ -63,16 +62,16 @@ def track_object(
 ) -> TrackResult:
     """Track the object's points in a frame sequence.
 
-    Joints that are not elastic must be in the recording, for the self-filter, the grasps and the clock; None where the
-    model has no robot. Without a URDF file there is no self-filter and no clock offset. `empty` are frames of the scene
-    without robot and object, by the same camera: a background.
+    `recording` must contain all non-elastic joints, for the self-filter, the grasps and the clock; it is None if the
+    model has no robot. Without a URDF file, there is no self-filter and no clock offset. `empty` holds frames of the
+    background without robot and object, by the same camera.
 
     Raises
     ------
     DataError
-        No joint angles, time stamps of another clock, or not one good frame; the error lists the reasons.
+        Joint angles are missing, time stamps come from another clock, or no frame is good (with the reasons).
     ConfigError, ModelError
-        A point that the system does not have; meshes that cannot be read.
+        A point does not exist in the system; meshes cannot be read.
     """
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_sequence_calibration()
@@ -93,7 +92,7 @@ class _Work:
 
 
 class _Look(NamedTuple):
-    """Views of a frame under each hypothesis, the robot's configuration, and starts of searches."""
+    """Views of a frame under each hypothesis, the robot's configuration, and initial guesses."""
 
     sights: Sequence[ProcessedFrameCloud]
     q: Array
@@ -103,8 +102,7 @@ class _Look(NamedTuple):
 class FrameTracker:
     """Processes the frames of a sequence one by one, in any process. Arguments are those of `track_object`.
 
-    `frame_order` are all frames by their stamps, `calibration_frames` those from which the camera is calibrated.
-    """
+    `frame_order` lists all frames by stamp, `calibration_frames` the frames used to calibrate the camera."""
 
     def __init__(
         self,
@@ -156,7 +154,7 @@ class FrameTracker:
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
 
     def _configuration_at_rest(self, t: float) -> Array:
-        """Configuration at a time on the joints' clock with the object at rest; constant beyond the recording."""
+        """Configuration at a time of the joints' clock, with an undeformed object; constant beyond the recording."""
         q = self.shape_fitter.rest_configuration.copy()
         if self.joint_angles_at is not None:
             index = [self.system.mechanism.joint_index(name) for name in self.shape_fitter.recorded_joint_names]
@@ -228,7 +226,7 @@ class FrameTracker:
             raise DataError(f"{spans}: their clocks are not the same", where=where, hint=f"{hint} together")
 
     def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
-        """The object with the sizes that were estimated."""
+        """The shape fitter with the estimated dimensions of the object."""
         key = (
             tuple(np.where(sizes.estimated_dimension_mask, sizes.log_ratio, 0.0).tolist())
             if any(sizes.estimated_dimension_mask)
@@ -244,7 +242,7 @@ class FrameTracker:
     def _removed(
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
     ) -> Callable[[Array], BoolArray]:
-        """Which places the filters leave no points of, the robot at a configuration."""
+        """Test of positions that the filters remove, with the robot at a configuration."""
         is_inside = self.object_region.membership_test_at(q, calibration.camera_position)
         within = self.options.filters.robot_padding + self._widest
 
@@ -258,7 +256,7 @@ class FrameTracker:
 
     @staticmethod
     def _finite(sequence: FrameSequence, index: int) -> tuple[Array, BoolArray]:
-        """A frame's finite points in the camera's frame, and which of all its points they are."""
+        """A frame's finite points in the camera's frame, and their indices among all its points."""
         points = sequence.load_cloud(index)
         finite: BoolArray = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points if finite.all() else points[finite]
@@ -270,7 +268,7 @@ class FrameTracker:
         return points, finite
 
     def _read(self, index: int, calibration: CameraCalibration) -> tuple[WeightedCloud, Array]:
-        """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
+        """A frame's world points where the object can be, which of them are the robot's, and all its points."""
         found, finite = self._finite(self.sequence, index)
         state, filters = calibration.camera_state, self.options.filters
         points = state.measured_to_world_points(found)
@@ -320,20 +318,20 @@ class FrameTracker:
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
     def unprocessed_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
-        """Make a frame's report before processing, with the reason if it is dropped."""
+        """Make a frame's report before processing, with a reason if the frame is dropped."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def mark_outlying_frames_and_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
-        """Drop outlying frames, and choose the root end with a note on how."""
+        """Drop outlying frames and choose the root end, with a note on how it was chosen."""
         rooted, note = frame_selection.with_consistent_root_end(frames, self.options)
         return frame_selection.mark_outlying_frames(rooted, self.options), note
 
     def track_result_from_frame_reports(
         self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration
     ) -> TrackResult:
-        """Make the tracking result from frame reports. `DataError` if no frame is good."""
+        """Make the tracking result from frame reports. Raises `DataError` if no frame is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
         of = common, things, self.options, self.sequence.source
@@ -375,7 +373,7 @@ class FrameTracker:
     def _look(
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
-        """The object's part of a frame; None with the reason in its report."""
+        """The object's part of a frame, or None with the reason in its report."""
         work = _Work(self.unprocessed_frame_report(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
@@ -384,7 +382,7 @@ class FrameTracker:
             return work, None
 
     def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
-        """The object's part of a frame; `DataError` with the reason why it is dropped."""
+        """The object's part of a frame. Raises `DataError` with the reason if the frame is dropped."""
         index, stamp, t = work.report.index, work.report.stamp, work.report.joint_time
         options, state = self.options, calibration.camera_state
         cloud, raw = self._read(index, calibration)
@@ -425,7 +423,7 @@ class FrameTracker:
         return look
 
     def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
-        """View of an object whose root is known from the model."""
+        """View of an object whose root position follows from the model."""
         found = point_cloud.extract_skeleton(cloud, rng, self.options.skeleton)
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
@@ -437,7 +435,7 @@ class FrameTracker:
     def _anywhere(
         self, starts: ShapeFitInitialGuesses, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
     ) -> _Look:
-        """Views of an object with an unknown root, with its possible ends."""
+        """Views of an object with an unknown root position, with its possible ends."""
         diameter, options = 2.0 * self._widest, self.options
         course = cloud_centerline_tree(cloud, diameter, options.skeleton.max_edge_length, rng)
         work.skeleton = course.to_skeleton
@@ -468,7 +466,7 @@ def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str,
 def _joint_angles(
     system: System, recording: Recording | None, known: Sequence[str]
 ) -> tuple[tuple[float, float] | None, Callable[[float], Array] | None]:
-    """Time span of the joints and their angles in the order of `known`, None without a robot."""
+    """Time span of the joints and their angles in the order of `known`; None without a robot."""
     if not known:
         return None, None
     need = "which the self-filter and the grasps need"
@@ -487,7 +485,7 @@ def _joint_angles(
 
 
 def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
-    """Frames by time stamp, and why some are of no use: they have none, or that of the one before."""
+    """Frames by time stamp, and reasons to drop frames without a stamp or with a repeated stamp."""
     reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
@@ -500,5 +498,5 @@ def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
 
 
 def _spread(indices: Sequence[int], most: int) -> tuple[int, ...]:
-    """So many of the indices at most, evenly spread."""
+    """At most a given number of the indices, evenly spread."""
     return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, min(len(indices), most)).round())

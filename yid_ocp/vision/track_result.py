@@ -1,4 +1,4 @@
-"""Results of tracking, with frame reports, shapes and points of good frames, and figures."""
+"""Results of tracking: frame reports, shapes and points of good frames, and figures."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class FrameReport:
 
 
 def count_drop_reasons(frames: Iterable[FrameReport]) -> dict[str, int]:
-    """Count dropped frames for each reason. Numbers in the reasons are left out."""
+    """Count dropped frames by reason, without the numbers in the reasons."""
     return dict(Counter(frame.drop_reason.partition(":")[0] for frame in frames if not frame.is_good).most_common())
 
 
@@ -64,7 +64,7 @@ class FrameProcessingStages:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """Result of tracking with shapes and points of the good frames."""
+    """Result of tracking: shapes and points of the good frames."""
 
     point_names: tuple[str, ...]  # points written down
     t: Array  # (M,), times of the good frames on the joints' clock [s]
@@ -80,13 +80,13 @@ class TrackResult:
     _place: Callable[[Array], Array]  # from a configuration to the points
 
     def configuration_at_time(self, t: float) -> Array:
-        """Configuration at any time by a cubic spline through the good frames, shape (n,). Constant beyond them."""
+        """Configuration (n,) at any time, by a cubic spline through the good frames; constant beyond them."""
         if len(self.t) < 2:
             return self.configurations[0].copy()
         return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
 
     def point_positions_at_time(self, t: float) -> Array:
-        """Positions of the tracked points at any time, from `configuration_at_time`, shape (np, 3) [m]."""
+        """Positions (np, 3) [m] of the tracked points at any time, from `configuration_at_time`."""
         return self._place(self.configuration_at_time(t))
 
     @property
@@ -100,14 +100,14 @@ class TrackResult:
         return (*self.dimensions.messages, *(thing.text for thing in self.foreign_objects))
 
     def to_point_group(self) -> PointGroup:
-        """Convert the points to a group `points_camera` of a recording."""
+        """Convert the points to the point group `points_camera` of a recording."""
         pose, words = self.camera_calibration.camera_state.pose, "depth camera, fitted shape"
         if np.nanmax(self.shared_std) > 0:
             words += f"; of std, {1e3 * np.nanmedian(self.shared_std):.1f} mm (median) are one error of all frames"
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
-        """Add these points to a recording (None: an empty one) as `points_camera`. Errors: `validated_recording`."""
+        """Copy of a recording (None: an empty one) with these points as `points_camera`, see `validated_recording`."""
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
         count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
@@ -136,9 +136,8 @@ class _Picture(NamedTuple):
 def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os.PathLike[str]) -> list[Path]:
     """Write a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit.
 
-    They are `NAME_1_cloud.png` to `NAME_5_fit.png` in the folder, which is made; the title of the last one says why the
-    frame was dropped. `OutputError` where the folder or a file cannot be written.
-    """
+    Files are `NAME_1_cloud.png` to `NAME_5_fit.png` in `folder`, which is created. The last title says why the frame
+    was dropped. Raises `OutputError`."""
     path, report, parts = make_folder(folder), stages.report, [np.empty((0, 3))]
     parts += [] if stages.filtered_points is None else [stages.filtered_points]
     parts += [] if report.shape_fit is None else [report.shape_fit.link_ends.reshape(-1, 3)]
