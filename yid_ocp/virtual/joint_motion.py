@@ -198,8 +198,8 @@ def grasping_joint_angles(
     values : mapping of str to float, optional
         Parameter values. Default: nominal.
     start_angles : mapping of str to float, optional
-        Start of the search by joint [rad or m]. Default: elbow up for Baxter, else the middle of the joint's range (zero
-        if unlimited).
+        Start of the search by joint [rad or m]. Default: elbow up for Baxter, else the middle of the joint's range, or
+        zero if the joint is unlimited.
     offsets : mapping of grasp to array_like, shape (3,), optional
         Position of each gripper relative to the undeformed tube end, in the world [m]. Two arms that hold a straight Y
         are fully stretched, a singular posture; offsets towards each other make the start well defined.

@@ -1,4 +1,4 @@
-"""The command `batch` makes one run per configuration or recording, with a common table and report."""
+"""The command `batch`: one run per configuration or recording, with a common table and report."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _BatchRun:
-    """Name (of its folder), configuration and overrides (`a.b=c` each) of one run of a batch."""
+    """One run of a batch: its name (and folder), configuration and overrides (`a.b=c` each)."""
 
     name: str
     config_file: Path
@@ -64,10 +64,9 @@ def batch_runs_from_configs(
 ) -> list[_BatchRun]:
     """List the runs of a batch, one per configuration, or one for each recording that matches a pattern.
 
-    With a pattern, such as `fleet/*.h5`, `**` for any folders, a run estimates on one recording and holds none out,
-    unless the overrides, `a.b=c` each, say otherwise. `ConfigError` where a configuration is not there or given twice,
-    or no recording matches.
-    """
+    With a pattern such as `fleet/*.h5` (`**`: any folders), each run estimates on one recording and has no held-out
+    recording, unless `overrides` (`a.b=c` each) say otherwise. Raises `ConfigError` if a configuration does not exist
+    or is listed twice, or if no recording matches."""
     paths = [Path(config) for config in configs]
     for i, path in enumerate(paths):
         if not path.is_file():
@@ -106,11 +105,10 @@ def run_batch(
 ) -> CommandOutcome[None]:
     """Run `solve` or `diagnose` for every run of `batch_runs_from_configs`. Finished runs in the folder are reused.
 
-    Successful where all runs were; those that failed say why. The folder `out` then holds `runs/NAME/` (a run folder
-    each), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which
-    has the command line that does the same. `OutputError` where it holds something else or cannot be made,
-    `WorkerError` as `run_tasks`.
-    """
+    The batch is successful if all runs are; a failed run states its reason. The folder `out` contains `runs/NAME/` (run
+    folders), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which
+    shows `command_line`. Raises `OutputError` if `out` holds something else or cannot be created, and `WorkerError` as
+    in `run_tasks`."""
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)
     results: dict[str, TaskResult] = {}
@@ -155,7 +153,7 @@ def run_batch(
 def _run_batch_task(
     name: str, config: Path, settings: Sequence[str], inputs: Sequence[Path], command: str, folder: str
 ) -> dict[str, Any]:
-    """Task: do one run of the batch in its own folder, replacing an earlier attempt; its entry for batch.json."""
+    """Task: one run of the batch in its own folder, replacing an earlier attempt. Returns its entry of batch.json."""
     del inputs  # they are part of what the result is kept by
     target = Path(folder) / name
     if target.exists():
@@ -191,7 +189,7 @@ def _entry(result: TaskResult, folder: Path) -> dict[str, Any]:
 
 
 def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
-    """`yid-history/1` of runs of one model, whose parameters mean the same thing; None where these are not that."""
+    """`yid-history/1` of runs of the same model; None for runs of different models."""
     if len(folders) < 2:
         return None
     try:

@@ -1,7 +1,6 @@
-"""The command `blind` diagnoses synthetic cases without their labels, then opens the labels and scores.
+"""The command `blind`: diagnose synthetic cases without their labels, then open the labels and score.
 
-Experiments are variations of configurations; each has an ensemble, from which its cases are drawn.
-"""
+Experiments are variations of configurations. The cases of an experiment are drawn from its ensemble."""
 
 from __future__ import annotations
 
@@ -70,7 +69,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 
 
 def _slice_numbers(text: str) -> tuple[int, int]:
-    """K and N of `K/N`; `ConfigError` of anything else."""
+    """K and N of `K/N`. Raises `ConfigError` for any other text."""
     own, _, of = text.partition("/")
     if not (own.isdigit() and of.isdigit() and 1 <= int(own) <= int(of)):
         raise ConfigError(f"'{text}' is no slice", where="--slice", allowed="K/N, K from 1 to N")
@@ -89,17 +88,16 @@ def run_blind(
 ) -> CommandOutcome[None]:
     """Run a blind validation of the diagnosis in several processes. Finished parts in the folder are reused.
 
-    Models, postures and sensors are those of the runs' first recordings, varied (`EXPERIMENT_VARIATIONS`) as far as
-    there are cases for it; the same seed draws other cases for each purpose, 'report' and 'calibration'.
-    Of `part` (K, N) every N-th case is made and diagnosed, in a folder `slice-K-of-N` of its own.
+    Models, joint angles and sensors are those of the runs' first recordings, with as many variations
+    (`EXPERIMENT_VARIATIONS`) as there are cases for. The cases depend on `seed` and `purpose` ('report' or
+    'calibration'). With `part` (K, N), only every N-th case is made and diagnosed, in a folder `slice-K-of-N`.
 
-    The folder holds `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
-    `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the sources
-    that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then `slice.json`
-    (`yid-blind-slice/1`: labels and answers with their hashes, for `join_slices`), `result.json` (`yid-blind/1`),
-    `table.md` and pictures; of an ensemble to calibrate by `thresholds.json` (`yid-calibration/1`). `OutputError` where
-    the folder holds another ensemble.
-    """
+    The folder contains `configs/`, `prepared/` (detectable sizes per experiment), `cases/` (recordings),
+    `sealed/labels.json`, `commitment.json` (hashes of the labels, written before the first diagnosis, and of the
+    sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), `slice.json`
+    (`yid-blind-slice/1`: labels and answers with hashes, for `join_slices`), `result.json` (`yid-blind/1`), `table.md`
+    and pictures. A calibration ensemble also has `thresholds.json` (`yid-calibration/1`). Raises `OutputError` if the
+    folder holds another ensemble."""
     if count < 1:
         raise runs[0].config_error(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
     if seed < 0:
@@ -164,7 +162,7 @@ class _Proof:
         return self.folder / "configs" / f"{name}.yaml"
 
     def commit(self) -> tuple[dict[str, Any], list[Task]]:
-        """The commitment to the labels and the diagnosis of every case, of those in the folder or made now."""
+        """The commitment to the labels, and the tasks of all cases, read from the folder or created."""
         file = self.folder / "commitment.json"
         configs = {entry.name: config_yaml_with_defaults(entry) for entry in self.runs}
         if not file.exists():
@@ -226,7 +224,7 @@ class _Proof:
     def best_closures(
         self, cases: Sequence[Task], labels: Sequence[blind.CaseGroundTruth], answers: Sequence[Mapping[str, Any]]
     ) -> dict[str, float]:
-        """By case, what its true effects close, where one of them or two were withheld and a gap was seen."""
+        """Closure by the true effects, for cases with one or two withheld effects and a detected gap."""
         tasks = []
         for case, label, found in zip(cases, labels, answers, strict=True):
             gap = found["result"]["verdict"] not in ("no_gap", "insufficient_data")
@@ -237,7 +235,7 @@ class _Proof:
         return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
     def done(self, function: Callable[..., Any], tasks: Sequence[Task], results: str | Path) -> list[Any]:
-        """What a function finds for each task; one experiment after the other, so that a worker builds each once."""
+        """Results of a function for all tasks, by experiment, so that a worker builds each experiment once."""
         order = sorted(range(len(tasks)), key=lambda i: str(tasks[i].arguments["experiment"]))
         folder, report = self.folder / results, self.progress.report_parts_done
         found = run_tasks(function, [tasks[i] for i in order], folder, self.workers, report)
@@ -277,11 +275,10 @@ def _draw_case(
 def _diagnose_case_from_recordings_task(
     experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], without: Sequence[str]
 ) -> dict[str, Any]:
-    """Task: diagnose a case from its recordings, the last one held out; returns {seconds, result}.
+    """Task: diagnose a case from its recordings, the last one held out. Returns {seconds, result, evidence}.
 
-    `evidence` beside them is what every rule needs, to judge the case again. For calibration, one without a gap has
-    `open` too: the statistics of a diagnosis that takes anything for a gap.
-    """
+    `evidence` allows the case to be judged again. For calibration, a case without a gap also has `open`: the statistics
+    of a diagnosis with permissive thresholds."""
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
     begun = time.perf_counter()
@@ -375,7 +372,7 @@ EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
 
 @dataclass(frozen=True)
 class _BlindExperiment:
-    """A virtual experiment of a blind ensemble: configuration file, variation of it, seed and purpose."""
+    """A virtual experiment of a blind ensemble: configuration file, variation, seed and purpose."""
 
     config_file: Path
     variation: str
@@ -409,7 +406,7 @@ class _BlindExperiment:
         )
 
     def _write_first_recording(self, file: Path) -> None:
-        """Write the first recording, which fixes initial configuration and sensors."""
+        """Write the first recording, which defines initial configuration and sensors."""
         varied, run = EXPERIMENT_VARIATIONS[self.variation], load_config(self.config_file)
         first = read_recordings_of_role(run, count=1)
         if not first:
@@ -438,7 +435,7 @@ class _BlindExperiment:
 
 @functools.lru_cache(maxsize=1)
 def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.BlindCaseGenerator]:
-    """Settings of the diagnosed model and the ensemble, kept for the next task of the same experiment."""
+    """Settings of the diagnosed model and the ensemble, cached for the next task of the same experiment."""
     del written
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)
@@ -472,8 +469,7 @@ def _blind_experiments_and_refinable_subset(
 ) -> tuple[dict[str, _BlindExperiment], frozenset[str]]:
     """Virtual experiments by name, and the names of those whose object's links can be divided further.
 
-    Variations that a configuration does not allow, as by frames on the object that is taken away, are left out.
-    """
+    Variations that a configuration does not allow are omitted, such as a missing object that carries frames."""
     found: dict[str, _BlindExperiment] = {}
     chains = set()
     for name, config in configs.items():

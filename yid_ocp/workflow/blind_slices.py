@@ -1,4 +1,4 @@
-"""Slices of a blind validation: written with their hashes, joined where these agree, scored, judged again."""
+"""Slices of a blind validation: written with hashes, joined if the hashes agree, scored and judged again."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SLICE_FORMAT = "yid-blind-slice/1"
 
 
 def write_slice(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write `slice.json`, labels and answers with the hash of their ensemble; return what was written."""
+    """Write `slice.json`, with labels, answers and the hash of their ensemble. Returns its contents."""
     written: dict[str, Any] = to_json_types({"format": _SLICE_FORMAT, **found})
     written["ensemble_sha256"] = _ensemble_sha256(written)
     write_strict_json(folder / "slice.json", written)
@@ -35,7 +35,7 @@ def write_slice(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _ensemble_sha256(part: Mapping[str, Any]) -> str:
-    """Hash of what slices of one ensemble have in common: plan, settings, seed, sources and number of slices."""
+    """Hash of the common properties of one ensemble's slices: plan, settings, seed, sources, number of slices."""
     common = [part[key] for key in ("cases", "seed", "purpose", "configs", "code", "code_of_cases")]
     text = json.dumps([*common, str(part["slice"]).partition("/")[2]], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -46,9 +46,8 @@ def join_slices(
 ) -> CommandOutcome[None]:
     """Score slices of one ensemble together, from their files `slice.json` or folders that hold one.
 
-    `out` gets what the folder of a whole ensemble holds without recordings, so that it can be judged again.
-    `DataError` of a slice of another ensemble, of one that is given twice, and of labels that were changed.
-    """
+    `out` receives the files of a whole ensemble without recordings, so it can be judged again. Raises `DataError` if a
+    slice belongs to another ensemble or is given twice, or if labels were changed."""
     found: list[dict[str, Any]] = []
     for file in files:
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
@@ -89,7 +88,7 @@ def _labels(part: Mapping[str, Any]) -> list[blind.CaseGroundTruth]:
 def score_slices(
     parts: Sequence[Mapping[str, Any]], folder: Path, runs: Sequence[RunSettings], progress: Progress
 ) -> CommandOutcome[None]:
-    """Score the answers of slices of one ensemble against their labels and write the result."""
+    """Score the answers of slices of one ensemble against their labels, and write the result."""
     first, pairs = parts[0], [pair for part in parts for pair in zip(_labels(part), part["answers"], strict=True)]
     best = {case: value for part in parts for case, value in part["best"].items()}
     pairs.sort(key=lambda pair: pair[0].case)
@@ -128,11 +127,10 @@ def _write_result(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
 def rescore_blind(
     folder: str | Path, out: str | Path, overrides: Sequence[str] = (), progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[None]:
-    """Judge finished cases of a blind validation again by present rules and other thresholds, without a refit.
+    """Judge finished cases of a blind validation again, with the present rules and the thresholds in `overrides`.
 
-    `out` gets `result.json` (`yid-blind/1`), with `rescored`: the cases whose verdict or effects differ from what was
-    said, and how many are `not_judged`, because these thresholds ask for a refit that the diagnosis did not make.
-    """
+    Nothing is refitted. `out` receives `result.json` (`yid-blind/1`). Its `rescored` lists the cases whose verdict or
+    effects change, and counts as `not_judged` the cases that need a refit which the original diagnosis did not make."""
     made, target = Path(folder), make_folder(out)
     commitment = read_input_json(made / "commitment.json")
     labels = {}
@@ -161,7 +159,7 @@ def rescore_blind(
 
 
 def _stored_values(folder: Path) -> dict[str, Any]:
-    """Results of a folder's tasks by their names, from any version of the package."""
+    """Results of a folder's tasks by name, from any version of the package."""
     files = sorted(folder.glob("*.json"), key=lambda file: file.stat().st_mtime)
     entries = [read_input_json(file) for file in files if not file.name.endswith(".error.json")]
     return {str(entry["name"]): entry["value"] for entry in entries}

@@ -1,4 +1,4 @@
-"""Build the system of a run from its settings, and the compiled step."""
+"""Build the system of a run from its settings, and compile its step."""
 
 from __future__ import annotations
 
@@ -45,10 +45,9 @@ _OTHER_SIDE = {"left": "right", "right": "left"}
 def build_system(run: RunSettings, link_division: int = 1) -> System:
     """Build the mechanical model of a run. Parameters have the values and bounds of the settings.
 
-    Each of the object's links is divided into `link_division`, the stiffness and damping of a tube kept; a cable's
-    edges stay as they are. `ConfigError` or `ModelError`, which name the setting, for names that do not exist and
-    values outside their bounds.
-    """
+    Each of the object's links is divided into `link_division` links with the same stiffness and damping in total; edges
+    of a cable are not divided. Raises `ConfigError` or `ModelError`, with the setting, if a name does not exist or a
+    value is outside its bounds."""
     model, arms = run.model, run.model.arms
     run_inputs.input_files_by_name(run)
     run_inputs.load_plugins(run)
@@ -98,7 +97,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
 
 
 def urdf_reader_options(run: RunSettings) -> dict[str, Any]:
-    """Options of `read_urdf` for the joints and links that a run takes of its robot."""
+    """Options of `read_urdf` for the joints and links of the robot that a run uses."""
     arms = run.model.arms
     return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}
 
@@ -118,7 +117,7 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 
 
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
-    """Measured vertices and clamps of a run's cable. None for an object without clamps of its own."""
+    """Measured vertices and clamps of a run's cable. None for an object without its own clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
         return run.model.object.topology() if isinstance(run.model.object, ClampedObject) else None
 
@@ -126,8 +125,7 @@ def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
 def arms_are_estimated_states(run: RunSettings) -> bool:
     """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
 
-    Not beside sensors on links, which cannot be weighted where noise drives the motion.
-    """
+    This is not possible with sensors on links, which cannot be weighted under process noise."""
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
     recordings = read_recordings_of_role(run)
@@ -181,7 +179,7 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
-    """The system with links of uncertain mass, the effects and the parameters' values of the settings."""
+    """The system with uncertain link masses, the effects, and the parameter values of the settings."""
     if run.model.arms.link_mass_std > 0:
         system = with_link_mass_parameters(system, _LINK_MASS_PARAMETER)
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
@@ -223,7 +221,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
 
 
 def _with_robot_file_constants(run: RunSettings, system: System) -> System:
-    """The system with armature, dry friction and servos of an MJCF file, which values of the settings override."""
+    """The system with armature, dry friction and servos of an MJCF file; values in the settings override these."""
     present = {f"{said.kind}@{said.location}" for said in run.model.effects if said.values}
     kinds = {"armature": ("rotor_inertia", "armature"), "frictionloss": ("joint_coulomb", "tau_c")}
     for joint, own in _robot_file_constants(run).items():
@@ -252,9 +250,8 @@ def _matches(name: str, key: str) -> bool:
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """Settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
-    Before them go those of `model.friction`, `model.arms.servo.motor` and `model.arms.link_mass_std`. `ConfigError` for
-    a name or pattern that matches nothing.
-    """
+    Settings implied by `model.friction`, `model.arms.servo.motor` and `model.arms.link_mass_std` come first. Raises
+    `ConfigError` if a name or pattern matches nothing."""
     sections = _section_parameter_settings(run, parameters)
     result = dict(sections)
     for key, given in run.parameters.items():
@@ -270,7 +267,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
 
 
 def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
-    """Joints with friction by `model.friction`, either those named or all of the arms. Empty without that section."""
+    """Joints with friction by `model.friction`: the named joints or all arm joints. Empty without that section."""
     if run.model.friction is None:
         return ()
     known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
@@ -296,7 +293,7 @@ def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[s
 
 
 def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
-    """Settings of parameters that sections of the model imply: friction free, motors and link masses with priors."""
+    """Parameter settings implied by sections of the model: free friction, and priors of motors and link masses."""
     found: dict[str, ParameterSettings] = {}
     friction, motor = run.model.friction, run.model.arms.servo.motor
     values: dict[str, float] = {}
@@ -336,7 +333,7 @@ def divided_link_parameter_scale(run: RunSettings, name: str, link_division: int
 
 
 def system_with_second_arm_holding_object(run: RunSettings, system: System) -> System | None:
-    """Add the second arm at a free end of the object to a run's system. None where impossible."""
+    """Run's system with the second arm at a free end of the object. None if impossible."""
     model, joints = run.model, run.model.arms.joints
     if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
         return None
@@ -389,8 +386,7 @@ def _with_extra_frames(
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
     """Robot (or clamps) and objects with the additional frames of the settings.
 
-    A frame that the recordings place has parameters NAME.x, .y, .z; see `marker_positions_from_reference_pose`.
-    """
+    A frame that recordings locate has parameters NAME.x, .y, .z; see `marker_positions_from_reference_pose`."""
     made = list(items)
     for name, said in run.model.frames.items():
         where, parent = ("model", "frames", name), said.parent_frame
@@ -418,7 +414,7 @@ def _with_extra_frames(
 
 
 def _with_marker(tree: Mechanism, name: str, frame: str) -> Mechanism:
-    """The mechanism with a frame at a parameter's place in another one, turned like it."""
+    """The mechanism with a frame whose position in another frame is a parameter, with the same orientation."""
     carrier = tree.with_added_frame(name, frame, np.eye(4)).frames[name]
     entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {frame}") for axis in _AXES]
     offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
@@ -431,9 +427,8 @@ def marker_positions_from_reference_pose(
 ) -> dict[str, dict[str, float]]:
     """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
 
-    The object stands in the world: without its weight it is straight. Empty where no frame is placed so. `ConfigError`
-    where it does not, or a marker is no point of a recording; `DataError` for a recording without `straight`.
-    """
+    Empty if no frame uses `marker_reference_pose`. Raises `ConfigError` if the object is not fixed in the world, or a
+    marker is not a point of a recording, and `DataError` if a recording has no `straight` positions."""
     names = [name for name, said in run.model.frames.items() if said.marker_reference_pose]
     if not names:
         return {}

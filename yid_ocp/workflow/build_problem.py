@@ -1,7 +1,6 @@
 """Build the estimation problem of a run from recordings, options and free parameters on a compiled step.
 
-Recordings are checked before: those given twice count once, gaps are cut out; everything else is said and left.
-"""
+Recordings are checked first: duplicates count once, and gaps are cut out. Other issues are reported, not corrected."""
 
 from __future__ import annotations
 
@@ -57,8 +56,7 @@ _MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
 def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
     """Make the options of the estimation problem that a run's settings describe.
 
-    Values that differ from recording to recording (a cable's edges, places of markers) are those of `recordings`.
-    """
+    Values that differ between recordings (edges of a cable, marker positions) come from `recordings`."""
     parameters = system.parameters
     chosen = build.settings_by_parameter_name(run, parameters)
     for name in run.problem.initial_state_fit_parameters:
@@ -108,7 +106,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
 
 
 def _checked_discretisations(run: RunSettings) -> tuple[DiscretisationName, ...]:
-    """Discretisations that a run's settings check after a solve, by default those that matter for its object."""
+    """Discretisations that are checked after a solve: from the settings, by default those relevant to the object."""
     said, item = run.output.checked_discretisations, run.model.object
     if said is None:
         said = "both" if item is not None and item.default_link_refinement else "time_step"
@@ -117,7 +115,7 @@ def _checked_discretisations(run: RunSettings) -> tuple[DiscretisationName, ...]
 
 
 def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel | None:
-    """The run's model with every link divided in two; None for an object without links of its own."""
+    """The run's model with every link divided in two; None for an object without divisible links."""
     if run.model.object is None or run.model.object.n_links_per_segment_or_total is None:
         return None
 
@@ -134,13 +132,13 @@ def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:
 def build_problem(
     run: RunSettings, step: Step | None = None, reference_recordings: Sequence[Recording] = ()
 ) -> EstimationProblem:
-    """Build the estimation problem of a run. It also has marker positions of `reference_recordings`.
+    """Build the estimation problem of a run. It includes marker positions of `reference_recordings`.
 
     Raises
     ------
     ConfigError, DataError, ModelError
-        Settings, recordings or names that do not fit, a grasp that cannot be closed, a recording that nothing can be
-        done with; with `recordings.strict` any doubt about one.
+        Settings, recordings or names are inconsistent, a grasp cannot be closed, or a recording is unusable. With
+        `recordings.strict`, any issue of a recording.
     """
     system = build_system(run) if step is None else step.system
     free = free_parameter_names(run, system.parameters)
@@ -174,7 +172,7 @@ def build_problem(
 
 
 def min_initial_closure_error_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Least possible distance between each grasp's two frames at a recording's first arm angles [m]."""
+    """Smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
     system = problem.system
     if not system.grasps:
         return {}
@@ -316,7 +314,7 @@ def _beside_the_model(
 def _excitation(
     run: RunSettings, arm: RecordedJointsModel, free: Sequence[str], recordings: Sequence[Recording]
 ) -> list[Issue]:
-    """Whether the motion can tell what is sought, as far as that shows without the object."""
+    """Whether the motion can determine the free parameters, as far as the robot alone shows."""
     asked: dict[str, list[str]] = {}
     for name in free:
         joint, _, quantity = name.rpartition(".")
@@ -342,7 +340,7 @@ def _is_modelled(system: System, doubt: Issue) -> bool:
 
 
 def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
-    """Issues of measured object points, from one rollout per recording with the initial parameters."""
+    """Issues of measured object points, from one rollout per recording at the initial parameters."""
     system = problem.system
     lengths = ca.vertcat(ca.SX(0), *(length for segment in system.segment_layouts for length in segment.link_lengths))
     size = float(ca.Function("size", [system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))

@@ -1,4 +1,4 @@
-"""The command `check` validates a run and its discretisation without solving."""
+"""The command `check`: validate a run and its discretisation without solving."""
 
 from __future__ import annotations
 
@@ -203,10 +203,9 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
-    """Lowest natural frequencies with twice the links and with half and a quarter of the time step.
+    """Lowest natural frequencies with twice the links, and with half and a quarter of the time step.
 
-    Under `links` and `time_step` are lists of {value, hertz, growing, message}, empty where there is nothing to vary.
-    """
+    `links` and `time_step` are lists of {value, hertz, growing, message}, empty if nothing can be varied."""
     system = build_system(run)
     h = run.problem.time_step_or_default if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
@@ -252,7 +251,7 @@ def _row(value: float, found: discretisation.NaturalFrequencies) -> dict[str, An
 
 
 def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]]) -> None:
-    """Warn of frequencies that move between the first row and the last, the finest one."""
+    """Warn of frequencies that differ between the first row and the last, finest row."""
     coarse, fine = rows[0], rows[-1]
     for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:

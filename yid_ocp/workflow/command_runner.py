@@ -1,4 +1,4 @@
-"""Shared steps of all commands, such as progress display, printed summary, run folder and exit codes."""
+"""Shared steps of all commands: progress display, printed summary, run folder and exit codes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _CommandOutput = TypeVar("_CommandOutput")
 
 @dataclass(frozen=True)
 class CommandOutcome(Generic[_CommandOutput]):
-    """Outcome of a command with run folder, contents of result.json, computed result and success."""
+    """Outcome of a command: run folder, contents of result.json, computed result and success."""
 
     folder: Path
     result: dict[str, Any]
@@ -43,7 +43,7 @@ class CommandOutcome(Generic[_CommandOutput]):
 
 
 def command_with_settings(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
-    """Make a command that calls `work(settings, out, progress, ...)`. `...` are the arguments `names`."""
+    """Make a command that calls `work(settings, out, progress, ...)`, where `...` are the arguments `names`."""
 
     def run(arguments: argparse.Namespace) -> int:
         settings = load_config(arguments.config, arguments.overrides)
@@ -67,10 +67,10 @@ def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progres
 def print_result(
     arguments: argparse.Namespace, result: Mapping[str, Any], texts: Callable[[], Sequence[str]], place: str, path: str
 ) -> None:
-    """Print a command's result: as text and the line `place`, as `path` alone (`quiet`) or as JSON (`json`).
+    """Print a command's result in one of three modes: as text, as path or as JSON.
 
-    Beside JSON nothing else goes to standard output; the place goes to standard error.
-    """
+    By default, the lines of `texts` and the line `place` are printed. `quiet` prints only `path`. `json` prints only
+    JSON on standard output, and `place` on standard error."""
     if arguments.json:
         print_json(result)
         if not arguments.quiet:
@@ -82,7 +82,7 @@ def print_result(
 
 
 def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:
-    """Workers from `--workers` or `--scheduler`. None where neither is given. Errors as `WorkerConfig`."""
+    """Workers from `--workers` or `--scheduler`, or None without either. Errors are as in `WorkerConfig`."""
     if arguments.workers is None and not arguments.scheduler:
         return None
     workers = WorkerConfig(arguments.workers, arguments.scheduler)
@@ -104,10 +104,9 @@ _USUAL_ITERATIONS = 20  # of a search, from its start to its end
 
 
 class _RemainingTime:
-    """Time left: of a command whose stages say what they usually take, else of a stage whose parts are counted.
+    """Remaining time of a command whose stages state their usual time, else of a stage with counted parts.
 
-    The pace, time spent over usual time, is that of imports and stages so far, each counting half as much as the next.
-    """
+    The pace is the ratio of spent to usual time over imports and past stages; each counts half as much as the next."""
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._spent = min(max(import_time, _USUAL_IMPORT_TIME / 4), _USUAL_IMPORT_TIME * 32)
@@ -131,7 +130,7 @@ class _RemainingTime:
         self._work, self.n_iterates, self._first = work, 0, None
 
     def of_command(self) -> str:
-        """Text of the time left until the command's end; empty where its stages do not say what they take."""
+        """Text of the command's remaining time; empty if its stages do not state their usual time."""
         seconds = self.seconds_left()
         return "" if math.isnan(seconds) else f", about {_format_duration(seconds)} left"
 
@@ -148,7 +147,7 @@ class _RemainingTime:
         return abs(expected - spent) + self._ahead * pace
 
     def of_parts(self, done: int, total: int) -> str:
-        """Text of the remaining time of a stage with this many parts; empty if the command's is known."""
+        """Text of the remaining time of a stage with this many parts; empty if the command's time is known."""
         now = time.monotonic()
         # what stood there before this run began took no time
         known, begun = self._first = self._first or (done, now)
@@ -169,20 +168,20 @@ def _format_iterate(entry: Iterate) -> str:
 
 
 class StderrLogLinesProgress(Progress):
-    """Progress as lines on standard error, one per stage, iterate or tenth of a stage, and after some silence."""
+    """Progress as lines on standard error: per stage, iterate or tenth of a stage, and after some silence."""
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._tenths, self._last, self._left = 0, 0.0, _RemainingTime(import_time)
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
-        """Print a line with the name of the stage and the time left."""
+        """Print a line with the name of the stage and the remaining time."""
         interruption.raise_if_requested()
         self._tenths, self._last = 0, time.monotonic()
         self._left.begin_stage(work, ahead)
         print(f"{text} ...{self._left.of_command().removeprefix(',')}", file=sys.stderr, flush=True)
 
     def report_iterate(self, entry: Iterate) -> None:
-        """Print a line for the accepted point."""
+        """Print a line for the accepted iterate."""
         self._left.n_iterates += 1
         print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
 
@@ -233,7 +232,7 @@ class _BarProgress(Progress):
 
 @contextlib.contextmanager
 def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]:
-    """Show progress on standard error, by bars on a terminal, else by lines (context manager). Not with `--quiet`."""
+    """Show progress on standard error, as bars on a terminal, else as lines (context manager). `--quiet`: nothing."""
     terminal, import_time = sys.stderr.isatty(), time.monotonic() - arguments.begin_time
     if arguments.quiet or (arguments.json and not terminal):
         yield NULL_PROGRESS

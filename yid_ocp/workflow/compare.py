@@ -1,4 +1,4 @@
-"""The command `compare`: several methods on one problem, compared with the result of Caldwell et al. (2014)."""
+"""The command `compare`: several methods on one problem, and the published result of Caldwell et al. (2014)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from yid_ocp.workflow.solve import solution_to_result_dict
 
 
 def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
-    """Run every method, compare, and write the run folder; successful where any method converged."""
+    """Run and compare all methods, and write the run folder. Successful if any method converged."""
     solvers, experiment = list(run.compare.methods.values()), run.compare.reference_paper_experiment_name
     if not solvers:
         raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))

@@ -71,7 +71,7 @@ class _PointPlacement:
 
 @dataclass(frozen=True)
 class _GroupNoise:
-    """Noise standard deviation of a group (None where the recording states it), unit and source."""
+    """Noise standard deviation of a group (None if the recording states it), unit and source."""
 
     std: float | None
     unit: str
@@ -118,7 +118,7 @@ class ProposedConfigChoices:
 
     @property
     def is_identified_from_efforts(self) -> bool:
-        """Whether prescribed arms have no object, or only joint efforts depend on it."""
+        """Whether only joint efforts depend on the object, or prescribed arms have no object."""
         seen = any(not group.startswith("imu") for group in self.point_placements)
         return self.arm_mode == "prescribed" and not (self.has_object and seen)
 
@@ -132,21 +132,21 @@ def propose_config_choices(
     grasps: Mapping[str, str] | None = None,
     standing: bool = False,
 ) -> ProposedConfigChoices:
-    """Propose choices for a configuration from a robot and its recordings. At least one recording has joints.
+    """Propose choices for a configuration from a robot and its recordings, all of which need joints.
 
     Parameters
     ----------
     branches : sequence of Segment
-        Segments of the object, parents first; none for an arm without an object.
+        Segments of the object, parents first. Empty for an arm without an object.
     holder : str, optional
-        Frame that carries the object's root; the tool of the arm that moves most when absent.
+        Frame that carries the object's root. Default: the tool of the arm that moves most.
     grasps : mapping of frame to point, optional
-        What else holds the object; where it stands on the ground or two arms were recorded, ends of it when absent.
+        Other grasps. Default: ends of the object, if it stands on the ground or two arms were recorded.
     standing : bool
-        Whether the object stands on the ground, and arms hold its ends.
+        Whether the object stands on the ground and arms hold its ends.
 
-    `ConfigError` where no recorded joint is in the URDF, or there is no such frame; others as `read_urdf`.
-    """
+    Raises `ConfigError` if no recorded joint is in the URDF or a frame does not exist; other errors as in
+    `read_urdf`."""
     allowed = "joint states of the robot, which say how it was moved"
     for other in recordings:
         if other.joints is None:
@@ -291,7 +291,7 @@ def _commanded(joints: JointGroup) -> bool:
 
 
 def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: float) -> str:
-    """Name of a joint or point that moves just after a time, from a line fit; empty where all rest."""
+    """Name of a joint or point that moves just after a time, from a line fit; empty if nothing moves."""
     seen = [("point {}", p.names, p.t, p.position.reshape(len(p.t), -1), _POINT_REST_SPEED) for p in recording.points]
     group = recording.joints
     if group is not None:
@@ -306,7 +306,7 @@ def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: fl
 
 
 def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
-    """Slope of each channel over a window, and its standard deviation by what the line leaves; zeros where unknown."""
+    """Slope of each channel over a window, and its std from the residuals of the line; zeros if unknown."""
     period = float(np.median(np.diff(t))) if len(t) > 1 else math.inf
     # a slow camera says nothing: what moves within five of its frames may well have rested at the first
     window = max(window, min(5 * period, 2 * window))
@@ -321,10 +321,9 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 
 
 def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
-    """Time of rest in a recording's later part, where the held-out part begins [s]. None if it never rests.
+    """Time [s] of standstill in the later part of a recording, at which the held-out part starts. None without.
 
-    What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
-    """
+    The later part can be predicted from equilibrium, and so tests the model on held-out data."""
     first, duration = min(group.t[0] for group in recording.joint_and_point_groups), recording.duration
     for part in np.arange(0.75, 0.5, -0.01):
         time = first + float(part) * duration
@@ -338,7 +337,7 @@ def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | 
 def _places(
     tree: Mechanism, recording: Recording, branches: Sequence[Segment], holder: str, standing: bool
 ) -> dict[str, tuple[_PointPlacement, ...]]:
-    """Places of all points: those of a frame or segment of their name, else, on an arm, where they were seen."""
+    """Locations of all points: a frame or segment of the same name, else, on an arm, from measured positions."""
     names = [branch.name for branch in branches]
     standing = standing or not branches  # an arm alone holds nothing on which a point could sit
     frames = {f"w_{name}" for name in names} | set(tree.frames)
@@ -365,10 +364,9 @@ def _places(
 def _samples_to_place_by(
     tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[Segment], holder: str
 ) -> PointGroup:
-    """Samples of a group, only those at rest if points in motion are farther away than a single segment is long.
+    """Samples of a group, only those at standstill if moving points are farther away than a single segment is long.
 
-    A late clock makes that of points that move.
-    """
+    A late clock causes such distances."""
     at = _poses(tree, recording, holder, group.t)[:, :3, 3]
     apart = np.linalg.norm(group.position - at[:, None], axis=2)
     farthest = float(np.max(apart, initial=0.0, where=np.isfinite(apart)))
@@ -383,7 +381,7 @@ def _samples_to_place_by(
 def _parts_when_straight(
     tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[Segment], holder: str
 ) -> Array | None:
-    """Parts of a single segment's length at which points sit (np,); None where it never was straight, or has no end."""
+    """Positions (np,) of points as fractions of a single segment's length; None without a straight pose or an end."""
     apart = np.linalg.norm(group.position - _poses(tree, recording, holder, group.t)[:, None, :3, 3], axis=2)
     farthest = np.max(apart, axis=0, initial=0.0, where=np.isfinite(apart))
     end = apart[:, int(np.argmax(farthest))]
@@ -403,10 +401,9 @@ def _near(
     branches: Sequence[Segment],
     holder: str,
 ) -> tuple[str, str]:
-    """Frame at which a point probably sits, by where it was seen from what holds the object, and why.
+    """Most probable frame of a point, from its measured positions relative to the holder, and the reason.
 
-    `part_when_straight` of the length of a single segment is NaN where that was never straight.
-    """
+    `part_when_straight` is its fraction of a single segment's length in a straight pose, or NaN without such a pose."""
     seen = np.isfinite(position).all(axis=1)
     if not seen.any():
         return "", "it was never seen"
@@ -437,7 +434,7 @@ def _along(name: str, percent: float) -> str:
 
 
 def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[str, tuple[_PointPlacement, ...]]:
-    """Frames of wrist sensors and inertial units: those of their names, else, of a wrist, that of the holder."""
+    """Frames of wrist sensors and inertial units: the frame of the same name, else, for a wrist, the holder."""
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for key, group, channel in _mounted_channels(recording):
         other = ("", "no moving link has that name: write frames: {NAME: FRAME} in place of use: false")
@@ -459,7 +456,7 @@ def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannel
 
 
 def _straight(branches: Sequence[Segment]) -> dict[str, Array]:
-    """Places along the straight object, by the name of the frame there."""
+    """Positions along the straight object, by frame name."""
     spots: dict[str, Array] = {}
     ends: dict[str | None, tuple[Array, Array]] = {None: (np.eye(3), np.zeros(3))}
     for branch in branches:
@@ -473,7 +470,7 @@ def _straight(branches: Sequence[Segment]) -> dict[str, Array]:
 
 
 def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array:
-    """Poses of a frame at recorded times, shape (N, 4, 4)."""
+    """Poses (N, 4, 4) of a frame at recorded times."""
     group = recording.joints
     assert group is not None
     q = ca.SX.sym("q", len(tree.joints))
@@ -522,7 +519,7 @@ def _size(t: Array, values: Array) -> float:
 
 
 def _time_step(period: float) -> float:
-    """A step of at most `_MAX_TIME_STEP` that meets the samples of a clock, or divides its period."""
+    """A step of at most `_MAX_TIME_STEP` that coincides with the samples of a clock, or divides its period."""
     if period <= _MAX_TIME_STEP:
         step = period * max(1, math.floor(_MAX_TIME_STEP / period + 1e-3))
     else:

@@ -1,4 +1,4 @@
-"""The command `diagnose` detects, locates and explains the gap. Finished refits survive an interruption."""
+"""The command `diagnose`: detect, locate and explain the gap. Finished refits survive an interruption."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
 
 
 def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
-    """Groups and fields of `SensorOptions` whose standard deviations count in the problem."""
+    """Groups and fields of `SensorOptions` whose standard deviations the problem uses."""
     levels = {(samples.sensor.group_name, "std") for episode in problem.episodes for samples in episode.measurements}
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     encoders = problem.options.sensors.get(JOINT_POSITION_GROUP_NAME)
@@ -258,7 +258,7 @@ def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePre
 
 
 def _unknown_force_scene(finding: DiagnosisResult) -> list[Animation]:
-    """The nominal model in the recording that it explains worst, with the largest unknown forces and offsets."""
+    """The nominal model in its worst-explained recording, with the largest unknown forces and offsets."""
     fit, smoothed = finding.nominal_model, finding.smoother_result
     if smoothed is None or not smoothed.smoothed_unknowns:
         return []
@@ -284,10 +284,9 @@ def _unknown_force_scene(finding: DiagnosisResult) -> list[Animation]:
 class _SingleJsonFileRefitStore:
     """A store of refits in one JSON file, replaced as a whole after every refit.
 
-    One that was made from other inputs, by another configuration or version is skipped with a notice. Refits run in
-    threads, not as tasks of `yid_ocp.parallel`: all of one diagnosis share a compiled step and what was worked out from
-    the recordings, and a refit takes less time than to build these in another process.
-    """
+    A file from other inputs, another configuration or another version is ignored with a notice. Refits run in threads,
+    not as tasks of `yid_ocp.parallel`, because they share a compiled step and data derived from the recordings. A refit
+    takes less time than building these in another process."""
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
         self.file = folder.resume_folder / "refits.json"
@@ -299,7 +298,7 @@ class _SingleJsonFileRefitStore:
         return len(self._known)
 
     def get(self, name: str) -> StoredFit | None:
-        """The stored refit of that name, or None; a reused refit is logged."""
+        """The stored refit of that name, or None. Reuse is logged."""
         found = self._known.get(name)
         if found is not None:
             self._folder.log_event("resumed", refit=name)

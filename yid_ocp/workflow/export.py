@@ -1,4 +1,4 @@
-"""The command `export` writes recordings as CSV or MCAP, run signals as MCAP, and models for other engines."""
+"""The command `export`: recordings as CSV or MCAP, run signals as MCAP, and models for other engines."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class _CalibratedModel:
     parameter_stds: Mapping[str, float | None]
 
     def system(self, labels: Iterable[str] | None = None, nominal: bool = False) -> System:
-        """The system with the labelled effects, all of them when absent; `nominal`: of those the nominal model has."""
+        """The system with the labelled effects (default: all); `nominal`: with the effects of the nominal model."""
         run = self.nominal_settings if nominal else self.settings
         if labels is None:
             return build_system(run)
@@ -139,10 +139,10 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
 
 
 def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: Progress) -> dict[str, Any]:
-    """Write the final model of a run and, but for `yaml`, a manifest of what the format represents; returns this.
+    """Write the final model of a run and, except for `yaml`, a manifest of what the format represents. Returns the
+    manifest.
 
-    `ConfigError` where the format cannot hold an estimate, an effect or a grasp, unless `is_lossy` accepts that.
-    """
+    Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this."""
     if form not in _MODEL_FORMATS:
         why = "mjcf: UsdPhysics has no schema for cables yet, nor springs on joints that turn about three axes"
         hint, allowed = why if form == "usd" else "", ", ".join(_MODEL_FORMATS)
@@ -201,7 +201,7 @@ def _refuse_losses(
     parameters: Mapping[str, Mapping[str, Any]],
     grasps: Sequence[str],
 ) -> None:
-    """Refuse a file that lacks effects, estimates or grasps of the model, unless that is accepted."""
+    """Refuse a file that lacks effects, estimates or grasps of the model, unless losses are accepted."""
     lost = [label for label, entry in effects.items() if entry.is_lost]
     for name, entry in parameters.items():
         is_lost = (
@@ -218,7 +218,7 @@ def _refuse_losses(
 def _expressible(
     calibrated: _CalibratedModel, full: System, form: str
 ) -> tuple[System, dict[str, FeatureExportSupport]]:
-    """The system without the effects that a format cannot tell, and what it makes of each."""
+    """The system without effects that a format cannot represent, and the representation of each effect."""
     said = models.format_support_by_effect(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
         told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
@@ -242,7 +242,7 @@ def _expressible(
 
 
 def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Progress) -> dict[str, Any]:
-    """Errors of the exported model, and of the nominal one, on recordings that neither was fitted to."""
+    """Errors of the exported and the nominal model on recordings that were not fitted."""
     which = "held_out" if calibrated.settings.recordings.held_out else "estimate"
     try:
         recordings = read_recordings_of_role(calibrated.settings, which)
@@ -283,13 +283,13 @@ def _replayed(
 
 
 def _fall(pairs: Sequence[tuple[ReplayErrorAgainstRecording, ReplayErrorAgainstRecording]]) -> float | None:
-    """Mean part by which errors beyond the noise fall, of pairs before and after; None if there was none before."""
+    """Mean fraction by which errors beyond noise fall, from pairs before and after; None if there were no errors."""
     parts = [1 - a.rmse_beyond_noise / b.rmse_beyond_noise for b, a in pairs if b.rmse_beyond_noise > 0]
     return sum(parts) / len(parts) if parts else None
 
 
 def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
-    """Write `OUT/RECORDING.mcap` for every recording of a run; its topics stand in docs/howto/reports.md."""
+    """Write `OUT/RECORDING.mcap` for every recording of a run; docs/howto/reports.md lists its topics."""
     source, files, notes = folder / "trajectories.h5", [], []
     run_history.read_estimation_result(folder)
     with open_hdf5_after_read_check(source) as file:
@@ -345,7 +345,7 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
 
 
 def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTopicTimeSeries]:
-    """Joints of a group as one topic, points as one each; differences of places are vectors."""
+    """Joints of a group as one topic, points as one topic each; position differences are vectors."""
     channels, t = _texts(sensor.attrs["channels"]), np.array(sensor["t"])
     if values.shape[1] == len(channels):
         quantity = channels[0].split(".")[1]
@@ -358,7 +358,7 @@ def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTop
 
 
 def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
-    """Unknown forces, pushes, offsets and biases, where each interval begins and where the last one ends."""
+    """Unknown forces, pushes, offsets and biases at the start of each interval and the end of the last one."""
     edges = np.array(group["edges"]) + float(group.attrs.get("start", 0.0))
     mean = np.array(group["mean"])
     if not len(mean):

@@ -1,4 +1,4 @@
-"""The command `friction` judges every law of the friction ladder by motions that it was not fitted to."""
+"""The command `friction`: judge every law of the friction ladder by motions that were not fitted."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
 def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
-    """Fit every friction law to all recordings but one kind of motion in turn, and write the run folder.
+    """Fit every friction law with one kind of motion left out in turn, and write the run folder.
 
-    Successful where the warranted law's fit to all recordings converged. `DataError` for fewer than two motions that
-    could be left out.
-    """
+    Successful if the warranted law's fit to all recordings converged. Raises `DataError` if there are fewer than two
+    kinds of motion."""
     joints = None if run.model.friction is None else run.model.friction.joints
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")

@@ -1,4 +1,4 @@
-"""The command `identifiability` analyses Fisher information of recordings and of changed experiments."""
+"""The command `identifiability`: Fisher information of recordings and of changed experiments."""
 
 from __future__ import annotations
 
@@ -42,11 +42,10 @@ from yid_ocp.workflow.solve import solve_and_decide_cable_memory
 class IdentifiabilityOptions:
     """Options of an identifiability analysis beyond the run's settings.
 
-    It judges where the solver ends or at the initial values, without solving. Initial states are as the settings have
-    them, so that verdicts are those of `solve`, or all estimated along; `grasp_offset_std` is the prior standard
-    deviation of where the grasps sit [m], None for grasps as the settings have them. Profile likelihoods are of the
-    `interval_parameters`, with `auto` of all in a small problem and none in a large one.
-    """
+    The analysis is made at the solution, or at the initial values without solving. Initial states are `assumed` as in
+    the settings, so that verdicts are those of `solve`, or all estimated. `grasp_offset_std` is the prior standard
+    deviation of grasp positions [m]; None keeps the grasps of the settings. `interval_parameters` get profile
+    likelihoods; `auto` means all in a small problem and none in a large one."""
 
     evaluation_point: Literal["solution", "initial"] = "solution"
     start_knowledge: fisher.InitialStateKnowledge = "assumed"
@@ -90,9 +89,8 @@ def run_identifiability(
 ) -> CommandOutcome[IdentifiabilityResult | None]:
     """Solve, analyse identifiability and write the run folder.
 
-    Where the solver failed there is no analysis, and the run folder holds the reason. `workers` work out intervals, one
-    parameter a task, and the experiments of `what_if`; this process when absent.
-    """
+    If the solver fails there is no analysis, and the run folder holds the reason. `workers` compute intervals, one
+    parameter per task, and the changed experiments of `what_if` (default: this process)."""
     asked = options or IdentifiabilityOptions()
     with atomic_run_folder(run, out, "identifiability") as folder:
         folder.record_run_start(run, "identifiability", asked._command_line_flags())
@@ -253,7 +251,7 @@ def _profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, 
 def _change_set_outcomes(
     common: Mapping[str, Any], sets: Sequence[Sequence[str]], inflation: float
 ) -> list[dict[str, Any]]:
-    """Task: expected information of the experiment with each set of changes, as plain data."""
+    """Task: expected information of the experiment for each set of changes, as plain data."""
     run, problem = _problem(common)
     other = system_with_second_arm_holding_object(run, build_system(run))
     two_arms = None if other is None else system_with_grasp_offset_effects(other)

@@ -1,4 +1,4 @@
-"""The command `import` converts files of other tools to a recording, merges several, or previews their contents."""
+"""The command `import`: convert files of other tools to a recording, merge several, or preview their contents."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 
 
 def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
-    """Print what files hold, what each would become, and the command that imports it where one does."""
+    """Print the contents of files, the recordings they would become, and the command that imports them."""
     found, said = list[dict[str, Any]](), list[str]()
     for file in arguments.files:
         with stderr_progress_display(arguments) as progress:
@@ -114,7 +114,7 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
 
 
 def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Options of several files together, the entries of mappings and lists one after another."""
+    """Options of several files together; entries of mappings and lists are concatenated."""
     combined: dict[str, Any] = {}
     for name, value in ((name, value) for options in proposals for name, value in options.items()):
         held = combined.get(name)
@@ -128,7 +128,7 @@ def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: Progress) -> list[str]:
-    """The command that imports files, tried, and doubts about what it would make; else what is missing."""
+    """A tested command that imports files, and issues of its result, or else the missing information."""
     try:
         if len(files) > 1:
             own = {name: value for name, value in options.items() if name != "clock_offsets"}
@@ -144,7 +144,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
 
 
 def recording_doubt_lines(recording: Recording) -> list[str]:
-    """Describe doubts about a recording itself, such as units, clocks, few samples, no motion, channels."""
+    """Describe issues of a recording itself, such as units, clocks, few samples, no motion or channels."""
     units, reasons = guess_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
@@ -157,10 +157,9 @@ def recording_doubt_lines(recording: Recording) -> list[str]:
 def _merged(
     files: Sequence[str], options: Mapping[str, Any], offsets: Mapping[str, float] | None, progress: Progress
 ) -> Recording:
-    """One recording of several files; an option counts for every file whose format or columns know it.
+    """One recording from several files. An option applies to every file whose format or columns support it.
 
-    Joints and points are chosen, and currents become torques, once all are together.
-    """
+    Joints and points are selected, and currents converted to torques, after the merge."""
     known = {file: () if has_native_recording_suffix(file) else reader_option_names(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):
@@ -196,7 +195,7 @@ def recording_contents_summary(recording: Recording) -> dict[str, Any]:
 
 
 def read_third_party_recording(file: str | Path, options: Mapping[str, Any], progress: Progress) -> Recording:
-    """Read a recording from another tool's file, its hash in `source`. Options and errors as in `read_any`."""
+    """Read a recording from another tool's file, with its hash in `source`. Options and errors: `read_any`."""
     progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)
     if recording.sha256 is None or has_native_recording_suffix(file):
@@ -210,7 +209,7 @@ def has_native_recording_suffix(file: str | Path) -> bool:
 
 
 def reader_options_from_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Read reader options from command-line flags. `ConfigError` or `DataError` for an invalid one."""
+    """Read reader options from command-line flags. Raises `ConfigError` or `DataError` if a flag is invalid."""
     options = {name: getattr(arguments, name) for name in _SINGLE if getattr(arguments, name) is not None}
     for key in (*_LISTS, *_MAPPINGS):
         if entries := _split(getattr(arguments, key)):
@@ -228,7 +227,7 @@ def _flag(key: str) -> str:
 
 
 def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
-    """`KEY=VALUE` each; of columns also values alone, in their order."""
+    """`KEY=VALUE` entries as a mapping; for columns also values without a key, in order."""
     if option == "columns" and not any("=" in entry for entry in entries):
         return {str(i + 1): entry for i, entry in enumerate(entries)}
     pairs: dict[str, Any] = {}

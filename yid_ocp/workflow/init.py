@@ -1,4 +1,4 @@
-"""The command `init` writes a commented configuration from robot, recordings and object dimensions."""
+"""The command `init`: write a commented configuration from robot, recordings and object dimensions."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 
 
 def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject | None:
-    """The described object, if any; `ConfigError` for a number that is missing or impossible, and names its option."""
+    """The described object, if any. `ConfigError`, with the option, if a number is missing or impossible."""
     templates, word = init_command_object_factories(), arguments.object
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
@@ -144,7 +144,7 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
 def _split(
     made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ProposedConfigChoices, out: Path
 ) -> dict[Path, Recording | None]:
-    """A single recording in two files where it comes to rest in between, the second one to be held out."""
+    """A single recording split in two files at an intermediate standstill; the second file is held out."""
     time = held_out_split_time(recordings[0], proposal.joints) if len(recordings) == 1 else None
     if time is None:
         return made
@@ -159,7 +159,7 @@ def _split(
 
 
 def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
-    """The recordings, the configuration, which is loaded before it gets its name, and its schema; all or nothing."""
+    """Write recordings, configuration (loaded as a check before it gets its name) and schema; all or nothing."""
     before = {file for file in made if file.exists()}
     try:
         for file, recording in made.items():
@@ -199,7 +199,7 @@ def _summary_lines(
 
 
 def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices) -> Recording:
-    """The recording with its points called as the frames at which they are guessed to sit."""
+    """The recording with points renamed to the frames at which they probably are."""
     points = []
     for group in recording.points:
         places = {place.point: place.frame or place.point for place in proposal.point_placements.get(group.name, ())}
@@ -209,7 +209,7 @@ def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices
 
 
 def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -> str | None:
-    """Page on which the arm moves as recorded, with the unbent object, marked frames and points; its path, if any."""
+    """Page with the recorded arm motion, the undeformed object, marked frames and points. Returns its path, if any."""
     run, page = load_config(out), out.with_suffix(".html")
     system = build_system(run)
     scene = recording_animation(recording.name, system, system.parameters.vector(), recording, has_straight_object=True)
@@ -234,7 +234,7 @@ def _config_lines(
     recordings: Sequence[str],
     imports: Mapping[str, Any],
 ) -> Iterator[str]:
-    """Commented YAML lines: every setting has a comment beside it or in the line above."""
+    """Commented YAML lines; every setting has a comment on its line or the line above."""
     yield f"# yaml-language-server: $schema={_SCHEMA_FILE}"
     yield f"# Written by `yid-ocp init` {package_version()}. All may be changed; keys: docs/reference/settings.md."
     yield "# Each line ends with its evidence. Next: `yid-ocp check` on this file, then `yid-ocp solve`."
@@ -288,7 +288,7 @@ def _number(value: float) -> str:
 
 
 def _listed(indent: str, key: str, values: Iterable[str], comment: str) -> list[str]:
-    """A key with a list, on several lines where one is too long."""
+    """A key with a list, on several lines if one line is too long."""
     rows, row = [], ""
     for value in map(_text, values):
         if row and len(row) + len(value) > 90:
@@ -358,7 +358,7 @@ def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterato
 
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
-    """Settings that differ from their defaults, and those that every reader asks for, with their descriptions."""
+    """Settings that differ from their defaults or concern every reader, with their descriptions."""
     for key, option in dataclass_options(cast(Any, type(settings))).items():
         value = getattr(settings, option.field_name)
         if key == "mount" or (value == option.default_value and key not in _ALWAYS_WRITTEN_SETTINGS):

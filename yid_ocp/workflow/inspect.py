@@ -1,4 +1,4 @@
-"""The command `inspect` shows equations, sparsity patterns and linearisation of a run's model."""
+"""The command `inspect`: equations, sparsity patterns and linearisation of a run's model."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ run_from_arguments = command_with_settings(_run_inspect, "entries", "export")
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint:
-    """Start of the first recording: at rest in its first configuration, or fitted to its first points."""
+    """Initial state of the first recording: equilibrium at its first angles, or fitted to its first points."""
     system, sizes = step.system, step.sizes
     theta = system.parameters.vector()
     known = np.zeros(len(system.driven) + len(system.prescribed))
@@ -164,7 +164,7 @@ def _linearised(
 
 
 def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
-    """Values of all columns of the equations, the step from the point taken."""
+    """Values of all columns of the equations, for the step from the linearisation point."""
     n, still = step.sizes["n"], point.prescribed_positions
     q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
     q1, _, lam, status = step(q, p, point.torque, point.theta, (still, still), z)
@@ -190,7 +190,7 @@ def _patterns(
 
 
 def _nlp(symbols: NamedStepEquations, problem: EstimationProblem, picture: Path) -> dict[str, Any]:
-    """Size of the NLP with a node at every step and what it leaves out; draws the picture of its first steps."""
+    """Size of the NLP with a node at every step, and its omissions; also draws the pattern of its first steps."""
     episode = problem.episodes[0]
     sensors, feedback = [samples.sensor for samples in episode.measurements], episode.tracking_feedback
     followed = () if feedback is None else tuple(map(int, feedback.state_indices))
@@ -208,7 +208,7 @@ def _nlp(symbols: NamedStepEquations, problem: EstimationProblem, picture: Path)
 
 
 def _is_left_out(sensor: Sensor) -> bool:
-    """Whether a program of node states does not have what the sensor reads."""
+    """Whether a program of node states lacks what the sensor reads."""
     return bool(sensor.effort_joints) or isinstance(sensor, MountedSensor)
 
 
@@ -219,7 +219,7 @@ def _dependence(
     point: _LinearisationPoint,
     rows: StepEquationLinearizations,
 ) -> tuple[step_diagnostics.ParameterDetectability, ...]:
-    """Where every parameter enters and who sees it; along the recordings where the problem frees it."""
+    """Equations and sensors that depend on each parameter; along the recordings if the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
     found = step_diagnostics.parameter_detectabilities(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)

@@ -1,4 +1,4 @@
-"""The command `plan` plans arm motions with the identified model, to a target or for information."""
+"""The command `plan`: plan arm motions with the identified model, to a target or for information."""
 
 from __future__ import annotations
 
@@ -43,8 +43,7 @@ def run_plan(
 ) -> CommandOutcome[_Plan]:
     """Plan the motion of a run's goal, and write recording, CSV tables, `trajectory.json`, result.json and report.
 
-    Successful where the goal was reached within all limits; the run folder says why not.
-    """
+    Successful if the goal is reached within all limits; otherwise the run folder holds the reason."""
     with atomic_run_folder(run, out, "plan") as folder:
         folder.record_run_start(run, "plan")
         progress.begin_stage("building the model and its compiled step")
@@ -85,11 +84,10 @@ def _compile_step_for_planning(run: RunSettings) -> Step:
 
 
 def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapping[str, float] | None:
-    """Joint positions at the start of the motion: from the settings, else from the first recording.
+    """Joint positions at the start of the motion, from the settings or else from the first recording.
 
-    None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a
-    straight object are at its full stretch, from which it snaps to either side; a recording rarely begins there.
-    """
+    None means the joint angles of the first grasp of the undeformed object. Two arms that hold a straight object are
+    then fully stretched, and it snaps to either side; recordings rarely start like this."""
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
     [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system
@@ -103,7 +101,7 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
 def identified_parameters_with_covariance(
     run: RunSettings, step: Step
 ) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
-    """Parameters and their covariance, from a run folder of `solve` or from the settings, with their source."""
+    """Parameters, their covariance and their source: a run folder of `solve`, or the settings."""
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run is None:
@@ -241,7 +239,7 @@ def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> 
 def discrimination_plan_settings(
     confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path
 ) -> dict[str, Any] | None:
-    """Make settings of `plan` for a motion that discriminates confusable effects. None without any."""
+    """Settings of `plan` for a motion that discriminates confusable effects. None if there are none."""
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]

@@ -26,11 +26,10 @@ from yid_ocp.solvers.base import EpisodeAndPrediction
 
 
 def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
-    """Estimated torque offset of every recording, also held-out, and joint: `value`, `std`, `prior_std` [N m].
+    """Estimated torque offset of every recording, held-out ones too, and joint: `value`, `std`, `prior_std` [N m].
 
-    The problem's weights are frozen near `x`, shape (nx,); without them, or where offsets are no part of the model, the
-    result is empty.
-    """
+    The problem's whitening filters are fixed near `x` (nx,). Without filters, or without offsets in the model, the
+    result is empty."""
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
     known = list(zip(problem.episodes, whitening.torque_biases_and_stds_by_recording(problem, x), strict=True))
@@ -57,12 +56,11 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
 
 
 def numbers_to_use(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
-    """Make lines to copy from an estimate, for the parameters that are found. Empty if none is found.
+    """Make lines to copy from an estimate, for the identifiable parameters. Empty if there are none.
 
-    `values` with total standard deviations, `joints` (of each segment and deformation the number of links and the
-    lowest and highest stiffness of a joint [N m/rad]), lines of `yaml` and `mjcf`, rows of `latex`, the command that
-    exports the model of the run folder, and what to cite.
-    """
+    The result holds `values` with total standard deviations, `joints` (number of links and range of joint stiffness [N
+    m/rad], per segment and deformation), lines of `yaml` and `mjcf`, rows of `latex`, the command that exports the
+    model of the run `folder`, and what to cite."""
     found = {n: e for n, e in solution.parameters.items() if e.free and e.verdict == "identifiable"}
     if not found:
         return {}
@@ -113,7 +111,7 @@ def _has_torque_bias(episode: Episode) -> bool:
 def predicted_configuration_trajectory(
     name: str, problem: EstimationProblem, episode: Episode, prediction: EpisodePrediction, theta: Array
 ) -> ConfigurationTrajectory:
-    """Make the trajectory of a predicted recording for an animation. `theta` (ntheta,) holds all parameters."""
+    """Trajectory of a predicted recording for an animation. `theta` (ntheta,) holds all parameters."""
     system, q = problem.system, prediction.rollout.state[:, : problem.system.n_coordinates]
     own = problem.predictor.theta_with_episode_values(episode, theta)
     return ConfigurationTrajectory(name, system, own, episode.grid.node_times, q)
@@ -128,15 +126,12 @@ EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, Episo
 def write_solve_trajectories(
     path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> None:
-    """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`.
+    """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`. Raises `OutputError`.
 
-    `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
-    [N s], `torque` (N, nu) [N m] or what servos are commanded, `command` (N, nu) [rad or m] (NaN while a motor is off),
-    `effort` (N, nc) [N m], the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor
-    `GROUP/` with `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`.
-
-    Raises `OutputError`.
-    """
+    `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m) [N
+    s], `torque` (N, nu) [N m] or, for servos, `command` (N, nu) [rad or m] (NaN while a motor is off), `effort` (N, nc)
+    [N m], the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with
+    `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`."""
     pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:
         done = solution.episode_predictions
@@ -167,22 +162,18 @@ def write_solve_trajectories(
 def write_diagnosis_hdf5(
     path: Path, finding: DiagnosisResult, pairs: Sequence[EpisodeWithNominalAndEffectPredictions]
 ) -> None:
-    """Write held-out predictions, smoothed unknowns and event forces to HDF5 as `yid-diagnosis-trajectories/1`.
+    """Write held-out predictions, smoothed unknowns and event forces as `yid-diagnosis-trajectories/1` (HDF5).
 
-    `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
+    `RECORDING/GROUP/`, for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
     attributes `channels`, `unit`.
 
-    `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
-    since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
-    forces, offsets and biases about the nominal model and `prior` (nd,), the standard deviation at the largest
-    evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each,
-    and `start`, the time of the first node [s].
+    `where/RECORDING/`, for every estimation recording with a gap to locate: `edges` (J + 1,) of the intervals with
+    constant unknowns [s since the first node]; `mean` and `std` (J, nd) of the unknown forces, offsets and biases about
+    the nominal model; `prior` (nd,), their standard deviation at the largest evidence (zero: group not used); the
+    attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each, and `start`, the time of the first node [s].
 
-    `events/RECORDING/CHANNEL/` where a force acted as an event: `t` (M,) [s], `value` (M,) the force beside what model
-    and recording have, `allowed` (M,) what the model may be wrong by; the attribute `unit`.
-
-    Raises `OutputError`.
-    """
+    `events/RECORDING/CHANNEL/`, for every event force: `t` (M,) [s], `value` (M,) of the force beyond model and
+    recording, `allowed` (M,), the assumed model error; the attribute `unit`. Raises `OutputError`."""
     with create_hdf5_atomically(path) as file:
         file.attrs["format"] = DIAGNOSIS_TRAJECTORIES_FORMAT
         for episode, before, after in pairs:

@@ -36,7 +36,7 @@ _FULL_HINT = "choose a folder on a disk with room, with --out"
 
 @dataclass
 class RunFolder:
-    """A run folder during writing, with its paths, log and hashes of inputs."""
+    """A run folder while it is written, with its paths, log and hashes of inputs."""
 
     final_path: Path  # its name when complete
     path: Path  # where it is now
@@ -47,7 +47,7 @@ class RunFolder:
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
-        """Write config.yaml, hash the inputs and log the start of a command. Errors: `input_files_by_name`."""
+        """Write config.yaml, hash the inputs, and log the start of a command. Errors: `input_files_by_name`."""
         self.write_text_file("config.yaml", config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
@@ -58,7 +58,7 @@ class RunFolder:
         self.log_command_start([command, *said, *flags])
 
     def log_command_start(self, words: Sequence[str]) -> None:
-        """Log the start of a command with its inputs. The command line `words` reproduces its result."""
+        """Log the start of a command and its inputs. The command line `words` reproduces its result."""
         self._command_line = shlex.join(["yid-ocp", *words])
         self.log_event("start", command=words[0], versions=software_and_plugin_versions(), inputs=self.input_hashes)
 
@@ -75,7 +75,7 @@ class RunFolder:
     def write_result_and_report(
         self, run: RunSettings, shown: Progress, result: Mapping[str, Any], name: str = "result.json", /, **known: Any
     ) -> dict[str, Any]:
-        """Write result.json and, if set, report.html. `known`: more attributes of `ReportData`."""
+        """Write result.json and, if set, report.html. `known` holds more attributes of `ReportData`."""
         written = self.write_result(result, name)
         if run.output.write_report:
             shown.begin_stage("writing the report", 1.5)
@@ -116,11 +116,9 @@ def _grouped(notes: list[str]) -> list[str]:
 def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
     """Create a run folder that appears under its name only if the block succeeds (context manager).
 
-    The name is reserved first: two runs never write to one folder, and a run that ends finds its name free. What
-    killed runs left beside it is cleared away. `OutputError` where the folder exists and is not empty, another run is
-    making it, or it cannot be made or written to. Its name is `out`, or `NAME-COMMAND-YYYYmmdd-HHMMSS` in
-    `output.runs_folder`.
-    """
+    The name is `out`, or `NAME-COMMAND-YYYYmmdd-HHMMSS` in `output.runs_folder`. It is reserved first, so that two runs
+    never write to one folder. Remains of killed runs next to it are deleted. Raises `OutputError` if the folder exists
+    and is not empty, is being written by another run, or cannot be created or written to."""
     stem = "-".join(filter(None, (run.name, command)))
     targets = _targets(run, out, stem)
     made = [parent for parent in targets[0].parents if not parent.exists()]
@@ -165,7 +163,7 @@ def _name_requested_folder(error: YidError, target: Path, *hidden: Path) -> None
 
 
 def _publish(folder: RunFolder, lock: FileLock) -> None:
-    """Give the complete folder its name, or the next free one where somebody took it: nothing finished is lost."""
+    """Give the complete folder its name, or the next free one if it was taken, so that no result is lost."""
     temporary, target = folder.path, folder.final_path
     with _refusing("written", target, _FULL_HINT):
         folder._log.close()
@@ -187,7 +185,7 @@ def _publish(folder: RunFolder, lock: FileLock) -> None:
 
 
 def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
-    """The first name that no other run has or makes, and the lock that keeps it; it stands in the unfinished folder."""
+    """The first name not used by another run, and its lock, a file in the unfinished folder."""
     parent = targets[0].parent
     for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():  # left by killed runs
         with contextlib.suppress(OSError):
@@ -219,7 +217,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
 
 
 def _is_of_a_run(temporary: Path) -> bool:
-    """Whether a hidden folder may be emptied: no link, of this user, with nothing or a run's lock in it."""
+    """Whether a hidden folder may be emptied: not a link, owned by this user, empty or with a run's lock."""
     lock = temporary / _LOCK
     try:
         info = temporary.lstat()
@@ -237,7 +235,7 @@ def _remove_all_but_lock(temporary: Path) -> None:
 
 
 def _locked(temporary: Path) -> FileLock | None:
-    """The lock of an unfinished folder, None where another process holds it or clears the folder away."""
+    """The lock of an unfinished folder; None if another process holds it or deletes the folder."""
     lock = FileLock(temporary / _LOCK, is_singleton=False, thread_local=False)
     try:
         lock.acquire(timeout=0)

@@ -1,4 +1,4 @@
-"""Read the estimates of earlier runs as a diagnosis baseline and for the command `report`."""
+"""Read the estimates of earlier runs, as a baseline of a diagnosis and for the command `report`."""
 
 from __future__ import annotations
 
@@ -50,9 +50,8 @@ _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 def read_estimates(folder: str | Path) -> RunEstimates:
     """Read estimates and covariance of free parameters from the run folder of a `solve` or `diagnose`.
 
-    `DataError` where there is no finished run, its result cannot be read, is one of another command or of an older
-    format, or its solve failed.
-    """
+    Raises `DataError` if there is no finished run, its result cannot be read, belongs to another command or has an old
+    format, or if its solve failed."""
     file, result = Path(folder) / "result.json", read_estimation_result(folder)
     try:
         said = result.get("model", result)  # of a diagnosis, the model that it ended with
@@ -79,7 +78,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
 
 
 def parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Values of effect parameters, by the effect's label and the parameter's own name."""
+    """Values of effect parameters, by effect label and parameter name without label."""
     found: dict[str, dict[str, float]] = {}
     for name, value in parameters.items():
         label, _, quantity = name.rpartition(".")
@@ -89,7 +88,7 @@ def parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[st
 
 
 def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
-    """Add effects to the model settings at their values, by label. Existing effects are kept."""
+    """Settings with effects added to the model at their values, by label. Existing effects are kept."""
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
     added = [EffectSettings(kind=kind, location=location, values=values) for (kind, _, location), values in parts]
@@ -110,7 +109,7 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
 
 
 def read_result_file(file: Path) -> dict[str, Any]:
-    """Read any command's result.json. `DataError` if it cannot be read or is of an old version."""
+    """Read any command's result.json. Raises `DataError` if it cannot be read or has an old format."""
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
@@ -125,7 +124,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
 
 
 def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]:
-    """Estimates of the runs in `diagnosis.baseline`. `ConfigError` for one of another model, or given twice."""
+    """Estimates of the runs in `diagnosis.baseline`. `ConfigError` if one has another model or is listed twice."""
     found: list[RunEstimates] = []
     for i, folder in enumerate(run.diagnosis.baseline):
         where = ("diagnosis", "baseline", i)
@@ -148,7 +147,7 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
 
 
 def _dependent(folders: Sequence[str | Path]) -> str:
-    """Says which run has another one of them as its baseline, so that one would count twice; empty where none has."""
+    """Message on a run that is the baseline of another one and would count twice; empty if there is none."""
     known = [Path(folder).resolve() for folder in folders]
     for folder in known:
         said = read_result_file(folder / "result.json").get("baseline") or {}
@@ -173,7 +172,7 @@ def require_same_model(folders: Sequence[Path]) -> None:
 
 
 def _difference(run: RunSettings, there: RunSettings | None) -> str:
-    """The first section of the model in which two runs differ, empty where none is known to."""
+    """The first section of the model that differs between two runs; empty if none is known to differ."""
     if there is None:
         return ""
     for key in _COMPARED_MODEL_SECTIONS:
@@ -195,7 +194,7 @@ def _settings(folder: str | Path) -> RunSettings | None:
 
 
 def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
-    """Add a baseline's effects at their estimated values to the settings. Parameters estimated there are free."""
+    """Settings with a baseline's effects at their estimated values. Parameters estimated in the baseline are free."""
     if not runs:
         return run
     known, _, _ = pool_estimates(runs)
@@ -212,7 +211,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 
 
 def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
-    """Load recordings without the sought effect, from settings or baseline. A text says why none exist."""
+    """Load recordings without the sought effect, from settings or baseline, and the reason if there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
         file = resolve_recording_path(path)
@@ -233,7 +232,7 @@ def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recor
 def require_recordings_not_in_baseline(
     run: RunSettings, problem: EstimationProblem, runs: Sequence[RunEstimates], without: Sequence[Recording]
 ) -> None:
-    """Raise `ConfigError` where a recording of the run is also a baseline or reference recording."""
+    """Raise `ConfigError` if a recording of the run is also a baseline or reference recording."""
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
@@ -252,7 +251,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 
 
 def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
-    """Compare runs of one model, given in the order of time, or two of the same recordings; writes JSON and a page."""
+    """Compare runs of one model in chronological order, or two runs of the same recordings. Writes JSON and a page."""
     if len(paths) < 2:
         hint = "add the runs of other days"
         raise ConfigError("one run has no history", where="report", allowed="two or more run folders", hint=hint)
@@ -294,7 +293,7 @@ def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
 
 
 def _have_same_recordings(folders: Sequence[Path]) -> bool:
-    """Whether two runs are of the same recordings; `ConfigError` where they share some but not all."""
+    """Whether two runs have the same recordings. `ConfigError` if they share only some of them."""
     inputs = [read_result_file(folder / "result.json").get("inputs", {}) for folder in folders]
     known = [{digest: path for path, digest in own.items() if has_native_recording_suffix(path)} for own in inputs]
     if not known[0].keys() & known[1].keys():
@@ -359,8 +358,7 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
 def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Values of every parameter that is free in one of two runs, and their difference over the larger std.
 
-    There is no difference from a value that a run could not find.
-    """
+    The difference is None if a run could not identify the value."""
     parameters: dict[str, Any] = {}
     for name in dict.fromkeys(name for own in found for name, entry in own.items() if entry.get("free", True)):
         known = {label: own[name] for label, own in zip(labels, found, strict=True) if name in own}
@@ -378,7 +376,7 @@ def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any
 
 
 def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple[str, str], ChannelPrediction]:
-    """Predictions in a run's trajectories.h5, by recording and channel; adds what each recording was used for."""
+    """Predictions in a run's trajectories.h5, by recording and channel, with the role of each recording."""
     found: dict[tuple[str, str], ChannelPrediction] = {}
     with open_hdf5_after_read_check(folder / "trajectories.h5") as file:
         is_solve = file.attrs["format"] == SOLVE_TRAJECTORIES_FORMAT
@@ -400,7 +398,7 @@ def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple
 def _overlaid_motions(
     folders: Sequence[Path], labels: Sequence[str], found: Sequence[Mapping[str, Any]]
 ) -> list[Animation]:
-    """Motions of both runs' models and the measured one; none where a model or recording can no longer be read."""
+    """Measured motion and motions of both runs' models; empty if a model or recording is no longer readable."""
     told: dict[str, list[ConfigurationTrajectory]] = {}
     try:
         runs = [load_config(folder / "config.yaml") for folder in folders]

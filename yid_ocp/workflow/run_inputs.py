@@ -30,9 +30,8 @@ _loaded: dict[str, str] = {}  # what this process has run: file or entry point, 
 def load_plugins(run: RunSettings) -> None:
     """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once per process.
 
-    `ConfigError` for a file that is missing, raises, registers nothing, or uses a name that is taken; for one that
-    changed after this process ran it. Nothing of it stays registered.
-    """
+    Raises `ConfigError`, and registers nothing of the plug-in, if it is missing, raises, registers nothing, uses a
+    registered name, or changed after this process ran it."""
     for entry in _installed():
         name, of = f"entry point {entry.name}", _distribution(entry)
         if name not in _loaded:
@@ -65,7 +64,7 @@ def _installed() -> Sequence[metadata.EntryPoint]:
 
 
 def _run(path: Path, digest: str) -> None:
-    """Import a file under a name that nothing else has, so that two of one name do not meet."""
+    """Import a file under a unique module name, so that two files of the same name do not conflict."""
     name = f"yid_ocp_plugin_{path.stem}_{digest[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -81,7 +80,7 @@ def _run(path: Path, digest: str) -> None:
 
 @contextlib.contextmanager
 def _registering(name: str, where: str, hint: str, path: Path | None = None, known: bool = False) -> Iterator[None]:
-    """Say what is wrong with a plug-in that the block runs, and forget what it registered until then."""
+    """Convert errors of a plug-in that the block runs, and remove its registrations after an error."""
     before = [set(registry) for registry in _REGISTRIES]
     try:
         yield
@@ -120,15 +119,14 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
 
 
 def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
-    """Make a `ConfigError` about an unknown name in the settings, with the nearest known one. It is not raised."""
+    """Make (not raise) a `ConfigError` about an unknown name in the settings, with the nearest known name."""
     return run.config_error(f"there is no {noun} '{name}'", *path, hint=nearest_name_hint(name, known))
 
 
 def input_files_by_name(run: RunSettings) -> dict[str, Path]:
-    """Find every file that a run reads, such as configuration, plug-ins, robot and recordings, by its name.
+    """All input files of a run (configuration, plug-ins, robot, recordings), by their name in the settings.
 
-    `ConfigError` where one does not exist, which names the setting and the nearest file that does.
-    """
+    Raises `ConfigError` if a file does not exist. The message has the setting and the most similar existing file."""
     files = {"configuration": Path(run.config_file)} if run.config_file else {}
     for i, path in enumerate(run.plugins):
         files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
@@ -155,17 +153,16 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
 
 
 def resolve_recording_path(path: str) -> Path:
-    """Find the path of a recording named in the settings. `default:NAME` is one shipped with the package."""
+    """Path of a recording named in the settings; `default:NAME` is a recording shipped with the package."""
     if not path.startswith("default:"):
         return Path(path)
     return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
 
 
 def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
-    """Read the first `count` recordings of `recordings.estimate` or `held_out`, uniquely named. None means all.
+    """Read the first `count` recordings (None: all) of `recordings.estimate` or `held_out`, uniquely named.
 
-    Errors as `read_recording`, which name the setting.
-    """
+    Errors are as in `read_recording`, with the setting."""
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
     for i, path in enumerate(paths[:count]):

@@ -1,4 +1,4 @@
-"""The command `simulate` simulates robot and sensors and writes a recording."""
+"""The command `simulate`: simulate robot and sensors and write a recording."""
 
 from __future__ import annotations
 
@@ -34,15 +34,14 @@ def run_simulate(
     seed: int = 0,
     noise: bool = False,
 ) -> CommandOutcome[Recording | None]:
-    """Write `recording.h5` of the model under the first recording's inputs, or without one of a virtual experiment.
+    """Write `recording.h5` of the model with the first recording's inputs, or of a virtual experiment.
 
-    With a recording under `recordings.estimate`, its torques or prescribed motion drive the model with the parameters'
-    initial values, and every sensor is predicted at the times at which it measured. Without one, MuJoCo simulates a
-    random motion of the driven arms. There is no recording where the rollout failed.
+    With a recording under `recordings.estimate`, its torques or prescribed motion drive the model at the initial
+    parameter values, and every sensor is predicted at its sample times. Otherwise MuJoCo simulates a random motion of
+    the driven arms. If the rollout fails there is no recording.
 
-    `noise` adds noise of the recorded standard deviations to what the model predicts (a virtual experiment always has
-    noise); `seed` is that of the motion and the noise.
-    """
+    `noise` adds noise with the recorded standard deviations to the predictions (a virtual experiment always has noise).
+    `seed` determines the motion and the noise."""
     with atomic_run_folder(run, out, "simulate") as folder:
         flags = [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
         folder.record_run_start(run, "simulate", flags)

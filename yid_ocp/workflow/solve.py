@@ -1,4 +1,4 @@
-"""The command `solve` estimates the free parameters, predicts held-out recordings, writes the run folder."""
+"""The command `solve`: estimate free parameters, predict held-out recordings, write the run folder."""
 
 from __future__ import annotations
 
@@ -36,11 +36,10 @@ _BARS, _SPARKLINE_WIDTH = "▁▂▃▄▅▆▇█", 24
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS, is_live: bool = False
 ) -> CommandOutcome[Solution]:
-    """Estimate, validate and write the run folder. It succeeds if the solver converged.
+    """Estimate, validate and write the run folder. Successful if the solver converged.
 
-    Where it failed the run folder holds the reason and the best point. `is_live`: report a table of cost and parameters
-    at every iterate, which a terminal renews.
-    """
+    If it failed, the run folder holds the reason and the best point. `is_live` reports a table of cost and parameters
+    at every iterate, which a terminal updates."""
     with atomic_run_folder(run, out) as folder:
         folder.record_run_start(run, "solve")
         progress.begin_stage("building the model and its compiled step", ahead=20.0)
@@ -85,7 +84,7 @@ def solve_and_decide_cable_memory(
 def _iterate_logger(
     problem: EstimationProblem, folder: RunFolder, progress: Progress, is_live: bool = False
 ) -> IterationCallback:
-    """Callback that writes every iterate to the run folder's log and reports it, with a table if `is_live`."""
+    """Callback that logs every iterate in the run folder and reports it, with a table if `is_live`."""
     iterates: list[Iterate] = []
 
     def iterate(entry: Iterate) -> None:
@@ -100,7 +99,7 @@ def _iterate_logger(
 
 
 def _iterate_table(problem: EstimationProblem, iterates: Sequence[Iterate]) -> list[Sequence[str]]:
-    """Cost and parameters: start, now, last step and course; parameters that moved most in the last step come first."""
+    """Cost and parameters: initial, present, last step and history; largest last steps first."""
     courses = {name: [float(entry.x[i]) for entry in iterates] for i, name in enumerate(problem.shared_parameters)}
     steps = {name: own[-1] - own[-2] if len(own) > 1 else 0.0 for name, own in courses.items()}
     ordered = sorted(courses, key=lambda name: -abs(steps[name]) / max(abs(courses[name][-1]), 1e-12))
@@ -114,7 +113,7 @@ def _iterate_table(problem: EstimationProblem, iterates: Sequence[Iterate]) -> l
 
 
 def _sparkline(values: Sequence[float]) -> str:
-    """The last values as a row of bars between their least and largest."""
+    """The last values as a row of bars between their minimum and maximum."""
     shown = values[-_SPARKLINE_WIDTH:]
     low, high = min(shown), max(shown)
     return "".join(_BARS[round((len(_BARS) - 1) * (value - low) / ((high - low) or 1.0))] for value in shown)
@@ -155,5 +154,5 @@ def solution_to_result_dict(
 def discretisation_shifts_to_dict(
     shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Convert estimates' discretisation shifts for result.json, with parameters' standard deviations from data."""
+    """Convert estimates' discretisation shifts for result.json, with parameters' data standard deviations `std`."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}

@@ -1,4 +1,4 @@
-"""The command `track` tracks points in depth-camera frames, frame by frame on workers, and writes a recording."""
+"""The command `track`: track points in depth-camera frames, in parallel, and write a recording."""
 
 from __future__ import annotations
 
@@ -62,10 +62,9 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 def _run_track(
     run: RunSettings, out: str | Path | None, progress: Progress, workers: WorkerConfig | None
 ) -> CommandOutcome[None]:
-    """Track the frames of `track.frames_path`, or of a virtual camera; what an interrupted run did is used again.
+    """Track the frames of `track.frames_path` or of a virtual camera. Results of an interrupted run are reused.
 
-    Where not one frame is good, the run folder says why when the error is raised.
-    """
+    If no frame is good, an error is raised and the run folder holds the reasons."""
     settings = run.track
     with atomic_run_folder(run, out, "track") as folder:
         folder.record_run_start(run, "track")
@@ -119,7 +118,7 @@ def _run_track(
 
 
 def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
-    """Frames to draw: some of all, evenly spread, and as many of those that were dropped, each for another reason."""
+    """Frames to draw: some of all, evenly spread, and as many dropped frames, each with another reason."""
     chosen = {int(i) for i in np.linspace(0, len(frames) - 1, count + 2)[1:-1]}
     reasons = [frames[k].drop_reason.partition(":")[0] for k in sorted(chosen)]
     for k, frame in enumerate(frames):
@@ -136,7 +135,7 @@ def _track_result(
     things: Sequence[ForeignObject],
     found: TrackResult | None,
 ) -> dict[str, Any]:
-    """`yid-track/1` without doubts, inputs and versions; `found` is None where no frame is good."""
+    """`yid-track/1` without issues, inputs and versions; `found` is None if no frame is good."""
     spent = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     return {
         "format": "yid-track/1",
@@ -222,7 +221,7 @@ def _truth_errors(
 
 
 def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFramesWithTruth]:
-    """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
+    """Recording and camera frames of a virtual experiment; its true values are the initial parameter values."""
     from yid_ocp.virtual.experiment import VirtualExperimentSettings, record_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
@@ -270,7 +269,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
 
 
 def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Recording | None]:
-    """The tracker of the frames in files, and the recording with the joints, None where none is listed."""
+    """Tracker of the frames in files, and the recording with the joints, or None if none is listed."""
     recording = _read_joints(run)
     sequence, scene = _read_frames(run, "frames_path"), _camera_scene(run, system)
     background = None if run.track.background_frames_path is None else _read_frames(run, "background_frames_path")
@@ -325,7 +324,7 @@ class _FrameTasks:
 def _frame_tasks(
     run: RunSettings, system: System, folder: RunFolder, progress: Progress
 ) -> tuple[_FrameTasks, VirtualFramesWithTruth | None]:
-    """Tracking tasks of frames in files, written before where a virtual camera sees them; and the latter's truth."""
+    """Tracking tasks of frames in files, first written if a virtual camera renders them, and their true motion."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
     joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
@@ -375,7 +374,7 @@ def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[s
 
 @lru_cache(maxsize=1)
 def _tracker(text: str, config: Path) -> FrameTracker:
-    """One for all frames that a process works on; the text makes another one of it when the file has changed."""
+    """The tracker for all frames of a process; a changed file (`text`) makes a new tracker."""
     del text
     run = load_config(config)
     return _frame_tracker(run, build_system(run))[0]
