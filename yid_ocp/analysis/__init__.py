@@ -1,1 +1,1 @@
-"""Read-only analyses of a model and of an estimation, such as identifiability, data quality and convergence."""
+"""Analyses of a model and of an estimation: identifiability, data quality, convergence. None changes its input."""

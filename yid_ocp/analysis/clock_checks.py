@@ -1,11 +1,12 @@
-"""Check point clocks for offset and drift relative to the joint clock, also by a fit's residuals.
+"""Checks of point clocks for offset and drift relative to the joint clock, also with the residuals of a fit.
 
-A point that is seen at the stamp t is where it was at t - late - drift (t - middle), so that to first order
+A point seen with the stamp t was measured at the time t - late - drift (t - middle). To first order
 
-    expected - seen = speed (late + drift (t - middle)) + what else the expected place may be wrong by,
+    expected - seen = speed (late + drift (t - middle)) + other errors of the expected position,
 
-which is linear. Standard deviations count that errors of neighbouring samples are alike (blocks of time, Cameron,
-Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136). Only motion tells: at rest the columns of both are zero.
+which is linear in the unknowns. The standard deviations account for correlated errors of neighbouring samples (blocks
+of time, Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136). At rest the clock's columns are zero, so only
+motion is informative.
 """
 
 from __future__ import annotations
@@ -33,24 +34,24 @@ from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
 
-# From times on the joints' clock (N,) to places (N, np, 3) [m].
+# From times on the joints' clock (N,) to positions (N, np, 3) [m].
 PositionsAtTimes = Callable[[Array], Array]
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
-# No sensor takes longer for one sample: a slow camera knows when a frame was taken better than to its period [s].
+# Longest exposure of one sample: a slow camera knows the time of a frame better than its period [s].
 _MAX_EXPOSURE_TIME = 0.04
 _N_TIME_BLOCKS = 10  # blocks of time whose errors count as independent of each other
 _MAX_DRIFT = 0.05  # part by which clocks that were meant to agree may run apart
 _DRIFT_SEARCH_STEP = 0.2  # how far clocks run apart between two drifts that are tried first [s]
 _N_RELINEARIZATIONS = 3  # so many times a fit is repeated at the times that the last one found
 _MIN_EXPLAINED_FRACTION = 0.5  # part of what a fit leaves beyond noise that a drift has to explain
-# Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not pass for a clock's.
+# Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not be attributed to a clock.
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
 
 
 @dataclass(frozen=True)
 class _ClockError:
-    """Stamp minus true time [s] in the middle of a group, and the relative rate by which its clock runs faster."""
+    """Stamp minus true time [s] in the middle of a group, and the relative rate by which its clock is too fast."""
 
     span: tuple[float, float]
     delay: float
@@ -65,22 +66,22 @@ class _ClockError:
         return self.drift * (self.span[1] - self.span[0])
 
     def drifts_beyond(self, limit: float) -> bool:
-        """Whether the drift is significant, and larger than a limit in sum [s]."""
+        """Whether the drift is significant and its total exceeds a limit [s]."""
         return abs(self.drift) > _MIN_Z * self.drift_std and abs(self.whole_drift) > limit
 
 
 def _offset_tolerance(joints: JointGroup, group: PointGroup) -> float:
-    """Clock offset that cannot be resolved below the sample periods [s]."""
+    """Clock offset that is too small to be resolved with these sample periods [s]."""
     return 0.5 * (median_sample_period(joints.t) + min(median_sample_period(group.t), _MAX_EXPOSURE_TIME))
 
 
 def _clock_error(
     t: Array, residual: Array, speed: Array, others: Array, size: Array, span: tuple[float, float]
 ) -> _ClockError | None:
-    """A clock's offset and drift from a residual (R,), expected less seen in units of the noise, by least squares.
+    """A clock's offset and drift by least squares from a residual (R,), expected minus seen in units of noise.
 
-    `speed` (R, 2) are its derivatives by offset and accumulated drift (`_by_clock`), `others` (R, k) those by other
-    unknowns, whose usual sizes are `size`. None where the motion is not informative.
+    `speed` (R, 2) are the derivatives by offset and accumulated drift, `others` (R, k) those by other unknowns, whose
+    usual sizes are `size`. None if the motion is not informative.
     """
     length, data = max(span[1] - span[0], 1e-9), len(t)
     if not np.all(np.sum(speed**2, axis=0) > 0) or data < 3 * _N_TIME_BLOCKS:
@@ -106,7 +107,7 @@ def _clock_error(
 
 
 def _by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
-    """Derivatives of predicted values by the clock's offset and by its accumulated drift, shape (R, 2)."""
+    """Derivatives (R, 2) of predicted values by the clock's offset and by its accumulated drift."""
     return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
 
 
@@ -121,8 +122,8 @@ def check_robot_held_point_clock(
 ) -> Iterator[Issue]:
     """Yield issues about clock offset or drift of points whose positions follow from the joint angles.
 
-    They are seen (N, np, 3) [m] at the times `t` (N,); `by_angle` (N, np, 3, k) is the derivative of their places by
-    the angles, `std` their noise [m], zero if unknown.
+    The points are seen at `seen` (N, np, 3) [m] at the times `t` (N,). `by_angle` (N, np, 3, k) is the derivative of
+    their positions with respect to the angles. `std` is their noise [m], zero if unknown.
     """
     span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
@@ -172,17 +173,17 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severit
 
 
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
-    """Advise how to correct time stamps t that are `late` [s] at t = `middle` and drift by the fraction `drift`."""
+    """Text on how to correct time stamps t that are `late` [s] at t = `middle` and drift by the fraction `drift`."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
 def search_clock_offset_and_drift(
     path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
-    """Search, coarse to fine, the clock offset [s] and relative drift at which points lie nearest to a path.
+    """Search, coarse to fine, the clock offset [s] and relative drift for which points are nearest to a path.
 
-    The path is known from the first to the last of `knots` [s]; points `seen` (N, np, 3) [m] at the times `t` (N,).
-    With `drifts` the clock may run apart as well, by up to `_MAX_DRIFT`.
+    The path is known from the first to the last of `knots` [s]. The points are `seen` (N, np, 3) [m] at the times `t`
+    (N,). With `drifts` the clock may also drift, by up to `_MAX_DRIFT`.
     """
     middle, span = 0.5 * float(t[0] + t[-1]), float(t[-1] - t[0])
 
@@ -213,8 +214,8 @@ def search_clock_offset_and_drift(
 def drift_and_overstated_noise_issues(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
     """Find drifting clocks and overstated noise in the residuals of a fit.
 
-    A constant offset of a camera's clock looks like damping that the model lacks; to tell the two is a diagnosis's task
-    (effect `camera_latency`). One that grows over a recording is a clock's.
+    A constant offset of a camera's clock looks like missing damping; a diagnosis distinguishes the two (effect
+    `camera_latency`). Only an offset that grows during a recording is attributed to the clock here.
     """
     if not evaluation.ok or evaluation.jacobian is None or problem.rms_noise_of_data_residuals != 1.0:
         return []
@@ -256,7 +257,7 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
 def _by_lateness(
     problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction
 ) -> Array:
-    """Whitened prediction less measurement per second that the stamps are late, shape (M, k)."""
+    """Whitened prediction minus measurement per second of lateness of the stamps, shape (M, k)."""
     shared, _ = problem.theta_and_initial_state_deviation(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     state = result.rollout.state
@@ -270,7 +271,7 @@ def _by_lateness(
 
 
 def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[Issue]:
-    """Groups whose residuals, also summed over blocks of time as what lasts for long sums up, are far below noise."""
+    """Groups whose residuals, both per sample and summed over time blocks, are far below the stated noise."""
     by_group: dict[str, list[tuple[float, float, int]]] = {}
     units = {}
     for series in residual_channel_indices(problem):

@@ -1,4 +1,4 @@
-"""Compare estimation methods on one problem, and with published results."""
+"""Comparison of estimation methods on one problem, and with published results."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
 
 _MEMORY_SAMPLING_PERIOD = 0.02
-# Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of
-# the value: below that the methods' own stopping rules show.
+# Two estimates agree if they differ by less than this many of the larger standard deviation, or by this fraction of the
+# value (below that, the methods' stopping rules dominate).
 _AGREEMENT_STDS, _AGREEMENT_RTOL = 2.0, 0.005
 _SOLVE_LABEL = "solve"  # the run that gives the verdicts, by all noise
 
 
 @dataclass(frozen=True)
 class _MethodResult:
-    """Solution, its cost in the problem's own weighting, time and largest resident memory of one estimation method."""
+    """Result of one method: solution, cost in the problem's own weighting, times and largest resident memory."""
 
     method: str
     solution: Solution
@@ -80,11 +80,11 @@ def compare_methods(
 ) -> MethodComparison:
     """Run several methods from the same initial values and compare their estimates.
 
-    Steepest descent gets the published cost (points in metres, no noise levels, no weak prior), the others that of the
-    problem without process noise, which not every method can carry. With process noise their estimates are not
-    trusted, and the verdicts come from one more run of a method that can. `truth` are known parameter values;
-    `callback` is called with the method's name and every `Iterate`; `limits` say when a residual is more than noise.
-    Each method has the rest of `time_budget` [s] over the number of methods still to run; then it is stopped.
+    Steepest descent minimises the published cost (points in metres, no noise levels, no weak prior). The other methods
+    minimise the problem's cost without process noise, which not every method supports. If the problem has process
+    noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run of a method that
+    supports it. `truth` are known parameter values. `callback` receives the method's name and every `Iterate`. Each
+    method may use an equal part of the remaining `time_budget` [s], after which it is stopped.
     """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
     deadline = time.perf_counter() + time_budget
@@ -136,7 +136,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
             continue
         entry = run.solution.parameters[name]
         gap = abs(entry.value - reference.value)
-        # the ± of a fit that stopped short is that of its misfit, and would agree with everything
+        # a fit that stopped early has a large ± from its misfit, which would agree with everything
         std = max(entry.std, reference.std) if run.solution.status == Status.CONVERGED else reference.std
         if gap <= max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
             continue
@@ -169,10 +169,10 @@ def _explanations(
 def _descent_errors(
     run: _MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> str:
-    """Which parameters a method left far from the truth, and whether these are the ones that the data do not tell."""
+    """Sentence on the parameters that a method left far from the truth, and whether the data determine them."""
     known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
-    # the same limit makes a standard deviation too large for an identifiable parameter
+    # the same limit applies to the standard deviation of an identifiable parameter
     wrong = [name for name in known if not _near(found[name], truth[name])]
     verdicts = {name: VERDICT_TABLE_TEXTS[entry.verdict] for name, entry in known.items()}
     hidden = [name for name in known if known[name].verdict != "identifiable"]
@@ -195,7 +195,7 @@ def _descent_errors(
 
 
 class _Memory:
-    """Largest resident memory of this process while the block runs, sampled by a thread [MiB]."""
+    """Largest resident memory of this process during a block, sampled by a thread [MiB]."""
 
     def __enter__(self) -> _Memory:
         self.peak, self._stop = 0.0, threading.Event()
@@ -223,9 +223,9 @@ def _resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
-# Their recordings are not public. Statements rest on synthetic recordings of the experiments in MuJoCo with a chosen
-# truth: what they inform, where steepest descent with the published cost and step lengths is after 200 iterations,
-# and where constant errors of the torques lead it (`benchmarks/torque_ensemble.py`).
+# The recordings of the paper are not public. Statements rest on synthetic recordings of these experiments in MuJoCo
+# with a chosen truth: what they determine, where steepest descent with the published cost and step lengths is after 200
+# iterations, and how constant torque errors change that (`benchmarks/torque_ensemble.py`).
 
 _PAPER_PARAMETERS = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 PAPER_ESTIMATES: dict[str, dict[str, float]] = {
@@ -234,9 +234,9 @@ PAPER_ESTIMATES: dict[str, dict[str, float]] = {
     "dual_arm_no_vision": dict(zip(_PAPER_PARAMETERS, (19.559, 4.965, 8.575, 10.374, 0.000, 11.287), strict=True)),
     "dual_arm_vision": dict(zip(_PAPER_PARAMETERS, (24.840, 0.000, 12.373, 30.775, 1.406, 24.900), strict=True)),
 }
-"""Answers of Caldwell et al. (2014) for their four experiments [N m/rad]; the data are not public."""
+"""Estimates of Caldwell et al. (2014) for their four experiments [N m/rad]; the data are not public."""
 _TRUTH_EXPERIMENT = "single_arm_vision"
-"""The answer whose rounded values are the truth of the embedded recordings: the only one without a zero."""
+"""Experiment whose rounded estimates are the truth of the embedded recordings (the only one without a zero)."""
 
 _TORQUE_BIAS_STD = 0.3  # standard deviation of the constant error of a joint's torque in the ensemble [N m]
 _DESCENT_INITIAL_VALUE, _DESCENT_ITERATIONS = 3.0, 200  # of steepest descent in the ensemble [N m/rad]
@@ -255,18 +255,17 @@ def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[f
 def explain_paper_estimates(
     experiment: str, estimates: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """Explain why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours, a sentence each.
+    """Explain why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours, one sentence each.
 
-    `estimates` are those of the parameters from recordings of such an experiment, `truth` their values where known.
-    Empty where the model does not explain the recordings. The reason, judged by synthetic recordings, is the first of
-    these that applies:
+    `estimates` come from recordings of such an experiment, `truth` holds known values. The result is empty if the model
+    does not explain the recordings. The reason is the first of these that applies to synthetic recordings:
 
-    not informed: such recordings do not find the parameter, or only so weakly that their interval holds the value;
-    near the truth: the value is within 10 % of the truth of the synthetic recordings;
-    slow: it lies between the start and where the published method stops without torque errors, far from the truth, or
-    within 10 % of the latter;
-    torque error: it lies within the values to which constant torque errors lead the published method;
-    unexplained: anything else.
+    - not informed: the recordings do not determine the parameter, or so weakly that its interval contains the value
+    - near the truth: the value is within 10 % of the truth
+    - slow: the value is far from the truth, between the start and the point where the published method stops without
+      torque errors, or within 10 % of that point
+    - torque error: constant torque errors lead the published method to such values
+    - unexplained: none of these
     """
     judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}
     if any(entry.verdict == "not_trusted" for entry in judged.values()):
@@ -304,7 +303,7 @@ def _discrepancy(experiment: str, name: str, entry: ParameterEstimate, truth: fl
 
 
 def is_within_ensemble_range(published: float, values: Sequence[float]) -> bool:
-    """Whether a published estimate lies in an ensemble's range of estimates. A zero bound has a margin."""
+    """Whether a published estimate lies in an ensemble's range of estimates, with a margin for a bound at zero."""
     return min(values) - _ZERO_BOUND_FRACTION * max(values) <= published <= max(values)
 
 

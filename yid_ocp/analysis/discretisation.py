@@ -29,8 +29,8 @@ from yid_ocp.problem.options import DiscretisationName
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
-# Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
-# m + m/2 + m/4 + ... What falls faster has less to go.
+# Ratio of the distance to the limit of many links or short steps to the shift of one halving, for an error proportional
+# to their size: m + m/2 + m/4 + ...
 _EXTRAPOLATION_FACTOR = 2.0
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
@@ -41,8 +41,8 @@ _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the t
 class _FinerDiscretisationProblem:
     """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns.
 
-    `parameter_factors` lead from a coarse parameter to the same physical object in the finer model, 1 for absent names;
-    `subdivided_joints` are, for each joint of a divided link, the fine joints that share its angle.
+    A coarse parameter times its entry in `parameter_factors` (default 1) describes the same object in the finer model.
+    `subdivided_joints` maps each joint of a divided link to the fine joints that share its angle.
     """
 
     problem: EstimationProblem
@@ -53,7 +53,7 @@ class _FinerDiscretisationProblem:
         return float(self.parameter_factors.get(name.split("[")[0], 1.0))
 
     def _unknowns(self, names: Sequence[str], x: Array) -> Array:
-        """The unknowns that correspond to coarse ones, within bounds; divided links share their angle, at rest."""
+        """Unknowns that correspond to coarse ones, within bounds. Divided links share the angle of the coarse link."""
         made, at = self.problem.initial_unknowns, {name: i for i, name in enumerate(self.problem.unknown_names)}
         for name, value in zip(names, x, strict=True):
             base, bracket, recording = name.partition("[")
@@ -97,12 +97,10 @@ def _gauss_newton_step_in_finer_model(
 ) -> tuple[dict[str, float], Array] | str:
     """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns x (nx,).
 
-    With the residual that the step leaves where all is linear. Data, bounds and priors are those of the coarse problem,
-    whose evaluation is `at_x`; its prediction replaces the data with `model_difference_only`, for points away from an
-    estimate. A message where the step cannot be made.
-
-    Where noise drives the motion, its estimate, the weights and the Jacobian are the coarse ones: the finer model adds
-    its residual alone (Richardson's extrapolation), which saves a filter of its own.
+    Also returns the linearised residual after the step, or a message if the step fails. Data, bounds and priors are
+    those of the coarse problem, with the evaluation `at_x`. With `model_difference_only`, for points other than an
+    estimate, the coarse prediction replaces the data. With process noise, weights and Jacobian are the coarse ones, and
+    only the residual is the finer model's (Richardson extrapolation), which saves a filter.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -132,20 +130,20 @@ def _gauss_newton_step_in_finer_model(
 def refitted_residual_at_finer_step(
     fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> Array | None:
-    """Whitened residual at a finer time step, one Gauss-Newton step from the coarse fit x (nx,). None if unknown.
+    """Whitened residual at a finer time step, one Gauss-Newton step from the coarse fit x (nx,), or None if it fails.
 
-    `at_x` is the coarse evaluation with Jacobian. Beside process noise the weights are the coarse ones.
+    `at_x` is the coarse evaluation with Jacobian. With process noise, the weights are the coarse ones.
     """
     made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
     return None if isinstance(made, str) else made[1]
 
 
 def longest_accurate_time_step(problem: EstimationProblem) -> float:
-    """Find the longest time step [s] whose error is small beside the prediction residual at the initial unknowns.
+    """Find the longest time step [s] whose error is small compared with the residual at the initial unknowns.
 
-    From 20 ms on it is halved, at most five times, until half of it changes the prediction of the recordings to
-    estimate on by at most 3 % of its residual or of the noise, whichever is more (root mean squares, whitened). A guess
-    far from the truth has larger errors of the step, in proportion to its residual.
+    The step starts at 20 ms and is halved, at most five times, until half of it changes the predictions by at most 3 %
+    of their residual or of the noise, whichever is larger (root mean squares, whitened). A poor initial guess has a
+    larger residual and therefore allows a larger error of the step.
     """
     x, problem = problem.initial_unknowns, problem.with_time_step(_MAX_TIME_STEP)
     for _ in range(_MAX_HALVINGS):
@@ -158,7 +156,7 @@ def longest_accurate_time_step(problem: EstimationProblem) -> float:
 
 
 def _half_step_error(problem: EstimationProblem, fine: EstimationProblem, x: Array) -> float | None:
-    """Change of whitened predictions by a finer step as a fraction of their residual; None if they do not compare."""
+    """Change of whitened predictions by a finer step as a fraction of their residual; None if not comparable."""
     try:
         coarse = problem_whitened_at(problem, x)
         if any(own is not None for own in coarse.whitening_filters):
@@ -176,7 +174,7 @@ def _half_step_error(problem: EstimationProblem, fine: EstimationProblem, x: Arr
 
 @dataclass(frozen=True)
 class _CoarseWeights:
-    """Filter of a coarser rollout, in each of whose steps `ratio` finer ones make a mean torque."""
+    """Filter of a coarser rollout, for finer steps of which `ratio` average to one coarse torque."""
 
     coarse: ProcessNoiseWhitener
     input_error_model: InputErrorModel
@@ -190,7 +188,7 @@ class _CoarseWeights:
 
 
 def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> EstimationProblem:
-    """The finer problem about the coarse one's input errors, whitened by its filters, over the same whole steps."""
+    """The finer problem with the input errors and filters of the coarse one, over the same whole steps."""
     ratio, episodes = round(coarse.step.time_step / fine.step.time_step), []
     filters: list[ProcessNoiseWhitener | None] = []
     for own, other, whitening in zip(fine.episodes, coarse.episodes, coarse.whitening_filters, strict=True):
@@ -209,10 +207,11 @@ def measure_discretisation_shifts(
     *,
     model_difference_only: bool = False,
 ) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
-    """Measure how estimates shift when every link is divided in two and when the time step is halved.
+    """Measure how estimates shift if every link is divided in two, and if the time step is halved.
 
-    Of every shared free parameter, none where nothing was tried; and why something that was asked for is not known.
-    `x`, shape (nx,), is the estimate, `at_x` its evaluation with Jacobian; `model_difference_only` for other points.
+    Returns the shifts of every shared free parameter, empty if nothing was tried, and notes on shifts that could not be
+    computed. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. For other points, set
+    `model_difference_only`.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
@@ -263,7 +262,7 @@ def inflate_estimates_by_discretisation(
 ) -> dict[str, ParameterEstimate]:
     """Include the discretisation shift of estimates in their standard deviations, intervals and verdicts.
 
-    A verdict is only ever lowered. `sizes` are typical ones, as in `inference.uncertainty.parameter_verdict`.
+    A verdict can only get worse. `sizes` are typical sizes, as in `inference.uncertainty.parameter_verdict`.
     """
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
@@ -290,10 +289,10 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 @dataclass(frozen=True)
 class NaturalFrequencies:
-    """Natural frequencies of a system's step map about an equilibrium, with the robot held still.
+    """Natural frequencies of a system's step map about an equilibrium, with the robot fixed.
 
-    Unstable modes are damped ones that still grow from step to step: the equilibrium is unstable, or the time step is
-    too long for the tension that the grasps put on the object.
+    Unstable modes grow from step to step although damping is included: the equilibrium is unstable, or the time step is
+    too long for the tension of the object.
     """
 
     frequencies_hz: Array  # undamped, ascending, shape (k,)
@@ -310,10 +309,10 @@ def step_map_natural_frequencies(
     constraint_force: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
 ) -> NaturalFrequencies:
-    """Natural frequencies of a system's step map about an equilibrium, from the undamped eigenvalues of A_k.
+    """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
 
-    The driven and prescribed coordinates `configuration` [rad or m] are held still; rest is sought from `guess` (n,).
-    The midpoint rule lowers a frequency f to atan(pi f h)/(pi h); the force split affects growth alone.
+    The driven and prescribed coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts
+    at `guess` (n,). The midpoint rule lowers a frequency f to atan(pi f h)/(pi h). The force split affects only growth.
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
@@ -333,7 +332,7 @@ def step_map_natural_frequencies(
 
 
 def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:
-    """Eigenvalues of A at rest that belong to motion, not to what the constraints take away."""
+    """Eigenvalues of A at equilibrium that belong to motion, without those of the constraints."""
     n = step.system.n_coordinates
     q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
     a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
@@ -346,7 +345,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
-    `configuration` holds driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
+    `configuration` holds driven and prescribed coordinates [rad or m]. Lengths are taken from `theta`.
     """
     if not system.grasps:
         return {}
@@ -364,7 +363,7 @@ def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float
         full[free] = x
         return np.array(ca.densify(function(full, theta, 0)[part]))
 
-    # a little stiffness keeps the search from winding the object up
+    # a small stiffness prevents the search from winding up the object
     def gaps(x: Array) -> Array:
         return np.concatenate([phi_at(x, 0).ravel(), 1e-4 * x])
 
@@ -385,9 +384,9 @@ def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float
     return {grasp.name: float(distance) for grasp, distance in zip(system.grasps, distances, strict=True)}
 
 
-# Nodes at which the linearised step is looked at: of all motions together, and of one at least.
+# Number of nodes at which the step is linearised: in total, and at least per motion.
 _N_CHECKED_NODES, _MIN_CHECKED_NODES = 24, 4
-# Powers of ten by which an alternating error may grow: from the rounding of a step (1e-12) to what no sensor sees.
+# Allowed growth of an alternating error in powers of ten: from rounding in a step (1e-12) to below sensor resolution.
 _MAX_GROWTH_DECADES = 6.0
 
 
@@ -395,9 +394,9 @@ _MAX_GROWTH_DECADES = 6.0
 class AlternatingErrorGrowth:
     """Growth of errors that alternate in sign from step to step along one motion.
 
-    What a body does by itself goes on in one direction for several steps; a mode of the linearised step whose
-    eigenvalue has a negative real part turns back at every step, and is the method's own. Where its magnitude exceeds
-    one, the equations no longer follow the body, however well Newton solves them.
+    Physical motion keeps its direction for several steps. A mode of the linearised step whose eigenvalue has a negative
+    real part changes sign at every step; it is a numerical artefact. If the eigenvalue's magnitude exceeds one, the
+    integration is unstable, even if Newton's method converges.
     """
 
     recording_name: str
@@ -408,12 +407,12 @@ class AlternatingErrorGrowth:
 
     @property
     def keeps_errors_below_resolution(self) -> bool:
-        """Whether alternating errors grow by at most six decades. Rounding then stays below sensor resolution."""
+        """Whether alternating errors grow by at most six decades, so that rounding stays below sensor resolution."""
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
     @property
     def description(self) -> str:
-        """Explain in a sentence whether the time step is stable, with a remedy for an unstable one."""
+        """Sentence that states whether the time step is stable, with a remedy if it is not."""
         step = f"{self.recording_name}: the step of {self.time_step:g} s is"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along the motion"
@@ -427,8 +426,8 @@ def _error_growth_along(
 ) -> AlternatingErrorGrowth:
     """Growth of alternating errors along a rollout, up to its first failed step or singular derivatives.
 
-    The eigenvalues of A_k - B_k K_k are taken at some nodes (A_k by the implicit function theorem, so that the
-    constraints are in it); the largest alternating magnitude counts for the steps in between in its logarithm.
+    The eigenvalues of A_k - B_k K_k (A_k includes the constraints) are computed at some nodes. The logarithm of the
+    largest alternating magnitude is interpolated between them.
     """
     failed = np.flatnonzero(~np.isfinite(rollout.state).all(axis=1))
     steps = (int(failed[0]) if len(failed) else len(rollout.state)) - 1
@@ -451,7 +450,7 @@ def _error_growth_along(
 def _alternating_mode_magnitude(
     step: Step, theta: Array, rollout: Rollout, node: int, feedback: TrackingFeedback | None
 ) -> float | None:
-    """Largest magnitude of the eigenvalues of A - B K with negative real part at a node; None where A is not finite."""
+    """Largest magnitude of eigenvalues of A - B K with negative real part at a node; None if A is not finite."""
     n, fixed = step.system.n_coordinates, list(step.system.prescribed_coordinate_indices)
     state, after = rollout.state[node], rollout.state[node + 1]
     a, by_torque, _ = step.jacobians(
@@ -467,7 +466,7 @@ def _alternating_mode_magnitude(
 
 
 def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
-    """Largest alternating error growth of all recordings at x, up to a failed step. None if none can start."""
+    """Largest alternating error growth of all recordings at x, up to a failed step. None if no rollout can start."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)

@@ -1,9 +1,9 @@
 """Pool estimates of one model from several runs, and find drifting parameters and outlier runs.
 
-For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. Where
-nothing changed, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the
-standard deviations of the mean are widened by sqrt(chi2/dof), Birge's ratio (Birge 1932, Physical Review 40:207,
-doi:10.1103/PhysRev.40.207).
+The mean of estimates x_i of the same n parameters with covariances C_i is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. If the
+parameters are constant over k runs, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. If chi2 is
+larger, the standard deviations of the mean are multiplied by sqrt(chi2/dof), Birge's ratio (Birge 1932, Physical Review
+40:207, doi:10.1103/PhysRev.40.207).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _MIN_CORRELATION_EIGENVALUE = 1e-12  # what is known better than that follows fr
 class RunEstimates(ReprMixin):
     """Estimates of n parameters from one run, with their covariance.
 
-    Values (n,) and covariance (n, n) are in the parameters' `units`. Where a fit is not adequate, the model does not
-    explain the run's recordings; the covariance includes the misfit.
+    Values (n,) and covariance (n, n) are in the parameters' `units`. If `is_fit_adequate` is False (the model does not
+    explain the recordings), the covariance includes the misfit.
     """
 
     run_name: str
@@ -56,7 +56,7 @@ class RunEstimates(ReprMixin):
 
 @dataclass(frozen=True)
 class _ParameterDrift:
-    """Test whether one parameter has the same value in all runs that have it: pooled mean, chi2 of the differences."""
+    """Test whether one parameter has the same value in all its runs: pooled mean, chi2 of the differences."""
 
     name: str
     unit: str
@@ -72,7 +72,7 @@ class _ParameterDrift:
 
 @dataclass(frozen=True)
 class _RunOutlierTest:
-    """Test of one run against the pooled estimates of all others."""
+    """Test of one run against the pooled estimates of all other runs."""
 
     run_name: str
     chi2: float
@@ -85,7 +85,7 @@ class _RunOutlierTest:
 
 @dataclass(frozen=True)
 class DriftAndOutlierTests:
-    """Tests of several runs of one model for parameter drift and outlier runs. chi2 is of all differences."""
+    """Tests of several runs of one model for parameter drift and outlier runs. `chi2` covers all differences."""
 
     run_names: tuple[str, ...]
     parameter_drifts: tuple[_ParameterDrift, ...]
@@ -106,14 +106,14 @@ def nearby_positive_definite_covariance(covariance: Array) -> Array:
 
 
 def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
-    """Pool several runs' estimates. Also return chi2 of the differences between runs, and its degrees of freedom.
+    """Pool several runs' estimates. Also returns chi2 of the differences between runs, and its degrees of freedom.
 
-    Each run may lack some of the parameters. The pooled estimates are of all parameters of any run, widened by Birge's
-    ratio where the runs differ by more than they state.
+    A run may lack some of the parameters. The pooled estimates contain the parameters of all runs. Their standard
+    deviations are multiplied by Birge's ratio if the runs differ by more than their own standard deviations explain.
     """
     names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
     information, sums = np.zeros((len(names), len(names))), np.zeros(len(names))
-    # in units of the first standard deviations known, so that nothing is lost to rounding
+    # scaled by the first known standard deviations, to avoid rounding errors
     first = [next(run for run in runs if name in run.parameter_names) for name in names]
     unit = np.array([run.std[run.parameter_names.index(name)] for name, run in zip(names, first, strict=True)])
     parts = []
@@ -136,11 +136,11 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
 
 
 def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
-    """Test which parameters drifted between runs, in order of time, and which run is an outlier.
+    """Test which parameters drifted between runs (in order of time), and which run is an outlier.
 
-    Each parameter is tested by its marginal variances, each run by its whole covariance; the significance level is
-    divided by the number of parameters, and by that of runs. A run is an outlier where it disagrees with the others and
-    these agree without it, or better than with any other left out. With two runs none is.
+    Each parameter is tested with its marginal variances, each run with its whole covariance. The significance level is
+    divided by the number of parameters or of runs. A run is an outlier if it disagrees with the other runs and these
+    agree without it, or better than without any other run. Two runs have no outlier.
     """
     mean, chi2, degrees = pool_estimates(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
@@ -159,7 +159,7 @@ def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterD
 
 
 def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierTest:
-    """One run against the mean of all others; distrusted where they agree without it."""
+    """One run against the mean of all other runs; an outlier if these agree without it."""
     chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
     p = chi2_p_value(chi2, degrees)
     without = [pool_estimates([*runs[:k], *runs[k + 1 :]])[1:] for k in range(len(runs))]

@@ -43,24 +43,24 @@ def solve(
 ) -> Solution:
     """Solve an estimation problem and return the estimates, uncertainty and verdicts that the command `solve` reports.
 
-    The best fit of several starts (`solvers.solve`), a cable without memory where the recordings do not support it,
-    profile-likelihood intervals of what is weakly determined, and the error of the discretisations that
-    `problem.options.checked_discretisations` names, which the standard deviations include. Verdicts are `not_trusted`
-    where the step is unstable, clocks drift, or a prediction without a model has a smaller error.
+    The steps are: the best fit of several starts (`solvers.solve`); a refit without cable memory if the recordings do
+    not support it; profile-likelihood intervals of weakly determined parameters; the errors of the discretisations in
+    `problem.options.checked_discretisations`, which the standard deviations include. Verdicts are `not_trusted` if the
+    time step is unstable, if clocks drift, or if a prediction without a model has a smaller error.
 
     Parameters
     ----------
     solver : Solver, optional
-        `GaussNewton()` when absent, whatever the problem's configuration file names.
+        Default: `GaussNewton()`, regardless of the configuration file.
     initial_unknowns : sequence of float, optional
-        The problem's when absent.
+        Default: those of the problem.
     callback : callable, optional
         Receives every `Iterate`.
 
     Returns
     -------
     Solution
-        With its `checks`. Non-convergence raises nothing: see its status and message.
+        With its `checks`. A search that does not converge raises no error; see `status` and `message`.
     """
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
@@ -75,7 +75,7 @@ def solve(
 
 
 def checked_solution(problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS) -> Solution:
-    """Complete a fit with profile intervals, the discretisation's error and `checks`. See `solve`."""
+    """Complete a fit with profile intervals, the error of the discretisation and `checks`. See `solve`."""
     start, problem = problem, solution.problem or problem
     if solution.evaluation is not None:
         problem = _with_equilibrium_guesses(problem, solution.evaluation.episode_predictions, ())
@@ -103,7 +103,7 @@ def _with_equilibrium_guesses(
     predictions: Sequence[EpisodePrediction],
     held_out_predictions: Sequence[EpisodePrediction | str],
 ) -> EstimationProblem:
-    """The problem, whose further searches for equilibria begin at those of predictions at its solution."""
+    """The problem with equilibria of predictions at its solution as starts of further searches for equilibria."""
 
     def guessed(episodes: Sequence[Episode], found: Sequence[EpisodePrediction | str]) -> Sequence[Episode]:
         pairs = zip(episodes, found or [""] * len(episodes), strict=True)
@@ -141,7 +141,7 @@ def _with_discretisation_errors(
 def _checked_solution_and_issues(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> tuple[Solution, tuple[Issue, ...]]:
-    """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit."""
+    """The solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit."""
     if solution.evaluation is None:
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_and_units(problem, solution, held_out)
@@ -157,10 +157,10 @@ def _checked_solution_and_issues(
 def _checked_solution_and_step_stability(
     start: EstimationProblem, problem: EstimationProblem, solution: Solution
 ) -> tuple[Solution, dict[str, Any]]:
-    """The solution, marked as not converged where the step is unstable, and stability data for result.json.
+    """The solution, marked as not converged if the step is unstable, and stability data for result.json.
 
-    Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
-    stable and leave that place; one that ends there has followed the step's own errors.
+    Stability is tested along the recorded motions at the initial values and at the estimate. A search may start where
+    the step is unstable; if it ends there, it has fitted numerical errors.
     """
     growth = discretisation.largest_alternating_error_growth
     begin, end = growth(start, start.initial_unknowns), growth(problem, solution.x)
@@ -186,7 +186,7 @@ _MIN_MOVING_RECORDINGS = 2  # that start in motion, of which one is left out at 
 
 @dataclass(frozen=True)
 class ChosenCableMemoryFit:
-    """Problem and solution with or without cable memory. The message gives the reason, empty if nothing was decided."""
+    """Problem and solution with or without cable memory. `message` is the reason, empty if there was no choice."""
 
     problem: EstimationProblem
     solution: Solution
@@ -201,9 +201,9 @@ def choose_cable_memory_fit(
 ) -> ChosenCableMemoryFit:
     """Refit without cable memory if recordings that start in motion do not support the memory.
 
-    Where a cable moves when its recording begins, the load that it bears there is not known, and what it seems to
-    remember may be that motion. Each recording that starts so is predicted from the others alone (one Gauss-Newton
-    step away from the fit of all), with memory and with none; it is kept where that is the smaller error in sum.
+    The load of a cable that moves at the start of a recording is unknown, and its apparent memory may be this motion.
+    Each such recording is predicted from the other ones, with and without memory (by one Gauss-Newton step from the fit
+    of all). The memory is kept if the sum of its errors is smaller.
     """
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
@@ -225,7 +225,7 @@ def choose_cable_memory_fit(
 
 
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
-    """Fix the cable's memory parameters of a problem at zero."""
+    """Return the problem with the cable's memory parameters fixed at zero."""
     memory = _memory_parameters(problem)
     free = tuple(name for name in problem.free if name not in (*memory, MEMORY_HALVING_SPEED_PARAMETER_NAME))
     return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))
@@ -242,7 +242,7 @@ def _moving(problem: EstimationProblem) -> list[int]:
 
 
 def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int]) -> float:
-    """Root mean square of the whitened residuals of recordings, each predicted by parameters from the others."""
+    """Root mean square of the whitened residuals of recordings, each predicted by parameters from the other ones."""
     guesses = None if solution.evaluation is None else solution.evaluation.equilibrium_guesses
     evaluation = problem.evaluate(solution.x, equilibrium_guesses=guesses)
     assert evaluation.jacobian is not None
@@ -270,14 +270,14 @@ _START_FRAMES = 2  # frames from which the baselines of a cable start, as its ow
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
-    """Unit of a channel, or of the first member of a group. Empty if unknown."""
+    """Unit of a channel, or of the first member of a group; empty if unknown."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
 def prediction_errors_and_units(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodePrediction | str]]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
-    """Errors and baselines of held-out, then fitted recordings, with units and errors of fitted channels."""
+    """Errors and baselines of held-out, then fitted recordings; units of channels; errors of fitted channels."""
     residuals: Mapping[str, Any] = {}
     pairs = list(held_out)
     if solution.evaluation is not None:
@@ -294,8 +294,8 @@ def _prediction_error_entry(
 ) -> dict[str, Any]:
     """Prediction errors of one recording: RMSE per channel for the model and for every baseline.
 
-    A group of several points has an entry of its own beside its channels: the square root of the mean squared distance
-    over all its points and frames but those that fixed the start. `outcome` is a prediction or why there is none.
+    A group of several points has an additional entry: the root mean square distance over its points and frames, without
+    the frames that determined the initial state. `outcome` is a prediction, or the reason for its absence.
     """
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
     options = problem.options
@@ -319,10 +319,10 @@ def _prediction_error_entry(
 def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
 ) -> tuple[list[tuple[Episode, EpisodePrediction | str]], dict[str, dict[str, float]]]:
-    """Held-out predictions as of `predict_held_out`, and the error that noise makes of each, by recording and channel.
+    """Predictions of held-out recordings, and the errors that noise causes in them, by recording and channel.
 
-    Root mean square of what sensors add and of what torque errors as large as stated do to the motion, drawn a few
-    times. `x` is the unknown vector, shape (nx,).
+    The expected error combines sensor noise and the effect of some random draws of the stated torque errors on the
+    motion.
     """
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
     pairs: list[tuple[Episode, EpisodePrediction | str]] = []
@@ -360,8 +360,8 @@ def _expected_errors(
 
 
 def _rms_by_channel(sensor: Sensor, square: Array) -> tuple[dict[str, float], Array]:
-    """Root mean square by channel that has finite samples, and sums (M, channels), of squared outputs (M, outputs)."""
-    # a slow camera may see nothing, and then no axis can be left to reshape
+    """Root mean squares by channel with finite samples, and sums (M, channels), of squared outputs (M, outputs)."""
+    # a slow camera may have no frame, for which reshape cannot infer an axis
     summed = square.reshape(len(square), len(sensor.channel_names), sensor.outputs_per_channel).sum(axis=2)
     found = {}
     for c, channel in enumerate(sensor.channel_names):
@@ -372,7 +372,7 @@ def _rms_by_channel(sensor: Sensor, square: Array) -> tuple[dict[str, float], Ar
 
 
 def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) -> tuple[str, float, float] | None:
-    """The best baseline that all channels have, its error and the model's (rms); None where the model is as good."""
+    """Best baseline common to all channels, its error and the model's error (rms); None if the model is as good."""
     rms = {
         name: float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
         for name, errors in {"": entry["rmse"], **entry["baselines"]}.items()
@@ -386,7 +386,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
 def channels_worse_than_naive_guess(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Find channels that a baseline without a model predicts clearly better."""
+    """Find channels that a baseline without a model predicts clearly better than the model."""
     worse = []
     for entry in entries:
         for channel in entry["rmse"]:
@@ -398,9 +398,9 @@ def channels_worse_than_naive_guess(
 
 
 def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
-    """Issues for sensors that a model-free baseline predicts better than the model, over all their channels.
+    """Issues for sensors that a baseline without a model predicts better than the model, over all their channels.
 
-    Single channels that say little of what the model is about may well be worse; see `channels_worse_than_naive_guess`.
+    A single channel may be worse without an issue; see `channels_worse_than_naive_guess`.
     """
     found = []
     for entry in entries:

@@ -1,4 +1,4 @@
-"""Fisher information of hypothetical variants of a recorded experiment in grasps, arms, motions and sensors."""
+"""Fisher information of hypothetical variants of a recorded experiment: grasps, arms, motions and sensors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _DEFAULT_CAMERA_STD, _DEFAULT_CAMERA_RATE = 5e-3, 3.0  # of a camera where there
 _DEFAULT_ARM_POINT_STD = 1e-3  # of points that an arm measures where it measured none [m]
 DEFAULT_TORQUE_STD = 0.1  # of joint torques whose noise nobody stated [N m]
 _MOTION_SEED = 11  # of alternative motions
-# Two arms hold the object pushed together and away from the robot: at its full stretch a branched tube snaps [m].
+# Offsets of two grippers towards each other and away from the robot: a fully stretched branched tube snaps through [m].
 _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 
@@ -59,7 +59,7 @@ class FrameObservationSchedule:
 
 @dataclass(frozen=True)
 class RecordedExperiment:
-    """A recorded experiment to be varied, with its problem, unknowns and prior knowledge."""
+    """A recorded experiment whose variants are analysed: problem, unknowns and prior knowledge."""
 
     problem: EstimationProblem
     x: Array  # unknowns at which the information is evaluated, shape (nx,)
@@ -74,12 +74,12 @@ class RecordedExperiment:
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group, frame times [s] and typical std [m] of the camera. A missing group means defaults."""
+        """Point group, frame times [s] and typical std [m] of the camera; None and defaults without a camera."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group, sample times [s] and typical std [m] of the arms' points. A missing group means defaults."""
+        """Point group, sample times [s] and typical std [m] of points measured by arms; None and defaults if none."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
 
@@ -124,7 +124,7 @@ def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
 
 
 class _ObservableFrame(NamedTuple):
-    """A frame that a camera, or also an arm, could measure; `added_frame` where it must be added to the mechanism."""
+    """A frame that a camera or also an arm could measure. `added_frame` is set if the mechanism lacks it."""
 
     name: str
     description: str
@@ -133,7 +133,7 @@ class _ObservableFrame(NamedTuple):
 
 
 def observable_frames(system: System) -> list[_ObservableFrame]:
-    """Measurable frames: segment tips, midpoints and markers near the tips. Without segments, links and markers."""
+    """Measurable frames: segment tips, midpoints and markers near the tips; without segments, links and markers."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[_ObservableFrame] = []
@@ -165,7 +165,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 
 
 def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_ObservableFrame]]:
-    """Add all measurable frames to a step's mechanism and list the frames. The equations stay the same."""
+    """Return the step with all measurable frames in its mechanism, and these frames. The equations stay the same."""
     mechanism, seen = step.system.mechanism, observable_frames(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
@@ -176,8 +176,9 @@ def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_Observa
 class CandidateExperimentSensitivities:
     """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
-    Sensitivities of a frame's position at every node, by (episode, group, frame), are by the unknowns, then by the q
-    that are errors of the torques that drive this episode (`point_sensitivities_and_joint_sensor_information`).
+    `position_sensitivities` holds, by (episode, group, frame), the derivatives of a frame's position at every node with
+    respect to the nx unknowns and to the q torque-error unknowns of this episode (see
+    `point_sensitivities_and_joint_sensor_information`).
     """
 
     problem: EstimationProblem  # with nuisances, and every measurable frame observed at every node
@@ -191,7 +192,7 @@ class CandidateExperimentSensitivities:
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def fisher_information_with_prior(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
-        """Fisher information of observations plus that of the prior, (nx, nx). There is one list per recording."""
+        """Fisher information (nx, nx) of observations plus that of the prior. `views` has one list per recording."""
         total = self.prior_information.copy()
         nx = len(total)
         for i, episode in enumerate(self.problem.episodes):
@@ -227,7 +228,7 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 
 
 class CandidateExperimentSensitivityBuilder:
-    """Builds and caches experiment variants from sets of mechanical changes."""
+    """Builds and caches experiment variants for sets of mechanical changes."""
 
     def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
@@ -235,7 +236,7 @@ class CandidateExperimentSensitivityBuilder:
         self._layouts: dict[frozenset[str], CandidateExperimentSensitivities | str] = {}
 
     def build_sensitivities(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
-        """Compute the sensitivities for a set of mechanical changes. A message says why they cannot be computed."""
+        """Compute the sensitivities for a set of mechanical changes, or return a message if that is not possible."""
         if mechanics not in self._layouts:
             if mechanics:
                 words = " and ".join(MECHANICAL_CHANGE_DESCRIPTIONS[name] for name in sorted(mechanics))
@@ -286,7 +287,7 @@ class CandidateExperimentSensitivityBuilder:
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
-        # priors of the parameters themselves stay out: the question is what sensors inform
+        # priors of the parameters are excluded: the result is the information of the sensors
         stated[:, [problem.unknown_names.index(name) for name in names]] = 0.0
         return CandidateExperimentSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
 
@@ -294,7 +295,7 @@ class CandidateExperimentSensitivityBuilder:
         given = self.setting.problem.options.sensors
         sensors = {name: replace(choice, use=None) for name, choice in given.items() if name.startswith("joints.")}
         if "second_arm" in mechanics:
-            # made motions state their noise, that of joints which the settings do not know too
+            # simulated motions state their noise, also for joints that the settings do not contain
             sensors = {name: replace(choice, std=None, bias_std=None) for name, choice in sensors.items()}
         if "torque" in mechanics:
             joints = self.setting.problem.episodes[0].recording.joints
@@ -304,7 +305,7 @@ class CandidateExperimentSensitivityBuilder:
         return sensors
 
     def _finest(self, episode: Episode) -> dict[str, float]:
-        """Least standard deviation that each group's points can have in a recording [m]."""
+        """Smallest standard deviation of the points of each group in a recording [m]."""
         finest = {}
         samplings = self.setting.camera_point_group_and_sampling, self.setting.arm_point_group_and_sampling
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
@@ -315,7 +316,7 @@ class CandidateExperimentSensitivityBuilder:
         return finest
 
     def _with_encoders(self, problem: EstimationProblem) -> EstimationProblem | None:
-        """The same experiment with the driven joints' encoders as measurements, where they are in the one made."""
+        """The experiment with driven joints' encoders as measurements, if the recorded experiment has them."""
         base = self.setting.problem
         used = any(isinstance(samples.sensor, PositionSensor) for e in base.episodes for samples in e.measurements)
         if not used or not problem.system.driven:
@@ -331,7 +332,7 @@ class CandidateExperimentSensitivityBuilder:
         return EstimationProblem(problem.step, recordings, problem.free, options, values)
 
     def _experiment(self, mechanics: frozenset[str]) -> tuple[System, list[Recording], list[str]]:
-        """System and motion, driven as in the recordings."""
+        """System, recordings and notes of the experiment, driven as in the recordings."""
         base = self.setting.problem
         system = base.system
         if "second_arm" in mechanics:
@@ -356,11 +357,11 @@ class CandidateExperimentSensitivityBuilder:
 
     @cached_property
     def _corrected(self) -> EstimationProblem:
-        """The problem with the errors of torques known that its measurements tell of."""
+        """The problem with the torque errors that its measurements determine."""
         return problem_whitened_at(self.setting.problem, self.setting.x, rounds=2)
 
     def _cut(self, episode: Episode) -> Recording:
-        """The part of a recording that the problem uses, its torques without the errors that are known."""
+        """The part of a recording that the problem uses, with known torque errors subtracted."""
         recording, errors, joints = episode.recording, episode.input_errors, episode.recording.joints
         if errors is not None and joints is not None and joints.effort is not None:
             effort, driven = joints.effort.copy(), self.setting.problem.system.driven
@@ -390,7 +391,7 @@ class CandidateExperimentSensitivityBuilder:
         return replace(system, grasps=tuple(turned))
 
     def _moved(self, system: System, episode: Episode, seed: int, twice: bool) -> tuple[Recording, list[str]]:
-        """A motion of the driven joints in MuJoCo, from the recording's posture; what of it a robot could not do."""
+        """A motion of the driven joints in MuJoCo from the recording's posture, and obstacles on a real robot."""
         base, given = self.setting.problem, self.setting.parameter_values
         values = {name: v for name, v in given.items() if name in system.parameters}
         posture = dict(zip(base.system.driven, map(float, episode.measured_driven_angles[0]), strict=True))
@@ -414,7 +415,7 @@ class CandidateExperimentSensitivityBuilder:
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[_ObservableFrame], torque: bool) -> Recording:
-        """The recording with every sight in view at every node, of unit standard deviation, and efforts to predict."""
+        """The recording with every frame seen at every node with unit standard deviation, and with efforts."""
         setting, base = self.setting, self.setting.problem
         episode, joints = base.episodes[index % len(base.episodes)], recording.joints
         t, step = joints.t if joints is not None else episode.recording.points[0].t, base.step.time_step
@@ -445,7 +446,7 @@ class CandidateExperimentSensitivityBuilder:
 
 
 def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequence[Array | float]:
-    """Of encoders, of torques, and the constant one, of driven joints; that of joints not recorded is a typical one."""
+    """Noise of encoders, of torques and of constant torque errors for driven joints; typical values if not recorded."""
     errors = episode.input_errors
     if errors is None:
         return (0.0, 0.0, 0.0)
@@ -470,7 +471,7 @@ def _frame_positions(system: System, values: Mapping[str, float], frames: Sequen
 
 
 def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, Array]:
-    """Offsets of grippers that take an object held by several out of its full stretch [m]."""
+    """Gripper offsets that keep an object held by several grippers below its full stretch [m]."""
 
     def direction(x: Array) -> Array:
         return np.asarray(x / max(float(np.linalg.norm(x)), 1e-9))

@@ -1,4 +1,4 @@
-"""Cross-validate friction laws of increasing complexity, and extract friction torques from data."""
+"""Cross-validation of friction laws of increasing complexity, and friction torques from data."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _MAX_CLOUD_POINTS = 1500
 class FrictionLawFit:
     """One friction law fitted to all recordings, with its prediction errors on recordings left out in turn.
 
-    Each recording's root mean square error is that of a prediction by a fit without its kind of motion; NaN where that
-    failed. It is in the channels' unit, or in standard deviations where units differ.
+    `left_out_errors` holds each recording's root mean square error, predicted by a fit without its kind of motion (NaN
+    if the fit failed). It is in the channels' unit, or in standard deviations if units differ.
     """
 
     law: str
@@ -40,7 +40,7 @@ class FrictionLawFit:
 
 
 def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Group recording names by name without number, or singly if groups are few. Motors-off ones are omitted."""
+    """Recording names by kind (name without number), or singly if kinds are few. Those with motors off are omitted."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
@@ -55,7 +55,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 def cross_validate_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
-    """Fit a friction law to all recordings, and refit without one kind of motion in turn to get errors."""
+    """Fit a friction law to all recordings, and refit it without each kind of motion to get prediction errors."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
@@ -112,8 +112,8 @@ def friction_torque_clouds(
 ) -> tuple[_FrictionTorqueCloud, ...]:
     """Friction torques of driven joints from data. Empty for models with constraints or internal coordinates.
 
-    What the discrete equations lack along the smoothed measured angles with the friction at zero, and what the fitted
-    law adds there.
+    The measured torque is the residual of the discrete equations along the smoothed measured angles with zero friction.
+    The predicted torque is the change of this residual by the fitted law.
     """
     step, system = problem.step, problem.system
     driven = system.driven
@@ -151,7 +151,7 @@ def friction_torque_clouds(
 
 
 def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: Array) -> Array:
-    """Torque that each inner node lacks for the motion q, shape (N - 1, n) [N m]."""
+    """Torque (N - 1, n) [N m] that the equations at each inner node lack for the motion q."""
     step = problem.step
     n, none = step.sizes["n"], np.zeros((len(torque), 0))
     state = np.hstack([q, np.zeros((len(q), n))])
@@ -160,7 +160,7 @@ def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: 
 
 
 def _load_function(problem: EstimationProblem) -> ca.Function:
-    """Torque through each joint's gear by (q, v, u, theta), shape (n,) [N m]."""
+    """Torque through each joint's gear, (n,) [N m], as a function of (q, v, u, theta)."""
     system = problem.system
     n, nu = system.n_coordinates, len(system.driven)
     q, v, u = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("u", nu)
@@ -173,7 +173,7 @@ def _load_function(problem: EstimationProblem) -> ca.Function:
 
 
 def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
-    """Move a problem's held-out recordings to the recordings for estimation."""
+    """Return the problem with its held-out recordings among the recordings for estimation."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)
     return problem.with_episodes((*problem.episodes, *added), (), filters, ())

@@ -53,7 +53,7 @@ InitialStateKnowledge = Literal["assumed", "unknown"]
 _GRASP_OFFSET_KIND = "grasp_offset"
 _GRASP_OFFSET_PREFIX = f"{_GRASP_OFFSET_KIND}@"
 GRASP_OFFSET_PRIOR_STD = 0.01  # prior of where a grasp sits [m]
-# A column this much smaller than the largest counts as zero where nuisances are eliminated.
+# A column this much smaller than the largest counts as zero when nuisances are eliminated.
 _RANK_RTOL = 1e-10
 _MAX_DIRECTION_MISMATCH = 0.05  # of a direction against that of a plain combination, both of unit length
 _FINITE_CHANGE_FACTOR = 1.3  # factor on the first parameter in the test of a combination at a finite change
@@ -65,8 +65,9 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # by which a combination may move the data, of 
 class ParameterIdentifiability:
     """Value, standard deviations and identifiability verdict of one parameter.
 
-    The verdict is that of a solution at the same point (`inference.uncertainty.parameter_verdict`), consistent with the
-    95 % interval by profile likelihood about the best fit of all unknowns; this is None where not requested.
+    The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). It is
+    consistent with `interval`, the 95 % profile-likelihood interval about the best fit of all unknowns (None if not
+    requested).
     """
 
     value: float
@@ -80,9 +81,9 @@ class ParameterIdentifiability:
 
 @dataclass(frozen=True)
 class _ParameterDirection:
-    """A direction of relative parameter changes and its uncertainty, with limits of the verdict as for a parameter.
+    """A direction of relative parameter changes and its uncertainty, judged like a parameter.
 
-    The singular value is that of the whitened sensitivity to relative changes, nuisances eliminated: standard
+    The singular value is that of the whitened sensitivity to relative changes after elimination of nuisances: standard
     deviations of the data per unit change.
     """
 
@@ -97,8 +98,8 @@ class _ParameterDirection:
 class IdentifiabilityResult(ReprMixin):
     """Identifiability of p free parameters, with correlations, Fisher information and uncertain directions.
 
-    Values and standard deviations in `parameters` are in each one's `unit`, relative ones, correlations (p, p) and the
-    Fisher information (p, p) of relative changes have none [1].
+    Values and standard deviations in `parameters` are in each parameter's `unit`. Relative standard deviations,
+    correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless.
     """
 
     parameters: Mapping[str, ParameterIdentifiability]
@@ -136,36 +137,37 @@ def identifiability(
 ) -> IdentifiabilityResult:
     """Analyse by Fisher information which free parameters the problem's recordings determine.
 
-    The Fisher information of independent Gaussian noise is I = J' J, J = d r/d x the whitened sensitivities; the
-    standard deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it (Ljung 1999,
-    System Identification, section 7.4; Raue et al. 2009, Bioinformatics 25:1923, doi:10.1093/bioinformatics/btp358).
+    With independent Gaussian noise, the Fisher information is I = J' J, where J = d r/d x are the whitened
+    sensitivities. The standard deviation of an unknown is the root of the diagonal of the inverse of I, which includes
+    all nuisances (Ljung 1999, System Identification, section 7.4; Raue et al. 2009, Bioinformatics 25:1923,
+    doi:10.1093/bioinformatics/btp358).
 
     Parameters
     ----------
     solution : Solution or array_like, optional
-        Point at which to judge (a solution of this problem, or its unknown vector); the initial values when absent.
+        Point of the analysis (a solution of this problem, or its unknown vector); default: the initial values.
     start : "assumed" or "unknown"
-        As the problem has it, so that verdicts are those of its solution; or every recording's initial state estimated
-        along, with the problem's prior about what it assumes.
+        "assumed": initial states as in the problem, so that verdicts equal those of its solution. "unknown": every
+        initial state is also estimated, with the problem's prior.
     grasp_std : float, optional
-        Prior standard deviation of the fixed `grasp_offset@...` parameters of a system that has any (see
-        `system_with_grasp_offset_effects`), which are estimated along [m]; None for grasps that are known.
+        Prior standard deviation [m] of the fixed `grasp_offset@...` parameters (`system_with_grasp_offset_effects`),
+        which are then also estimated; default: grasps are known.
     intervals : iterable of str, or "all"
-        Parameters whose interval by profile likelihood is wanted.
+        Parameters for which a profile-likelihood interval is computed.
     limits : ExcessResidualCriteria, optional
-        What makes a residual at a solution more than noise.
+        Criteria by which a residual at a solution exceeds noise.
 
     Returns
     -------
     IdentifiabilityResult
-        Of p free parameters: verdicts and standard deviations, correlations and Fisher information, shape (p, p).
+        For p free parameters: verdicts and standard deviations, correlations and Fisher information, shape (p, p).
 
     Raises
     ------
     SolverError
-        The model cannot be rolled out at the point.
+        The rollout at the point fails.
     ConfigError
-        An interval is wanted of what is not a free parameter.
+        `intervals` contains a name that is not a free parameter.
     """
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
@@ -175,7 +177,7 @@ def identifiability(
     given = unknowns_from_solution(problem, solution)
     wide = with_nuisance_unknowns(problem, start, grasp_std)
     x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
-    # the matrices are small: threads of the linear algebra library cost more than they give
+    # the matrices are small: threads of the linear algebra library cost more than they gain
     with threadpoolctl.threadpool_limits(1):
         as_solved, wide = wide is problem, problem_whitened_at(wide, x, rounds=2)
         evaluation = wide.evaluate(x)
@@ -185,7 +187,7 @@ def identifiability(
         covariance, chi2 = unknowns_covariance_and_reduced_chi2(wide, evaluation)
         inflation, fit = math.sqrt(max(1.0, chi2)), None
         if solution is None:
-            # far from the data chi2 says nothing of the noise
+            # far from a fit, chi2 is no measure of the noise
             covariance, inflation = covariance / inflation**2, 1.0
         else:
             own = wide if as_solved else problem_whitened_at(problem, given, rounds=2)
@@ -209,7 +211,7 @@ def identifiability(
 def _profiles(
     view: _Sensitivities, wanted: Sequence[str], judged: dict[str, ParameterEstimate], progress: Progress
 ) -> dict[str, ParameterProfileLikelihood]:
-    """Profile likelihoods of the wanted parameters about the best fit of all unknowns; updates what is judged."""
+    """Profile likelihoods of the wanted parameters about the best fit of all unknowns; updates `judged`."""
     problem, sizes = view.problem, typical_parameter_magnitudes(view.problem, view.x)
 
     def one(name: str, best: Array, there: Evaluation) -> tuple[ParameterProfileLikelihood, ParameterEstimate]:
@@ -225,14 +227,14 @@ def _profiles(
 
 
 def system_with_grasp_offset_effects(system: System) -> System:
-    """Add a neutral `grasp_offset` effect to every grasp that has none."""
+    """Return the system with a neutral `grasp_offset` effect at every grasp that has none."""
     there = {effect.location for effect in system.effects if effect.kind == _GRASP_OFFSET_KIND}
     places = [grasp.name for grasp in system.grasps if grasp.name not in there]
     return system.with_effects([make_effect(_GRASP_OFFSET_KIND, place, system) for place in places])
 
 
 def unknowns_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
-    """Get a problem's unknown vector from a solution, an array or, when absent, its initial values.
+    """Return a problem's unknown vector from a solution, an array or (default) its initial values.
 
     Raises `SolverError` for a wrong shape or a value that is not finite.
     """
@@ -252,7 +254,7 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
 def with_nuisance_unknowns(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
-    """Add unknown initial states (if `start` is "unknown") and grasp offsets (if a prior is given) to a problem."""
+    """Return the problem with unknown initial states (if `start` is "unknown") and grasp offsets (if `grasp_std`)."""
     options, grasps, priors = problem.options, [], dict(problem.options.prior_stds)
     initial = "estimated" if start == "unknown" else options.initial_state
     if grasp_std is not None:
@@ -264,7 +266,7 @@ def with_nuisance_unknowns(
     known = dict(options.known_initial_states)
     values = {name: dict(entry) for name, entry in options.parameters_by_recording.items()}
     if options.initial_state == "fitted_to_points" and start == "unknown":
-        # what was fitted to the points becomes the centre of a prior
+        # the state fitted to the points becomes the mean of a prior
         for episode in problem.episodes:
             if episode.name not in known and episode.fixed_initial_state is not None:
                 known[episode.name] = episode.fixed_initial_state.state
@@ -278,7 +280,7 @@ def with_nuisance_unknowns(
 
 
 def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Transfer values of `x` by name to another problem's unknown vector. The rest keep its initial values."""
+    """Transfer values of `x` by name to another problem's unknown vector. Other entries keep their initial values."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])
 
@@ -305,7 +307,7 @@ class _Sensitivities:
         jacobian = linearization_without_weak_priors(problem, evaluation)[1].copy()
         chosen = np.array([problem.unknown_names.index(name) for name in names], int)
         others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
-        # what is known beforehand of the parameters themselves is not something that a sensor sees
+        # prior knowledge of the parameters is not information of a sensor
         jacobian[problem.residual_rows.stated_priors, chosen] = 0.0
         scale = np.where(x[chosen] != 0, np.abs(x[chosen]), problem.unknown_scales[chosen])
         unit, nuisance = scale / inflation, jacobian[:, others] * problem.unknown_scales[others]
@@ -315,15 +317,15 @@ class _Sensitivities:
 
     @property
     def alone(self) -> Array:
-        """Size of the sensitivity to relative changes with everything else known, shape (p,)."""
+        """Norm (p,) of the sensitivity to relative changes if everything else is known."""
         return np.linalg.norm(self.by_alone, axis=0)
 
     def unit(self, name: str) -> str:
-        """Unit of a parameter, which may carry its recording's name."""
+        """Unit of a parameter, whose name may include a recording."""
         return self.problem.system.parameters[name.split("[")[0]].unit
 
     def correlations(self, covariance: Array) -> Array:
-        """Correlations of the parameters, NaN where nothing informs one."""
+        """Correlations of the parameters, NaN for parameters without information."""
         own = covariance[np.ix_(self.chosen, self.chosen)]
         std = np.sqrt(np.diag(own))
         most = MIN_RELATIVE_STD_TAKEN_AS_INFINITE * np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
@@ -332,7 +334,7 @@ class _Sensitivities:
 
 
 def _orthogonal_part(columns: Array, explained: Array) -> Array:
-    """The part of columns that is orthogonal to the columns `explained`."""
+    """Component of the columns orthogonal to the columns `explained`."""
     if explained.shape[1] == 0:
         return columns
     vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
@@ -341,9 +343,9 @@ def _orthogonal_part(columns: Array, explained: Array) -> Array:
 
 
 def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, ...]:
-    """Unseen parameters, plain unseen combinations, and what is seen; least seen first.
+    """Parameters and combinations without information, then informed directions; least observable first.
 
-    `std`: relative standard deviations of the parameters, which count a misfit in time where directions count its size.
+    `std` are relative standard deviations of the parameters, which include misfit correlated in time.
     """
     relative, count = view.relative, len(view.names)
     hidden = view.alone * MAX_WEAK_RELATIVE_STD < 1.0
@@ -357,7 +359,7 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
         sizes[: len(singular)], wide[: len(vectors), rest] = singular, vectors
         blind = sizes * MAX_WEAK_RELATIVE_STD < 1.0
         if np.any(blind):
-            # an orthonormal basis of what the seen directions leave
+            # an orthonormal basis of the complement of the observable directions
             seen, left = wide[~blind][:, rest], np.zeros((int(blind.sum()), count))
             left[:, rest] = np.linalg.svd(np.eye(len(rest)) - seen.T @ seen)[0][:, : len(left)].T
             found += [_direction(view, vector, _unseen_words(view, vector)) for vector in _sparse_basis(left)]
@@ -398,7 +400,8 @@ class _Component(NamedTuple):
 
 
 _SERIES = "1/{a} + 1/{b}, as springs in series are"
-# what may be seen of a and b: words, slope of a relative change that leaves it, b that does with a new a, like units
+# combinations of a and b: text, relative change that preserves it, b that preserves it for a new a, whether units must
+# be equal
 _Combination = tuple[str, Callable[[float, float], tuple[float, float]], Callable[[float, float, float], float], bool]
 _COMBINATIONS: tuple[_Combination, ...] = (
     (_SERIES, lambda a, b: (a, -b), lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n), True),
@@ -437,7 +440,7 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
 
 
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
-    """Change of the data with other parameter values, beyond the part that nuisances explain [standard deviations]."""
+    """Change of the data for other parameter values, after elimination of nuisances [standard deviations]."""
     problem, x = view.problem, view.x.copy()
     for name, value in changes.items():
         x[problem.unknown_names.index(name)] = value
@@ -460,7 +463,7 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:
-    """A sentence on the trade between the parameters of an unidentifiable direction."""
+    """Sentence on the combined change of parameters along an unidentifiable direction."""
     if len(parts) == 1:
         return f"{parts[0].name} is not seen"
     largest, shown = max(abs(part.coefficient) for part in parts), parts
@@ -479,7 +482,7 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def _combination(view: _Sensitivities, first: _Component, second: _Component) -> str | None:
-    """Words on the plain combination of two parameters that the data determine, also at a finite change, if any."""
+    """Text of the simple combination of two parameters that the data determine, also at a finite change, or None."""
     direction = np.array([first.coefficient, second.coefficient])
     direction /= np.linalg.norm(direction)
     (a, b), tried = (first.value, second.value), list[tuple[float, str]]()

@@ -1,4 +1,4 @@
-"""Check limits, excitation and efforts of joints with recorded angles by their kinematics and dynamics."""
+"""Checks of limits, excitation and efforts of joints with recorded angles, by their kinematics and dynamics."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as s
 class RecordedJointsModel:
     """Numeric kinematics and inverse dynamics of the joints whose angles are recorded.
 
-    Driven joints come first, then prescribed ones; unknown coordinates, such as a beam's bending, are zero.
+    Driven joints come first, then prescribed joints. Unknown coordinates, such as a beam's bending, are zero.
     """
 
     system: System
@@ -52,12 +52,12 @@ class RecordedJointsModel:
 
     @staticmethod
     def from_system(system: System, theta: Array) -> RecordedJointsModel | None:
-        """Make the model of a system's driven and prescribed joints. None where it has none."""
+        """Return the model of a system's driven and prescribed joints, or None without such joints."""
         names = (*system.driven, *system.prescribed)
         return RecordedJointsModel(system, theta, names) if names else None
 
     def has_all_angles_recorded(self, recording: Recording) -> bool:
-        """Whether a recording has all joint angles. Clamps that follow measured points have none recorded."""
+        """Whether a recording has all joint angles. Clamps that follow measured points have no recorded angles."""
         return all(name in recording.joint_names for name in self.joint_names)
 
     @property
@@ -78,14 +78,14 @@ class RecordedJointsModel:
 
     @cached_property
     def _has_no_unknown_descendants(self) -> bool:
-        """Whether no joint of unknown angle depends on the recorded joints."""
+        """Whether no joint with unknown angle is attached to the recorded joints."""
         ancestors, known = self.system.mechanism.ancestor_joint_indices, set(self.joint_configuration_indices)
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
-        """Positions of frames and their Jacobian at recorded angles `q` (N, k). Shapes: (N, nf, 3) [m], (N, nf, 3, k).
+        """Positions (N, nf, 3) [m] of frames at recorded angles `q` (N, k), and their Jacobian by `q` (N, nf, 3, k).
 
-        The frames are such that `is_frame_determined_by_angles`.
+        Every frame must satisfy `is_frame_determined_by_angles`.
         """
         place, slope = (np.array(ca.densify(x)) for x in self._places(frames).map(len(q)).call([q.T]))
         count, width = len(frames), len(self.joint_names)
@@ -93,7 +93,7 @@ class RecordedJointsModel:
         return place.T.reshape(len(q), count, 3), by_angle.reshape(len(q), count, 3, width)
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        """Joint efforts by rigid-body inverse dynamics, without dampers, springs and grasps, shape (N, k) [N m]."""
+        """Joint efforts (N, k) [N m] by rigid-body inverse dynamics, without dampers, springs and grasps."""
         return np.array(self._effort.map(len(q)).call([q.T, v.T, a.T])[0]).T
 
     @cached_property
@@ -134,7 +134,7 @@ class RecordedJointsModel:
 
 @dataclass(frozen=True)
 class _SmoothedMotion:
-    """Smoothed recorded motion at N times; both ends are left out."""
+    """Smoothed recorded motion at N times, without both ends of the recording."""
 
     t: Array  # shape (N,) [s]
     q: Array  # shape (N, k), as `v`, `a` and the effort [N m]
@@ -144,7 +144,7 @@ class _SmoothedMotion:
 
 
 def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMotion | None:
-    """Smoothed motion of the named joints at a few hundred times; None where the recording is too short."""
+    """Smoothed motion of the named joints at a few hundred times; None if the recording is too short."""
     t, step = joints.t, median_sample_period(joints.t)
     if len(t) < 30 or step <= 0 or t[-1] - t[0] > 1e5 * step:
         return None
@@ -162,7 +162,7 @@ def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMot
 
 
 def check_joint_limits(arm: RecordedJointsModel, recording: Recording) -> Iterator[Issue]:
-    """Yield issues about recorded angles or speeds that exceed the joint limits."""
+    """Yield issues about recorded angles or speeds beyond the joint limits."""
     joints = recording.joints
     if joints is None:
         return
@@ -216,8 +216,9 @@ def check_inertial_effort_excitation(
 ) -> Iterator[Issue]:
     """Yield an issue if efforts due to speed and acceleration do not exceed the noise of measured efforts.
 
-    Weight and stiffness can be found from static configurations; damping, friction and inertia only from these efforts,
-    taken from inverse dynamics and friction of a typical size. The arm `has_all_angles_recorded` in it.
+    Static configurations determine weight and stiffness. Damping, friction and inertia require the efforts of motion,
+    here estimated by inverse dynamics and friction of a typical size. `arm.has_all_angles_recorded(recording)` must
+    hold.
     """
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
@@ -244,7 +245,7 @@ def check_inertial_effort_excitation(
 
 
 def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> Array:
-    """White noise of efforts, as stated, else as seen, shape (k,) [N m]."""
+    """White noise (k,) of efforts as stated or, if not stated, as measured [N m]."""
     given = effort.std if effort.std is not None else joints.effort_std
     if given is not None:
         return expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
@@ -278,20 +279,20 @@ def check_joint_excitation(
             yield Issue("weak_excitation", words, "warning", depth, advice, *where, setting=line)
 
 
-# With measured effort e_j of joint j and the effort w_j that bodies and gravity need (Newton and Euler),
+# With measured effort e_j of joint j and the effort w_j that bodies and gravity require (Newton and Euler),
 #
 #     e_j / g_j = w_j + c_j + d_j v_j + s_j sign(v_j) + k_j q_j + (J' f)_j,
 #
-# linear in 1/g_j, offset, friction, springs and in the force f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x) with
-# which each grasp loads the arm, whatever it holds. All have priors of the size that robots have, so that a joint about
-# which the recording says nothing keeps g = 1. Nothing is said of a joint whose effort is not explained: a
-# counterbalance that the URDF does not have is no wrong sign.
+# linear in 1/g_j, offset, friction, springs and the load f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x) of each
+# grasp on the arm, whatever it holds. All have priors of typical size for robots, so that a joint without information
+# keeps g = 1. A joint whose effort is not explained has no issue: a counterbalance missing in the URDF is not a wrong
+# sign.
 
-# What a robot's model is off by: part of the joint's largest effort, part of the spread of what it needs.
+# Error of a robot's model: fraction of the joint's largest effort, fraction of the spread of the required effort.
 _EFFORT_LIMIT_ERROR_FRACTION, _EFFORT_SPREAD_ERROR_FRACTION = 0.02, 0.1
-# Usual sizes beside a joint's largest effort: of a zero's error, of dry friction, of a spring [per rad].
+# Typical sizes relative to a joint's largest effort: offset, dry friction, spring [per rad].
 _OFFSET_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.02, 0.02
-# Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m].
+# Typical force on a grasp [N], and its derivatives [N/m, N/m^2, N s/m].
 _GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
 _WRONG_GAIN_FACTOR = 3.0  # usual size of 1/g, and the factor from which a gain counts as wrong
 _MAX_EXPLAINED_RMS = 1.5  # residual over the model's error, up to which a joint's effort is explained
@@ -302,14 +303,14 @@ _MIN_Z = 5.0  # standard deviations from which on a number counts
 _INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples further apart than half of its inverse count as independent [Hz]
 _MIN_EFFORT = 1e-3  # efforts below this tell nothing [N m]
 _LAG_SEARCH_STEP = 0.1  # in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]
-# Part of the largest effort that a joint of which nothing is asked may seem to need: it swings, and has friction.
+# Fraction of the largest effort that a joint with zero command may seem to require: it swings and has friction.
 _IDLE_COMMAND_FRACTION = 0.2
 _MAX_EFFORT_RATIO = 1.3  # by which an effort may exceed the URDF's limit, which some makers state for continuous use
 
 
 @dataclass(frozen=True)
 class _Data:
-    """Motion, recorded efforts (N, k), what bodies and gravity need, and the size of each joint's largest [N m]."""
+    """Motion, recorded efforts (N, k), efforts required by bodies and gravity, and each joint's largest [N m]."""
 
     arm: RecordedJointsModel
     motion: _SmoothedMotion
@@ -351,13 +352,13 @@ def check_efforts_by_inverse_dynamics(arm: RecordedJointsModel, recording: Recor
     if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
         commanded = joints.effort_sampling_kind_or_default == "command"
         least = (_IDLE_COMMAND_FRACTION if commanded else 2 * _EFFORT_LIMIT_ERROR_FRACTION) * size
-        # zero throughout although gravity and motion need more than the least that counts
+        # zero throughout although gravity and motion require more than the smallest effort that counts
         wanted = np.sqrt(np.mean(needed**2, axis=0))
         dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
         if dead.any():
             found.append(_zero(arm, dead))
         else:
-            # motion to and fro that is late looks turned round, so that comes first
+            # a delayed oscillation looks like a flipped sign, so delays are tested first
             data = _Data(arm, motion, motion.effort, needed, size)
             found += list(_late(data)) or list(_by_joint(data))
     return [replace(issue, recording=recording.name) for issue in found]
@@ -389,8 +390,8 @@ def _zero(arm: RecordedJointsModel, dead: BoolArray) -> Issue:
 def _by_joint(data: _Data) -> Iterator[Issue]:
     arm, effort, needed, size = data.arm, data.effort, data.needed, data.size
     loaded, factor, names = _loaded(data), _WRONG_GAIN_FACTOR, arm.joint_names
-    # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
-    # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
+    # A held object can add to efforts, but not several times the arm's weight, nor support nearly all of it. The prior
+    # on the gain does not allow powers of ten, so efforts are scaled first.
     ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(effort)), 1e-300)
     common = 1.0 if 1 / factor < ratio < factor else 10.0 ** round(math.log10(ratio))
     fit = _fitted(replace(data, effort=common * effort))
@@ -442,12 +443,12 @@ def _signs(arm: RecordedJointsModel, fit: _Fit, turned: BoolArray, upright: Bool
 def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
     needed, size = data.needed, data.size
     low, high = 1 / _WRONG_GAIN_FACTOR, _WRONG_GAIN_FACTOR
-    # a large zero error looks like a large gain; but then the variation follows as it should
+    # a large offset looks like a large gain, but then the variation has the right size
     off_zero = (fit.inverse > 0) & (fit.inverse < low) & (fit.direct > low) & (fit.direct < high)
     offset = np.where(off_zero, fit.shift, fit.offset)
     calm = told & (fit.left < _MAX_EXPLAINED_RMS / 1.5) & (off_zero | ((fit.inverse > low) & (fit.inverse < high)))
     for j in np.flatnonzero(calm & (np.abs(offset) > 3 * _OFFSET_FRACTION * size)):
-        # springs that carry part of the weight are no wrong zero
+        # springs that support part of the weight are no wrong offset
         balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
         if abs(offset[j]) > _MIN_Z * fit.offset_std[j] and not balanced:
             name, value = data.arm.joint_names[j], float(offset[j])
@@ -469,7 +470,7 @@ def _late(data: _Data) -> Iterator[Issue]:
         costs.append(_fitted(replace(data, motion=kept, effort=moved, needed=data.needed[inside])).cost)
     at = int(np.argmin(costs))
     lag = float(trials[at])
-    # twice over, so that what friction and grasp take up of a lag does not count
+    # by a factor of two, because friction and grasp explain part of a lag
     if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
         when, arms = "earlier" if lag > 0 else "later", joint_names_by_arm(data.arm.system)
         words = f"efforts fit the motion best {abs(lag):.2g} s {when} than they were recorded"
@@ -505,9 +506,9 @@ def _fitted(data: _Data) -> _Fit:
 
 
 def _by_itself(data: _Data) -> tuple[Array, Array]:
-    """Columns of each joint alone, shape (N, k, 5 k), and their usual sizes: 1/g, offset, friction twice, spring."""
+    """Columns (N, k, 5 k) of each joint alone, and their typical sizes: 1/g, offset, friction twice, spring."""
     motion, size, width = data.motion, data.size, data.effort.shape[1]
-    # a spring is large where the model has one whose stiffness is sought
+    # springs are large for joints at which the model estimates a spring
     sprung = {spring.joint_name for spring in data.arm.system.elastic_joints}
     springs = np.where([name in sprung for name in data.arm.joint_names], 10 * size, _JOINT_SPRING_FRACTION * size)
     parts = [
@@ -522,7 +523,7 @@ def _by_itself(data: _Data) -> tuple[Array, Array]:
 
 
 def _loaded(data: _Data) -> BoolArray:
-    """Joints on which what is held can act like a wrong zero."""
+    """Joints on which a held object can act like an offset."""
     if not data.holders:
         return np.zeros(len(data.size), bool)
     q = data.motion.q
@@ -532,7 +533,7 @@ def _loaded(data: _Data) -> BoolArray:
 
 
 def _loads(data: _Data) -> tuple[Array, Array]:
-    """Columns of the force at every grasp, shape (N, k, 33 per grasp), and their usual sizes."""
+    """Columns (N, k, 33 per grasp) of the force at every grasp, and their typical sizes."""
     if not data.holders:
         return np.zeros((*data.needed.shape, 0)), np.zeros(0)
     place, by_angle = data.arm.frame_positions_and_jacobians(data.holders, data.motion.q)

@@ -1,7 +1,7 @@
-"""Compare a built model with Pinocchio in mass matrix, gravity forces and inverse dynamics.
+"""Comparison of a built model with Pinocchio: mass matrix, gravity forces and inverse dynamics.
 
 Pinocchio gets the robot in two ways: from the URDF file, which it reads itself, and joint by joint from the built
-system, object and effects included. The first detects errors in reading the file, the second errors in the mechanics.
+system, including object and effects. The first reveals errors in reading the file, the second errors in the mechanics.
 """
 
 from __future__ import annotations
@@ -34,10 +34,7 @@ _N_RANDOM_CONFIGURATIONS = 3  # at which both are compared, besides the one that
 
 @dataclass(frozen=True)
 class _PinocchioComparison:
-    """Relative differences between a model and Pinocchio's model of the same bodies.
-
-    Each is the largest difference divided by the largest entry.
-    """
+    """Relative differences between a model and Pinocchio's model of the same bodies (over the largest entry)."""
 
     of: str  # the compared model, in words
     mass: float  # of mass matrices
@@ -46,12 +43,12 @@ class _PinocchioComparison:
 
     @property
     def agrees_within_rounding(self) -> bool:
-        """Whether all three agree within rounding."""
+        """Whether all three quantities agree within rounding."""
         return all(size <= _RELATIVE_TOLERANCE for size in (self.mass, self.weight, self.motion))
 
     @property
     def words(self) -> str:
-        """A sentence on the agreement or on each difference."""
+        """Sentence on the agreement, or on each difference."""
         parts = {"mass matrix": self.mass, "weight": self.weight, "inverse dynamics": self.motion}
         if self.agrees_within_rounding:
             said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
@@ -63,7 +60,7 @@ class _PinocchioComparison:
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
     """Compare a system with parameters `theta` with Pinocchio's model of the same joints and bodies.
 
-    The posture (n,) [rad or m] is compared besides `_N_RANDOM_CONFIGURATIONS` drawn ones.
+    Configurations are `posture` (n,) [rad or m] and `_N_RANDOM_CONFIGURATIONS` random ones.
     """
     built = system_with_numeric_parameters(system, theta)
     gravity = np.array(ca.DM(built.gravity)).ravel()
@@ -81,9 +78,9 @@ def compare_urdf_with_pinocchio(
 ) -> _PinocchioComparison:
     """Compare this package's model of a URDF robot with Pinocchio's model of the same file.
 
-    `mechanism` is what `read_urdf` made of it with the same `joints` (all movable ones when absent), values `locked` of
-    those that were not kept [rad or m], and `exclude_links`, left out with all that hangs on them; gravity (3,) is in
-    m/s^2. Raises ValueError where Pinocchio does not read the file.
+    `mechanism` is the result of `read_urdf` for the same file and arguments: `joints` (movable joints, default all),
+    `locked` (positions of the other joints [rad or m]) and `exclude_links` (links removed with their subtrees).
+    `gravity` (3,) is in m/s^2. Raises ValueError if Pinocchio cannot read the file.
     """
     model, locked = pin.buildModelFromXML(_without(path, exclude_links)), locked or {}
     if joints is not None:
@@ -121,16 +118,16 @@ def _link(joint: ElementTree.Element, end: str) -> str:
 
 
 def _place(configuration: Array, joint: Any, value: float) -> None:
-    """Set a joint in Pinocchio's configuration, in which a continuous one is a cosine and a sine."""
+    """Set a joint in Pinocchio's configuration, in which a continuous joint is a cosine and a sine."""
     values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
     configuration[joint.idx_q : joint.idx_q + joint.nq] = values
 
 
 def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
-    """Pinocchio's model of a mechanism in numbers; with weight, masses are what gravity pulls at."""
+    """Pinocchio's model of a numeric mechanism. With `weight`, gravity acts, and masses are the effective weights."""
     model = pin.Model()
     model.gravity.linear = gravity if weight else np.zeros(3)
-    # Pinocchio's mass matrix needs all that hangs on a joint to follow it at once
+    # Pinocchio's mass matrix requires depth-first order of the joints
     placed: dict[int, int] = {-1: 0}
     for j in sorted(range(len(mechanism.joints)), key=mechanism.ancestor_joint_indices):
         joint = mechanism.joints[j]
@@ -141,7 +138,7 @@ def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
         for body in joint.bodies:
             fraction = 1.0 if body.gravity_fraction is None or not weight else float(body.gravity_fraction)
             mass, tensor = float(body.mass) * fraction, _number(body.inertia_about_com) * fraction
-            # gravity's forces do not depend on the inertia about the centre
+            # gravity forces do not depend on the inertia about the centre of mass
             inertia = pin.Inertia(mass, _number(body.center_of_mass).ravel(), tensor)
             model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
     return model

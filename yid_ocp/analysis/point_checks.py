@@ -1,4 +1,4 @@
-"""Check whether measured points are mirrored, exchanged, scaled, delayed or out of reach of a model."""
+"""Checks of measured points for mirroring, exchange, scale, delay and reach, by a model."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from yid_ocp.sensors import SensorOptions
 _SensorChoices = Callable[[str], SensorOptions]
 
 _HELD_POINT_TOLERANCE = 0.01  # from where the arm holds a point: what calibration and a tool's measures leave [m]
-# Part of the object's length by which points may be elsewhere than a model with unknown stiffness says.
+# Fraction of the object's length by which points may differ from a model with unknown stiffness.
 _MAX_OBJECT_ERROR_FRACTION = 0.25
 _MAX_REMAINING_FRACTION = 0.5  # a change explains points where it leaves less than this part of their distance
-# By what lengths are wrong that are in another unit, or read so, and a power of ten for what was typed wrongly.
+# Factors of lengths in a wrong unit, and powers of ten for typing errors.
 _UNIT_SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 100.0, 1e3)
 _MIN_CLOCK_OFFSET = 0.05  # offset between two clocks that explains points far from where they should be [s]
 _PATH_SAMPLE_RATE = 50.0  # rate at which the way of the held points is worked out; splines join what lies between [Hz]
@@ -41,7 +41,7 @@ _LENGTH_RTOL = 0.2  # part by which lengths that cannot change may seem to
 
 
 class _Change(NamedTuple):
-    """A correction of measured points, and their remaining distance from the model [m]."""
+    """A correction of measured points, and the remaining distance from the model [m]."""
 
     cause: str
     words: str
@@ -64,7 +64,7 @@ def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choi
         return
     holders = {grasp.held_frame: grasp.holder_frame for grasp in arm.system.grasps}
     for group in recording.points:
-        # of a grasped point, the frame of the arm that holds it
+        # for a grasped point, the frame of the arm that holds it
         marked = _point_frames(arm.system, group, choice(group.name))
         held = {name: holders.get(frame, frame) for name, frame in marked.items()}
         known = filter(arm.is_frame_determined_by_angles, dict.fromkeys(held.values()))
@@ -100,7 +100,7 @@ def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choi
 
 
 def _explained(changes: Sequence[_Change], error: float, allowed: float, recording: str, group: str) -> Issue:
-    """The issue of the change that explains most; the first of equally good ones."""
+    """Issue for the change that explains most; the first of equally good changes."""
     best = min((change.error for change in changes), default=math.inf)
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
     words, depth = f"points are {error:.3g} m (rms) from where the model has them", error / allowed
@@ -124,13 +124,13 @@ def _rms(difference: Array) -> float:
 
 
 def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
-    """Another unit, axes exchanged or turned, about the origin of the world; and both."""
+    """Corrections by another unit, exchanged or flipped axes about the world's origin, and both."""
     for scale in _UNIT_SCALES:
         words = f"divided by {scale:g}"
         yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
     errors = {turn: _rms(seen[..., list(turn[0])] * np.array(turn[1]) - place) for turn in list(turns)[1:]}
-    # of several that do equally well the last
+    # of several equally good ones the last
     order, signs = min(reversed(errors), key=lambda turn: errors[turn])
     axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
     mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
@@ -148,7 +148,7 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
 
 
 def _changed_times(path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array) -> Iterator[_Change]:
-    """Points recorded earlier or later than the angles, or by a clock that runs faster or more slowly."""
+    """Corrections for points recorded earlier or later than the angles, or by a faster or slower clock."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
 
     def left(late: float, drift: float) -> float:
@@ -158,7 +158,7 @@ def _changed_times(path: PositionsAtTimes, knots: tuple[float, float], t: Array,
 
     late, _ = search_clock_offset_and_drift(path, knots, t, seen)
     error = left(late, 0.0)
-    # of a search over so many times some always fits better
+    # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
@@ -173,7 +173,7 @@ def _changed_times(path: PositionsAtTimes, knots: tuple[float, float], t: Array,
 def _changed_zeros(
     arm: RecordedJointsModel, frames: tuple[str, ...], q: Array, seen: Array, here: tuple[Array, Array]
 ) -> Iterator[_Change]:
-    """One joint whose zero is off, by Gauss and Newton."""
+    """Corrections of the zero of one joint, by Gauss-Newton."""
     found = []
     for j, name in enumerate(arm.joint_names):
         offset, (place, by_angle) = 0.0, here
@@ -195,7 +195,7 @@ def _changed_zeros(
 
 
 def _moved(seen: Array, place: Array) -> Iterator[_Change]:
-    """Another frame: a shift, then a turn as well (Kabsch, Acta Cryst. A32:922, doi:10.1107/S0567739476001873)."""
+    """Corrections by another frame: a shift, then also a rotation (Kabsch 1976, doi:10.1107/S0567739476001873)."""
     good = np.isfinite(seen).all(axis=-1)
     a, b = seen[good], place[good]
     if len(a) < 4:
@@ -212,10 +212,10 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
 
 
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
-    """Distances from a frame along its chain to every joint's origin, as far as the chain is neither known nor fixed.
+    """Distances from a frame to every joint's origin along the unknown part of its chain, by joint.
 
-    The first is the root, whose origin is fixed in the world, or on the arm. None for a frame that is fixed or known,
-    or that slides.
+    The first joint is the root, whose origin is fixed in the world or on the arm. None for a fixed, known or sliding
+    frame.
     """
     mechanism, known = system.mechanism, set() if arm is None else set(arm.joint_configuration_indices)
     entry = mechanism.frame(frame)
@@ -234,7 +234,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 def check_point_distances(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, choice: _SensorChoices
 ) -> Iterator[Issue]:
-    """Yield issues about points that are farther apart, or from the root, than the object's length allows."""
+    """Yield issues about points farther apart, or farther from the root, than the object's length allows."""
     mechanism = system.mechanism
     for group in recording.points:
         frames = _point_frames(system, group, choice(group.name))
@@ -261,7 +261,7 @@ def check_point_distances(
             far = float(np.nanmedian(size))
             allowed = (1 + _LENGTH_RTOL) * bound + 6 * noise + _HELD_POINT_TOLERANCE
             if far / allowed > worst:
-                # a point at the very root tells nothing of a scale
+                # a point at the root has no information on a scale
                 worst, ratio = far / allowed, far / bound if bound > 0 else 1.0
                 words = f"{said_as} is {far:.3g} m, {bound:.3g} m along the object"
         if worst > 1:
@@ -287,13 +287,13 @@ def check_object_points_against_rollout(episode: Episode, result: EpisodePredict
         if samples.sensor.camera_pose is not None:
             changes += _changed_pose(seen, place, np.array(ca.DM(samples.sensor.camera_pose.homogeneous_matrix())))
         best = min(changes, key=lambda change: change.error)
-        # a rollout with unknown stiffness is no yardstick for less than a clear answer
+        # a rollout with unknown stiffness only supports a clear correction
         if best.error < _MAX_REMAINING_FRACTION * error and best.error < allowed:
             yield _explained([best], error, allowed, episode.name, samples.sensor.group_name)
 
 
 def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
-    """Points in the camera's frame, or with the pose applied the wrong way round."""
+    """Corrections for points in the camera's frame, or transformed with the inverse pose."""
     back = np.linalg.inv(pose)
 
     def moved(by: Array) -> Array:
@@ -334,7 +334,7 @@ def _lengths(where: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Ar
 
 
 def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Issue | None:
-    """Points whose edges have the right length once two of them are exchanged."""
+    """Issue for two points whose exchange gives their edges the right length."""
     known, most = _lengths(rest, edges), math.log(1.6)
     ratio = _lengths(at, edges) / known
     off = np.abs(np.log(ratio)) > most
@@ -359,7 +359,7 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
 def _upside_down(
     cable: CableTopology, at: Mapping[str, Array], rest: Mapping[str, Array], gravity: Array
 ) -> Issue | None:
-    """A cable that rises between its clamps by more than its own shape does: gravity points the other way."""
+    """Issue for a cable that rises between its clamps by more than its shape does: gravity has the wrong sign."""
     pull = float(np.linalg.norm(gravity))
     free = [name for name in cable.free_vertex_names if name in at]
     ends = [name for name in (cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[-1]) if name in at]

@@ -49,7 +49,7 @@ _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 @dataclass(frozen=True)
 class ParameterProfileLikelihood:
-    """Rise of chi2 at fixed values of one unknown with the others refitted, and the 95 % interval."""
+    """Rise of chi2 at fixed values of one unknown with the other unknowns refitted, and the 95 % interval."""
 
     name: str
     value: float
@@ -68,15 +68,14 @@ class ParameterProfileLikelihood:
 def compute_profile_likelihood_interval(
     problem: EstimationProblem, x: Array, index: int, std: float, evaluation: Evaluation
 ) -> ParameterProfileLikelihood:
-    """Compute the profile likelihood of one unknown and its 95 % interval, where chi2 rises by less than 3.84.
+    """Compute the profile likelihood of one unknown and its 95 % interval, in which chi2 rises by less than 3.84.
 
-    Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
-    Unknowns that are positive by nature move in their logarithm. The weak prior does not count. An end is open where
-    the level is not reached before the unknown's bound, or before it has changed by a factor of 1000 (Venzon and
-    Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496).
-
-    `x` (nx,) is the best fit, `evaluation` that at it, with the Jacobian, `std` the unknown's standard deviation, for
-    the first guess; it may be infinite.
+    The profile is followed by continuation: from the previous value, the other unknowns are predicted along the tangent
+    and corrected by Gauss-Newton. Positive unknowns are represented by their logarithm. The weak prior is left out of
+    chi2. An end is open if the level is not reached before the unknown's bound, or within a factor of 1000 (Venzon and
+    Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496). `x` (nx,) is the best fit, and `evaluation` the
+    evaluation at `x` with Jacobian. `std` is the unknown's standard deviation; it sets the first step and may be
+    infinite.
     """
     walk = _Walk(problem, x, index, evaluation)
     size = min(std / abs(x[index]), 0.5) if walk.logarithmic else min(std, 10 * float(problem.unknown_scales[index]))
@@ -92,10 +91,10 @@ def compute_profile_likelihood_interval(
 def solution_with_profile_intervals(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
-    """Add profile-likelihood intervals and consistent verdicts for weakly determined parameters to a solution.
+    """Return a solution with profile-likelihood intervals and consistent verdicts for weakly determined parameters.
 
-    There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
-    (`mark_unidentifiable_near_zero_estimate`). Unchanged where the problem is too large for profiles.
+    For these the cost is not quadratic; nor is it for stiffnesses that are small compared with their typical size
+    (`mark_unidentifiable_near_zero_estimate`). A problem that is too large for profiles keeps its solution.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
@@ -118,7 +117,7 @@ def solution_with_profile_intervals(
             entry = with_profile_interval(entry, profile.interval, size)
         return entry
 
-    # of every parameter about one and a half times as long as the solution took
+    # each parameter takes about one and a half times as long as the solution
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood", 7.5 * len(asked), 5.2)
     found = results_by_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
@@ -148,9 +147,9 @@ def mark_unidentifiable_near_zero_estimate(
 ) -> ParameterEstimate:
     """Mark a small estimate `not_identifiable` if the data do not exclude its typical size (99.9 %).
 
-    A branch's twist that no sensor sees swings only where its stiffness is near zero. There it follows the noise: the
-    cost has a narrow minimum, below what it is for all large values by what one more parameter takes from the noise.
-    `x` (nx,) is the best fit, `evaluation` that at it, `size` the `typical_parameter_magnitudes`.
+    An unobserved twist of a branch moves only if its stiffness is near zero, and then it fits the noise. The cost has a
+    narrow minimum there, lower than at all large values by what one additional parameter removes from the noise. `x`
+    (nx,) is the best fit, `evaluation` the evaluation at `x`, and `size` the entry of `typical_parameter_magnitudes`.
     """
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry
@@ -168,7 +167,7 @@ def is_small_enough_for_profiles(problem: EstimationProblem) -> bool:
 
 
 class _Point(NamedTuple):
-    """A refit at one value: coordinates, chi2 above the first one, residual rows and their Jacobian."""
+    """A refit at one value: coordinates, chi2 above the first point, residual rows and their Jacobian."""
 
     value: float
     x: Array
@@ -178,14 +177,14 @@ class _Point(NamedTuple):
 
 
 class _Walk:
-    """Follows the profile of one unknown to both sides, in coordinates: logarithms of positive unknowns."""
+    """Follows the profile of one unknown in both directions; coordinates of positive unknowns are logarithms."""
 
     def __init__(self, problem: EstimationProblem, x: Array, index: int, best: Evaluation) -> None:
         self.problem, self.index = problem, index
         lower, upper = problem.bounds
         self.positive = problem.positive_unknowns_mask & (x > 0)
         self.logarithmic = bool(self.positive[index])
-        # infinite bounds and bounds at zero become infinite ones of the coordinates
+        # infinite bounds and bounds at zero become infinite bounds of the coordinates
         with np.errstate(divide="ignore", invalid="ignore"):
             self.lower = np.where(self.positive, np.log(np.maximum(lower, 0.0)), lower)
             self.upper = np.where(self.positive, np.log(np.maximum(upper, 0.0)), upper)
@@ -202,7 +201,7 @@ class _Walk:
         return np.where(self.positive, np.exp(np.where(self.positive, s, 0.0)), s)
 
     def end(self, sign: int, size: float) -> float | None:
-        """Where the profile crosses the level on one side; None where it does not."""
+        """Value at which the profile crosses the level on one side, or None."""
         inside, s, centre = self.points[0], self.centre[self.index], self.centre[self.index]
         reach = _MAX_LOG_DISTANCE if self.logarithmic else 1e3 * float(self.problem.unknown_scales[self.index])
         bound = float((self.upper if sign > 0 else self.lower)[self.index])
@@ -227,7 +226,7 @@ class _Walk:
             inside, s = point, trial
             if trial == limit:
                 return None
-            # the root of a parabola is a line, whose slope from the start tells how far the level still is
+            # the root of delta chi2 is linear for a quadratic cost; its slope predicts the crossing
             gone, near = abs(trial - centre), height <= 0.05 * _TARGET_HEIGHT
             ahead = math.inf if near else gone * (_TARGET_HEIGHT / height - 1.0) * _STEP_OVERSHOOT
             step = min(max(ahead, 0.2 * gone), _MAX_STEP_GROWTH * gone) if barrier is None else 0.5 * abs(barrier - s)
@@ -238,7 +237,7 @@ class _Walk:
         return None
 
     def rise(self, value: float) -> float:
-        """Chi2 at a value, the others refitted, above the first one; NaN where no rollout succeeds."""
+        """Chi2 at a value with the other unknowns refitted, above the first point; NaN if no rollout succeeds."""
         point = self._refit(self.points[0], math.log(value) if self.logarithmic else value)
         return math.nan if point is None else point.chi2
 
@@ -246,7 +245,7 @@ class _Walk:
         return float(np.exp(s)) if self.logarithmic else s
 
     def _added(self, point: _Point) -> float:
-        """Root of delta chi2 at a point, which is noted."""
+        """Root of delta chi2 at a point, which is stored."""
         self.points.append(point)
         self.base = min(self.base, point.chi2)
         return self._height(point)
@@ -255,7 +254,7 @@ class _Walk:
         return math.sqrt(max(point.chi2 - self.base, 0.0))
 
     def _root(self, inside: _Point, outside: _Point) -> float:
-        """Regula falsi (Illinois) on the root of delta chi2, which is nearly a line; bisection where it is a cliff."""
+        """Regula falsi (Illinois) on the root of delta chi2, which is nearly linear; bisection at a discontinuity."""
         a, b, target = inside, outside, _TARGET_HEIGHT
         heights = [self._height(a) - target, self._height(b) - target]
         share = 1.0  # of the older side's height that counts, halved each time that side is kept
@@ -264,12 +263,12 @@ class _Walk:
             cliff = max(heights) > _CLIFF_HEIGHT_RATIO * target
             falsi = at[1] - heights[1] * (at[1] - at[0]) / (heights[1] - share * heights[0])
             s = 0.5 * (at[0] + at[1]) if cliff else falsi
-            # a cliff's edge is known well enough when its two sides are near each other
+            # a discontinuity is located once its two sides are close
             near = abs(at[1] - at[0]) < _CLIFF_WIDTH_RTOL * abs(at[1] - self.centre[self.index])
             if min(map(abs, heights)) < _ROOT_RTOL * target or near or attempt == 2 * _MAX_PROFILE_POINTS:
                 s = at[int(abs(heights[1]) < abs(heights[0]))]
                 break
-            # beyond the end the others may sit where nothing moves them any more
+            # beyond the end, the other unknowns may be in a flat region
             point = self._refit(a if heights[0] < heights[1] else b, s)
             if point is None:
                 break
@@ -288,7 +287,7 @@ class _Walk:
         now[self.index] = s
         found = self._at(now)
         if found is None:
-            # the tangent may lead too far; the others where they were
+            # if the tangent leads too far, the other unknowns keep their values
             now = near.x.copy()
             now[self.index] = s
             found = self._at(now)
@@ -327,7 +326,7 @@ class _Walk:
         return _Point(float(x[self.index]), s.copy(), chi2, *self._rows(evaluation, s))
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
-        """Residual and Jacobian by the coordinates, with anchors of positive unknowns in place of the weak priors."""
+        """Residual and Jacobian by the coordinates, with logarithmic priors instead of the weak priors."""
         residual, jacobian = linearization_without_weak_priors(self.problem, evaluation)
         slope = np.where(self.positive, self._unknowns(s), 1.0)
         anchors = np.eye(len(s))[self.anchored] / _LOG_PRIOR_STD

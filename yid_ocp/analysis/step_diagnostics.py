@@ -1,4 +1,4 @@
-"""Diagnostics of a compiled step, such as sizes, sparsity, and linearisation errors."""
+"""Diagnostics of a compiled step: sizes, sparsity, linearisation errors and observability of parameters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import Sensor, sensor_reading_function
 
-# balances Newton's tolerance against the third derivative, for angles and stiffnesses of order one
+# balances Newton's tolerance and the third derivative, for angles and stiffnesses of order one
 _DIFFERENCE_STEP = 1e-5
 
 
@@ -36,10 +36,7 @@ class CheckedStepLinearisation:
 
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
-    """Sizes of a step, such as vector lengths, unknowns, Jacobian nonzeros and operations.
-
-    `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
-    """
+    """Sizes of a step: vector lengths, Newton unknowns, Jacobian nonzeros, and operations of each function."""
     e, found = step.equations, []
     for f in step.functions.all_functions:
         nonzeros = sum(f.nnz_out(i) for i in range(f.n_out()))
@@ -54,7 +51,7 @@ def checked_step_linearisation(
 ) -> CheckedStepLinearisation:
     """Linearise a step at a state (nx,), and compare A_k and B_k with central finite differences.
 
-    The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
+    The torque (nu,) is in N m. `path` (nc,) are the prescribed coordinates before and after the step.
     """
     n, pair = step.sizes["n"], (path, path) if len(path) else None
     a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
@@ -64,7 +61,7 @@ def checked_step_linearisation(
         return np.concatenate([q1, p1, status.internal_coordinates])
 
     by_state = _differences(lambda v: after(v, torque, theta), state)
-    # prescribed coordinates come from the path, so the finite difference does not see them as part of the state
+    # prescribed coordinates come from the path, so finite differences by the state exclude them
     keep = np.setdiff1d(np.arange(len(state)), step.system.prescribed_coordinate_indices)
     errors = {
         "A": _error(a[:, keep], by_state[:, keep]),
@@ -78,7 +75,7 @@ def checked_step_linearisation(
 def linearise_step_equations(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepEquationLinearizations:
-    """Linearise the step equations, also by parameters. State (nx,), torque (nu,) [N m] and path (nc,) are given."""
+    """Linearise the step equations, also by all parameters, at a state (nx,), torque (nu,) [N m] and path (nc,)."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
@@ -88,7 +85,7 @@ def linearise_step_equations(
 
 
 def system_with_numeric_parameters(system: System, theta: Array) -> System:
-    """Replace a system's parameters by numbers, and set internal coordinates to zero."""
+    """Return a system with numbers instead of its parameters, and zero internal coordinates."""
     inner = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])
@@ -115,10 +112,10 @@ def _error(exact: Array, difference: Array) -> float:
     return float(np.max(np.abs(exact - difference), initial=0.0)) / largest if largest > 0 else 0.0
 
 
-# A row counts as seen where readings answer to it by more than this part of what they answer to the row seen best:
-# below is what a rest found to 1e-12 rad and a hundred steps of rounding leave.
+# A row counts as observed if a reading changes by more than this fraction of the largest such change over all rows:
+# smaller changes are rounding of the equilibrium (1e-12 rad) and of a hundred steps.
 _MIN_RELATIVE_RESPONSE = 1e-7
-# Steps over which readings are looked at; what is not seen within them takes longer than most motions.
+# Number of steps in which readings are examined; slower responses take longer than most motions.
 _RESPONSE_STEPS = 100
 
 
@@ -147,9 +144,9 @@ def parameter_detectabilities(
 ) -> tuple[ParameterDetectability, ...]:
     """Find the step equations that contain each parameter, and the sensors' response to the parameter.
 
-    A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
-    tracking filter's first gain. The row is seen to first order where a reading answers within `_RESPONSE_STEPS` steps.
-    The episode provides the sensors and the tracking filter; without one only rows are listed.
+    One unit is added to one row of one step that starts at `state`. The later steps are linear, x' = (A - B_u K) x,
+    where K is the first gain of the tracking filter. The row is observed to first order if a reading changes within
+    `_RESPONSE_STEPS` steps. `episode` provides the sensors and the tracking filter; without it only rows are listed.
     """
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
@@ -179,7 +176,7 @@ def parameter_detectabilities(
 
 
 class _WhitenedSensor(NamedTuple):
-    """One sensor at the rest, whitened: derivatives of its readings by state, effort and parameters."""
+    """One whitened sensor at equilibrium: derivatives of its readings by state, effort and parameters."""
 
     name: str
     by_state: Array
@@ -211,7 +208,7 @@ def _answers(
     steps: int,
     held: bool,
 ) -> Array:
-    """Largest whitened answer of every sensor to pushes on rows, of one step or `held`, shape (len(sensors), c)."""
+    """Largest whitened response (len(sensors), c) of every sensor to inputs on rows, in one step or (`held`) in all."""
     sizes, h = step.sizes, step.time_step
     n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
     nt = n + nz + sizes["m"]
@@ -263,7 +260,7 @@ class SparsityPattern:
     mark_label: str = ""  # what that means
 
     def with_numerical_nonzeros_marked(self, values: Array, where: str) -> SparsityPattern:
-        """Copy the pattern and mark the numerically nonzero entries of the matrix `values`."""
+        """Return a copy of the pattern in which the numerically nonzero entries of the matrix `values` are marked."""
         marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
         return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
 
@@ -300,8 +297,8 @@ def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | Non
 def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
     """Structural sparsity patterns of one step's matrices, by name.
 
-    `dR_dy`, residual by unknowns; `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` by the implicit function theorem;
-    `dR_dtheta`, all rows by the parameters.
+    `dR_dy` is the residual by the unknowns. `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` follow from the implicit function
+    theorem. `dR_dtheta` contains all rows by the parameters.
     """
     whole = _mask(symbols.full_jacobian_sparsity_pattern)
     system = symbols.equations.system
@@ -349,10 +346,9 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
 
 
 def _inverse_sparsity(mask: BoolArray) -> BoolArray:
-    """Structural nonzeros of a matrix's inverse from those of the matrix.
+    """Structural nonzeros of a matrix's inverse: paths in its graph after permutation to a zero-free diagonal.
 
-    With rows put in the order of a perfect matching the diagonal is full, and entry (i, j) of the inverse can differ
-    from zero where a path leads from i to j in the matrix's graph; all can where there is no perfect matching.
+    Without such a permutation (a perfect matching), all entries count as nonzero.
     """
     count = len(mask)
     matched = maximum_bipartite_matching(scipy.sparse.csr_matrix(mask), perm_type="row")
@@ -379,7 +375,7 @@ def _mask(pattern: ca.Sparsity) -> BoolArray:
 
 
 class _NlpStage(NamedTuple):
-    """Sparsity of one stage of the NLP, the same for all; the start depends on all free parameters."""
+    """Sparsity of one stage of the NLP, equal for all stages. The initial state depends on all free parameters."""
 
     constraint_mask: BoolArray  # one step's constraints by (theta_free, x_k, x_{k+1}, lam_k)
     hessian_mask: BoolArray  # of these constraints times their multipliers
@@ -405,11 +401,11 @@ def nlp_stage_sparsity(
     followed: Sequence[int],
     loose: Sequence[int],
 ) -> _NlpStage:
-    """Sparsity of one stage of the NLP with a node at every step. The order is `solvers.symbolic_transcription`'s.
+    """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.symbolic_transcription`.
 
-    The parameters `free` are unknowns, `sensors` read nodes, the tracking filter feeds the rows `followed` of the state
-    back to the torques, and the rows `loose` of the first node's state are estimated, with a prior; the start fixes the
-    others that are not prescribed.
+    The parameters `free` are unknowns. `sensors` are evaluated at nodes. The tracking filter feeds the state rows
+    `followed` back to the torques. The rows `loose` of the initial state are estimated with a prior; the other
+    unprescribed rows are fixed.
     """
     e, system = symbols.equations, symbols.equations.system
     kept = list(system.unprescribed_coordinate_indices)
@@ -421,14 +417,15 @@ def nlp_stage_sparsity(
     curved = _mask(ca.jacobian_sparsity(ca.gradient(ca.dot(weights, rows), local), local))
     f, n, nz, m, nu = len(free), system.n_coordinates, e.z0.numel(), e.lam.numel(), e.u.numel()
     nx = 2 * n + nz
-    # where each local variable stands in the stage; torques are not unknowns, under the filter they follow the state
+    # index of each local variable in the stage; torques are not unknowns, because the filter makes them functions of
+    # the state
     places = [*range(f + nx), *range(f + nx, f + nx + n), *range(f + nx + 2 * n, f + 2 * nx + m)]
     placing = np.zeros((local.numel(), f + 2 * nx + m), bool)
     placing[np.arange(len(places)), places] = True
     placing[np.ix_(np.arange(len(places), len(places) + nu), f + np.array(followed, int))] = True
     by_stage = _times(by_local, placing)
     hessian = _times(_times(placing.T, curved), placing)
-    # the constraint on the momentum after the step holds that momentum itself
+    # the constraint on the momentum after the step contains this momentum
     at = rows.numel() - n
     by_stage[at + np.arange(n), f + nx + n + np.arange(n)] = True
     measured = np.zeros((f + nx, f + nx), bool)
@@ -447,9 +444,9 @@ def nlp_stage_sparsity(
 def full_nlp_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
     """Size of the NLP with a node at every step, for recordings with the given numbers of `steps`.
 
-    `jacobian_nonzeros` counts those of the constraints, `hessian_nonzeros` both triangles of the exact Hessian of the
-    steps' constraints times their multipliers; what measurements add to it is not counted, and the start is linear in
-    the parameters, as multiple shooting takes it.
+    `jacobian_nonzeros` counts entries of the constraint Jacobian. `hessian_nonzeros` counts both triangles of the exact
+    Hessian of the step constraints times their multipliers, without entries of measurements. The initial state is
+    linear in the parameters, as in multiple shooting.
     """
     (f, nx, m, height), begun = stage.sizes, len(stage.fixed_start_rows)
     # every step after the first adds the same entries

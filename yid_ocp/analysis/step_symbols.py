@@ -15,12 +15,12 @@ from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.integrator.discrete import DiscreteEquations
 
-# How tightly an expression binds: a part that binds less than its place asks for gets parentheses.
+# Binding strength of an expression: an operand that binds less than required gets parentheses.
 _COMPARISON, _SUM, _PRODUCT, _POWER, _ATOM = range(5)
 _LEAF_OPERATIONS = (ca.OP_INPUT, ca.OP_CONST)
 _MAX_FRACTION_LENGTH = 60  # characters beyond which a fraction is written on one line, which TeX can break
 
-# operation: template, how tightly it binds, what it asks of its parts
+# operation: template, binding strength, required strength of its operands
 _OperationTemplate = tuple[str, int, tuple[int, ...]]
 
 
@@ -90,7 +90,7 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 def format_expressions(
     expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[_SymbolName], latex: bool = False
 ) -> _FormulaText:
-    """Format scalar expressions as text or LaTeX. `names` are those of their only symbols, the variables (k, 1)."""
+    """Format scalar expressions as text or LaTeX. `names` are those of the variables (k, 1), their only symbols."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
     for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
@@ -129,7 +129,7 @@ _Node = tuple[int, tuple[int, ...], float]
 
 
 def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
-    """The function's instructions as nodes that are written once, and which nodes are the outputs."""
+    """Instructions of the function as nodes that are written once, and the indices of the output nodes."""
     nodes: list[_Node] = []
     at: dict[int, int] = {}
     results = [0] * count
@@ -169,8 +169,8 @@ _MAX_LISTED_SYMBOLS = 6  # names of one block that are still listed one by one
 class SymbolBlock:
     """A named block of equations or variables of one kind.
 
-    Labels, one for every entry of the expressions (k, 1), are those of a joint, a grasp's equation, an internal
-    coordinate or a parameter; they take the place of `#` in the LaTeX template.
+    `labels` has one entry per row of the (k, 1) expression: the name of a joint, grasp equation, internal coordinate or
+    parameter. In the LaTeX template, `#` is replaced by the label.
     """
 
     name: str
@@ -181,7 +181,7 @@ class SymbolBlock:
 
     @property
     def full_names(self) -> tuple[str, ...]:
-        """Full names such as `q1[T1_0_x]`. Parameters and the time step have the label alone."""
+        """Full names such as `q1[T1_0_x]`. For parameters and the time step they are the labels."""
         return tuple(label if self.name in ("theta", "time_step") else f"{self.name}[{label}]" for label in self.labels)
 
 
@@ -206,12 +206,12 @@ class EquationOrDerivativeFormula:
         return bool(self.expression.is_zero())
 
     def numeric_value(self, variables: ca.SX, at: Array) -> float:
-        """Numeric value of the expression. The variables (k, 1) have the values `at` (k,)."""
+        """Numeric value of the expression at the values `at` (k,) of the variables (k, 1)."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
     @property
     def text_lines(self) -> list[str]:
-        """Text lines of the whole formula, with shared subexpressions first."""
+        """Text lines of the whole formula, shared subexpressions first."""
         if self.is_identically_zero:
             return [f"{self.title} = 0 whatever the state"]
         said = [_headline(self.title, self.formula.n_operations, self.variable_names)]
@@ -223,9 +223,9 @@ class EquationOrDerivativeFormula:
 class NamedStepEquations(ReprMixin):
     """Symbolic equations of one time step with named rows and columns. Rows are equations, columns variables.
 
-    Rows are in the blocks `del` (DEL equations; at a prescribed coordinate the residual is -h times its effort),
-    `internal`, `constraint`, and `p1`, the momentum after the step; columns in `q0`, `p0`, `z0`, `u`, `theta`,
-    `time_step`, and the unknowns `q1`, `z1`, `lam`.
+    The row blocks are `del` (DEL equations; at a prescribed coordinate the residual is -h times its effort),
+    `internal`, `constraint`, and `p1`, the momentum after the step. The column blocks are `q0`, `p0`, `z0`, `u`,
+    `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`.
     """
 
     equations: DiscreteEquations
@@ -307,10 +307,10 @@ class NamedStepEquations(ReprMixin):
         return slice(ends[at], ends[at + 1])
 
     def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:
-        """Find an equation by name or, for `ROW, COLUMN`, its derivative with respect to a variable.
+        """Return an equation by name or, for `ROW, COLUMN`, its derivative with respect to a variable.
 
-        `text` is such as `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]` or `constraint[left.x], T2.length`. Raises
-        `ConfigError` for neither one name nor two, or one that does not exist.
+        Examples of `text`: `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]`, `constraint[left.x], T2.length`. Raises
+        `ConfigError` if there are not one or two names, or if a name does not exist.
         """
         said = [part.strip() for part in text.split(",")]
         if len(said) > 2 or not all(said):
@@ -327,7 +327,7 @@ class NamedStepEquations(ReprMixin):
         return EquationOrDerivativeFormula(self.row_names[row], column, made, used, expression)
 
     def _summarize_columns(self, places: Iterable[int]) -> tuple[str, ...]:
-        """Names of columns by index; a block with many of them is abbreviated, `24 of q0`."""
+        """Names of columns by index. A block with many of them is abbreviated, such as `24 of q0`."""
         chosen, names, words = set(places), self.column_names, []
         for block in self.column_blocks:
             span = self.block_slice(block.name)
@@ -368,11 +368,11 @@ def _headline(title: str, count: int, variables: Sequence[str]) -> str:
 
 
 def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[SymbolBlock, ...]) -> int:
-    """Index of a row or column by its full name; raises `ConfigError` with the nearest name where there is none."""
+    """Index of a row or column by its full name. Raises `ConfigError`, with the nearest name, if there is none."""
     if name in known:
         return known.index(name)
     shapes = [f"{b.name}[{b.labels[0]}]" if b.full_names[0] != b.labels[0] else b.labels[0] for b in blocks if b.labels]
-    # of the same block where the block is right
+    # of the same block, if the block exists
     same = tuple(n for b in blocks if b.name == name.partition("[")[0] for n in b.full_names)
     hint = nearest_name_hint(name, known if len(known) < 12 else same or known)
     if len(known) >= 12 and not hint.startswith("did"):

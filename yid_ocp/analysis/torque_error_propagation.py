@@ -1,10 +1,10 @@
 """Low-rank propagation of torque and encoder errors to all readings of a motion.
 
-Torques are wrong in every recorded sample and by a constant, angles that a tracking filter follows in every step: some
-thousands of unknowns in a recording, of which sensors see no more than smooth motions. With G their effect on all
-readings in units of the finest noise, the left singular vectors of G whose singular values are not small represent
-them, from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2, doi:10.1137/090771806); the neglected
-rest would add less than `_NEGLIGIBLE_STD` squared to any reading's variance.
+Torques have an error in every recorded sample and a constant one; angles that a tracking filter follows have an error
+in every step. A recording has some thousands of these unknowns, but sensors only observe smooth motions. G is their
+effect on all readings in units of the finest noise. The left singular vectors of G with large singular values represent
+it; they are computed from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2, doi:10.1137/090771806).
+The neglected rest adds less than `_NEGLIGIBLE_STD` squared to the variance of any reading.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors.joints import PositionSensor
 
 _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a reading's noise
-# Random samples of all errors at first, twice as many as long as they are too few, and at most.
+# Initial number of random samples of all errors, doubled while too small, and its maximum.
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
@@ -39,15 +39,16 @@ def point_sensitivities_and_joint_sensor_information(
 ) -> tuple[dict[tuple[str, str], Array], Array]:
     """Sensitivities of an episode's points at every node, and Fisher information of its joint measurements.
 
-    In `problem` every point is in view at every node, of unit standard deviation; `evaluation` is at x (nx,), `finest`
-    each group's least standard deviation [m], `encoders` the same with the encoders of driven joints as measurements.
+    In `problem` every point is seen at every node with unit standard deviation. `evaluation` is the evaluation at x
+    (nx,). `finest` is the smallest standard deviation of each group [m]. `encoders` is the problem with encoders of
+    driven joints as measurements.
 
     Returns
     -------
     slopes : dict of (group, frame) to ndarray, shape (N + 1, 3, nx + q)
-        By the unknowns, then by the low-rank unknowns of torque and encoder errors.
+        Derivatives with respect to the unknowns, then to the low-rank unknowns of torque and encoder errors.
     information : ndarray, shape (nx + q, nx + q)
-        From joints, and the prior of these errors.
+        Information of joint measurements, and of the prior of these errors.
     """
     assert evaluation.jacobian is not None
     episode, result = problem.episodes[i], evaluation.episode_predictions[i]
@@ -95,7 +96,7 @@ def point_sensitivities_and_joint_sensor_information(
 
 
 def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> Array:
-    """Slopes of what encoders measured, in units of their noise, by the unknowns and the errors, (r, nx + q)."""
+    """Derivatives (r, nx + q) of encoder readings, in units of their noise, by the unknowns and the errors."""
     evaluation = encoders.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
         raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
@@ -111,8 +112,8 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
 def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorModel, slopes: Array) -> Array:
     """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors.
 
-    The tracking filter keeps the arms on what they followed. Where it follows encoders that are measurements, its share
-    of their noise is taken as independent of theirs, which is small beside that of torques.
+    If the tracking filter follows encoders that are also measurements, its share of their noise is treated as
+    independent, which is a small error compared with that of torques.
     """
     motion = _Motion(course, errors)
     rng = np.random.default_rng(0)
@@ -126,7 +127,7 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorMod
             back = motion.pulled(basis.reshape(*shape, count), slopes)
         squares, vectors = np.linalg.eigh(back.T @ back)
         sizes = np.sqrt(np.maximum(squares, 0.0))
-        # a third: what so few samples miss is somewhat larger than the least that they find
+        # a third, because the missed part is somewhat larger than the smallest found
         if count == most or sizes[0] < _NEGLIGIBLE_STD / 3:
             break
         count = min(2 * count, most)
@@ -135,7 +136,7 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorMod
 
 
 class _Motion:
-    """Changes of the state by errors of unit standard deviation: of the start, of samples, of steps, and constant."""
+    """Changes of the state by errors of unit standard deviation: initial, per sample, per step, and constant."""
 
     def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
@@ -161,12 +162,12 @@ class _Motion:
         self.size = len(self.torque_std) * (2 + self.samples + len(self.by_torque))
 
     def _parts(self, errors: Array) -> tuple[Array, Array, Array, Array]:
-        """Errors of the start's angles, constant ones, those of samples and of steps, each (..., nu, c)."""
+        """Errors of the initial angles, constant errors, errors of samples and of steps, each (..., nu, c)."""
         parts = errors.reshape(-1, len(self.torque_std), errors.shape[1])
         return parts[0], parts[1], parts[2 : 2 + self.samples], parts[2 + self.samples :]
 
     def moved(self, errors: Array, slopes: Array) -> Array:
-        """Readings by errors, G e: (size, c) to (N + 1, k, c)."""
+        """Readings G e of errors e: (size, c) to (N + 1, k, c)."""
         angles, constant, white, followed = self._parts(errors)
         constant, white = self.bias_std * constant, self.torque_std * white
         state = self.start_by_angles @ angles + self.start_by_torque @ (constant + white[0])
@@ -179,7 +180,7 @@ class _Motion:
         return found
 
     def pulled(self, readings: Array, slopes: Array) -> Array:
-        """The transposed map, G' y: (N + 1, k, c) to (size, c)."""
+        """The transposed map G' y: (N + 1, k, c) to (size, c)."""
         result = np.zeros((self.size, readings.shape[2]))
         angles, constant, white, followed = self._parts(result)
         costate = slopes[-1].T @ readings[-1]

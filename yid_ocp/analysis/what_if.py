@@ -1,4 +1,4 @@
-"""Rank changes of an experiment by the parameters that they make identifiable."""
+"""Ranking of changes of an experiment by the parameters that they make identifiable."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ class ExperimentChange:
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
-    """Predicted identifiability of an experiment with some changes. No verdicts if it could not be evaluated.
+    """Predicted identifiability of an experiment with some changes. `verdicts` is empty if it could not be evaluated.
 
-    The gain is information gain, 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation
-    of 400 % of each parameter.
+    `gain` is the information gain 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation of
+    400 % of each parameter.
     """
 
     changes: tuple[str, ...]
@@ -76,10 +76,9 @@ class ChangedExperimentResult:
 class ExperimentRanking(ReprMixin):
     """Changes of an experiment, ranked by the parameters that they make identifiable.
 
-    Single changes come with most identifiable parameters first, then by gain; those that could not be evaluated last.
-    `smallest_sufficient_sets` are all sets of fewest changes with which every parameter is identifiable, largest gain
-    first; empty where none of up to three changes does it. `greedy_sequence` adds the best single change one after the
-    other. Of each, standard deviations are relative to the parameter [1] and the gain is in nat.
+    `single_changes` are sorted by the number of identifiable parameters, then by gain; changes that could not be
+    evaluated come last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make every
+    parameter identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly.
     """
 
     unchanged_experiment: ChangedExperimentResult
@@ -111,29 +110,29 @@ def what_if(
     progress: Progress = NULL_PROGRESS,
     evaluate_changes: ChangeSetEvaluator | None = None,
 ) -> ExperimentRanking:
-    """Rank changes of an experiment by how many parameters they would make identifiable.
+    """Rank changes of an experiment by the number of parameters that they make identifiable.
 
-    Nothing is measured for it: new sensors look at the rollout of the recorded motion, the tracking filter keeping the
-    arms on it; new motions and a second arm are simulated in MuJoCo (or, another motion, taken from held-out
-    recordings where MuJoCo is not installed).
+    No new measurement is needed. New sensors observe the rollout of the recorded motion, on which the tracking filter
+    keeps the arms. New motions and a second arm are simulated in MuJoCo; without MuJoCo, another motion is taken from
+    held-out recordings.
 
     Parameters
     ----------
     solution : Solution or array_like, optional
-        Point at which to judge; the initial values when absent.
+        Point of the analysis; default: the initial values.
     start, grasp_std
-        Nuisances, as in `identifiability`, which states the errors too.
+        Nuisances, and their errors, as in `identifiability`.
     two_arm_system : System, optional
-        The system with one more arm and its grasp; without it that change is not tried.
+        The system with a second arm and its grasp; without it this change is not tried.
     considered_changes : collection of str, optional
-        Names of changes to consider, all when absent.
+        Names of changes to consider; default: all.
     evaluate_changes : callable, optional
-        Does what `evaluate_experiment_change_sets` does, in other processes for example; in this one when absent.
+        Replacement for `evaluate_experiment_change_sets`, for example in other processes.
 
     Returns
     -------
     ExperimentRanking
-        Of each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat].
+        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat].
     """
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
@@ -196,7 +195,7 @@ def _are_compatible(changes: Sequence[ExperimentChange]) -> bool:
 
 
 def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedExperimentResult]:
-    """Results sorted by identifiable parameters, then by gain; those that could not be evaluated last."""
+    """Results sorted by identifiable parameters, then by gain; results that could not be evaluated come last."""
     return sorted(outcomes, key=lambda entry: (not entry.verdicts, -entry.identifiable, -entry.gain))
 
 
@@ -242,7 +241,7 @@ class _Outcomes:
         return changes
 
     def of_all(self, sets: Sequence[Sequence[ExperimentChange]]) -> list[ChangedExperimentResult]:
-        """The outcomes of several sets of changes."""
+        """Outcomes of several sets of changes."""
         keys = [frozenset(change.name for change in changes) for changes in sets]
         new = {key: changes for key, changes in zip(keys, sets, strict=True) if key not in self.known}
         if new:
@@ -283,7 +282,7 @@ class _Outcomes:
         def look(frame: str) -> FrameObservationSchedule:
             return FrameObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
 
-        # a point that a second arm now holds is that arm's to measure
+        # a point that the second arm holds is measured by that arm
         held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
         views = [
             look(view.frame) if view.point_group == looking and rate is not None else view
@@ -299,7 +298,7 @@ class _Outcomes:
 def _relative_stds_and_gain(
     layout: CandidateExperimentSensitivities, information: Array
 ) -> tuple[dict[str, float], float]:
-    """Relative standard deviation of every free parameter, and the gain, from a Fisher information of all unknowns."""
+    """Relative standard deviation of every free parameter, and the gain, from the information of all unknowns."""
     problem, x = layout.problem, layout.x
     chosen = np.array([problem.unknown_names.index(name) for name in layout.free_parameters])
     others = np.setdiff1d(np.arange(len(x)), chosen)
