@@ -1,4 +1,4 @@
-"""Diagnosis of the sim-to-real gap by its existence, its location, and the effects that cause and close it."""
+"""Diagnosis of the sim-to-real gap: whether it exists, where it is, and which effects cause and close it."""
 
 from yid_ocp.diagnosis.diagnose import diagnose as diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult as DiagnosisResult

@@ -1,9 +1,9 @@
 """Compare a diagnosis with earlier runs, use their estimates as priors, and predict without the effects found.
 
-Of a linear model with the prior N(m, C0), the estimate x with the covariance C moves by x - m, which has the covariance
-C0 - C where nothing changed. A misfit that makes the data's noise count k times adds (k - 1) C (1 - C/C0). An effect is
-understood when taking it away predicts the world without it, and adding it the world with it.
-"""
+In a linear model with the prior N(m, C0), an estimate x with covariance C shifts by x - m. If nothing changed, the
+shift has the covariance C0 - C. A misfit that multiplies the data's noise variance by k adds (k - 1) C (1 - C/C0). An
+effect is understood if removing it predicts recordings made without it, and adding it predicts recordings made with
+it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _ParameterShift:
 
 @dataclass(frozen=True)
 class EarlierRunsComparison:
-    """Comparison of a fit with baseline runs, with their agreement and the shift of every parameter."""
+    """Comparison of a fit with baseline runs: their agreement, and the shift of every parameter."""
 
     baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
     is_baseline_explained: bool  # whether the model explained their recordings
@@ -62,16 +62,15 @@ class EarlierRunsComparison:
 
     @property
     def changed_parameters(self) -> tuple[_ParameterShift, ...]:
-        """Parameters that have changed significantly. The smallest p-value comes first."""
+        """Parameters that have changed significantly, smallest p-value first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
         return tuple(sorted(changed, key=lambda entry: entry.p_value))
 
 
 def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
-    """Use a baseline's estimates as a joint prior of a problem, with its parameters free.
+    """Problem with a baseline's estimates as a joint prior, and with the baseline's parameters free.
 
-    Raises `ConfigError` for parameters or effects that the model lacks, or that differ between its recordings.
-    """
+    Raises `ConfigError` if the model lacks a parameter or effect, or if a parameter differs between recordings."""
     names, parameters = baseline.parameter_names, problem.system.parameters
     for name in names:
         if name not in parameters:
@@ -98,7 +97,7 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
 
 @dataclass(frozen=True)
 class EarlierRunsBaseline:
-    """Combined estimates of earlier runs, and reference recordings made without the effect sought."""
+    """Combined estimates of earlier runs, and reference recordings made without the sought effect."""
 
     combined_estimates: RunEstimates | None  # all earlier runs together
     baseline_runs: tuple[str, ...]
@@ -108,7 +107,7 @@ class EarlierRunsBaseline:
 
     @staticmethod
     def from_runs(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> EarlierRunsBaseline:
-        """Combine the estimates of several runs and reference recordings `without` the effect into a baseline."""
+        """Make a baseline from the estimates of several runs and from reference recordings `without` the effect."""
         if not runs:
             return EarlierRunsBaseline(None, (), 0.0, 1.0, without)
         known, chi2, degrees = pool_estimates(runs)
@@ -117,7 +116,7 @@ class EarlierRunsBaseline:
         )
 
     def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> EarlierRunsComparison | None:
-        """Compute how far a fit's parameters have moved from its baseline prior. None if there are no runs."""
+        """Compute the shifts of a fit's parameters from its baseline prior. None if there are no runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
             return None
@@ -152,9 +151,8 @@ class EarlierRunsBaseline:
     ) -> ErrorsWithEffectsRemovedAndAdded | None:
         """Predict reference recordings without the effects of `last`, and the diagnosed recordings with them.
 
-        None without effects or reference recordings. Without earlier runs, the parameters of the system without the
-        effects are estimated on the reference recordings.
-        """
+        None without effects or reference recordings. If there are no earlier runs, the parameters of the system without
+        the effects are estimated on the reference recordings."""
         without, known = self.reference_recordings, self.combined_estimates
         if not last.effects or not without:
             return None
@@ -174,7 +172,7 @@ class EarlierRunsBaseline:
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
-    """Variance of every unknown by the stated noise and priors alone."""
+    """Variance of every unknown from the stated noise and priors alone."""
     problem = fit.problem
     jacobian = linearization_without_weak_priors(problem, fit.evaluation)[1] * problem.unknown_scales
     variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
@@ -187,7 +185,7 @@ _ChannelErrors = Mapping[str, tuple[float, str]]
 
 @dataclass(frozen=True)
 class _PredictionErrors:
-    """Prediction errors on recordings no fit has used, without diagnosis and counterfactual."""
+    """Prediction errors on recordings that no fit used, without diagnosis and counterfactual."""
 
     recordings: tuple[str, ...]
     without_diagnosis: _ChannelErrors
@@ -210,7 +208,7 @@ class _PredictionErrors:
         return bool(self.rmse_by_unit) and all(after < before for before, after in self.rmse_by_unit.values())
 
     def to_dict(self) -> dict[str, Any]:
-        """As in `yid-diagnosis/2`."""
+        """Dictionary as in `yid-diagnosis/2`."""
         rmse = {
             channel: {"without_diagnosis": before, "counterfactual": self.counterfactual[channel][0], "unit": unit}
             for channel, (before, unit) in self.without_diagnosis.items()
@@ -221,7 +219,7 @@ class _PredictionErrors:
 
 @dataclass(frozen=True)
 class ErrorsWithEffectsRemovedAndAdded:
-    """Prediction errors on reference recordings without the effects, and on the diagnosed ones with the effects."""
+    """Prediction errors on reference recordings without the effects, and on diagnosed recordings with the effects."""
 
     # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted
     effects_removed: _PredictionErrors
@@ -229,14 +227,14 @@ class ErrorsWithEffectsRemovedAndAdded:
     effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the prediction errors to a dictionary, the entry `counterfactual` of `yid-diagnosis/2`."""
+        """Convert the prediction errors to the entry `counterfactual` of `yid-diagnosis/2`."""
         return {"removed": self.effects_removed.to_dict(), "added": self.effects_added.to_dict()}
 
 
 def _predicted(
     last: RefittedModel, recordings: Sequence[Recording], plain: Mapping[str, float], other: Mapping[str, float]
 ) -> _PredictionErrors:
-    """Errors by two models; parameters that neither names are the problem's own, and effects neutral."""
+    """Prediction errors of two models; other parameters have the problem's values, and effects are neutral."""
     try:
         problem = _on(last, recordings)
         first, second = (_errors(problem, values, last.effects) for values in (plain, other))
@@ -250,7 +248,7 @@ def _nothing(recordings: Sequence[Recording], message: str) -> _PredictionErrors
 
 
 def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProblem:
-    """The problem with its compiled step, all candidates in it, on other recordings: to predict and to estimate on."""
+    """The problem with its compiled step and all candidates on other recordings, to predict or to estimate on."""
     own, none = last.problem, MultivariateGaussianPrior()
     options = replace(own.options, prior_stds={}, local_parameters=(), multivariate_prior=none, known_initial_states={})
     values = dict(zip(own.system.parameters.names, map(float, own.theta), strict=True))
@@ -268,7 +266,7 @@ def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Se
 
 
 def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:
-    """The nominal parameters as they are estimated on the recordings without the effects."""
+    """The nominal parameters, estimated on the recordings without the effects."""
     problem = _on(last, without).with_free_parameters_without_recompiling(shared)
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:

@@ -1,4 +1,4 @@
-"""Generate random blind cases of one experiment. Their labels are sealed before a recording is looked at."""
+"""Generate random blind cases of one experiment. Their labels are sealed before any recording is diagnosed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _MIN_CASES_PER_EXPERIMENT = 3  # cases below which an experiment is not worth it
 
 @dataclass(frozen=True)
 class PlannedBlindCase:
-    """Plan of one blind case, with number, experiment, category and effect size."""
+    """Plan of one blind case: number, experiment, category and effect size."""
 
     number: int
     experiment: str
@@ -69,11 +69,11 @@ def plan_blind_cases(
     chains: frozenset[str] = frozenset(),
     purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
-    """Plan `count` blind cases, distributed over experiments by `weights` and ordered by the seed.
+    """Plan `count` blind cases, distributed over experiments by `weights`, in an order drawn by the seed.
 
-    The weights are how large a part of the cases each experiment gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none,
-    but for the largest. The objects of `chains` can be made of finer links. `ConfigError` where there is no case.
-    """
+    `weights` holds the share of cases of each experiment. An experiment with less than `_MIN_CASES_PER_EXPERIMENT`
+    cases gets none; if all have less, the largest gets all. Objects of the experiments in `chains` can be simulated
+    with finer links. `purpose` selects the random stream. Raises `ConfigError` if `count` is below 1."""
     if count < 1:
         raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
     total = sum(weights.values())
@@ -101,7 +101,7 @@ def plan_blind_cases(
 
 
 def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
-    """So many things in these proportions, by the largest remainders."""
+    """Distribute a number in given proportions, by the largest remainders."""
     total = sum(parts.values())
     exact = {key: count * part / total for key, part in parts.items()}
     found = {key: int(value) for key, value in exact.items()}
@@ -153,14 +153,14 @@ class CaseGroundTruth:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
-        """Restore the label from a dictionary that `to_dict` made."""
+        """Restore the label from the dictionary returned by `to_dict`."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
         return CaseGroundTruth(**{**data, "injected": injected})
 
 
 @dataclass(frozen=True)
 class BlindCase:
-    """A blind case for the diagnosis, with recordings and the effect kinds excluded from the candidates."""
+    """A blind case for the diagnosis: recordings, and effect kinds excluded from the candidates."""
 
     name: str
     estimation_recordings: tuple[Recording, ...]
@@ -169,13 +169,13 @@ class BlindCase:
 
 
 def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
-    """Convert labels to JSON text, and hash the text by SHA-256. The hash is published before the diagnosis."""
+    """Convert labels to JSON text with its SHA-256 hash. The hash is published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
-    """Read sealed labels from JSON `text`. `DataError` if its SHA-256 hash is not `commitment`."""
+    """Read sealed labels from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         raise DataError("the labels are not those that were committed to", where="sealed labels")
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
@@ -183,7 +183,7 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
 
 @dataclass(frozen=True)
 class SyntheticMeasurementConditions:
-    """Settings of an experiment's synthetic recordings, for number, sensor noise, simulation and camera."""
+    """Settings of an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
 
     estimation_count: int = 1  # to estimate on; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
@@ -201,16 +201,16 @@ amplitudes a move the residual."""
 
 
 class BlindCaseGenerator:
-    """Generates random blind cases of one experiment. `ConfigError` where its system has no driven joints.
+    """Generates random blind cases of one experiment. Raises `ConfigError` if its system has no driven joints.
 
     Parameters
     ----------
     problem : EstimationProblem
-        Its system, options and free parameters are every case's; its first recording gives the initial posture.
+        It defines system, options and free parameters of all cases. Its first recording gives the initial joint angles.
     finer : callable, optional
-        The system with so many times its links.
+        Function that returns the system with a given multiple of its links.
     simulated_system : System, optional
-        What moves, where that is not the problem's: the same with its arms driven.
+        The simulated system, if not the problem's: the same system with driven arms.
     """
 
     def __init__(
@@ -245,10 +245,9 @@ class BlindCaseGenerator:
         return np.random.default_rng([self.seed, ALLOWED_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
     def _draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
-        """True values of the free parameters, log-uniform about their start, and of all ordinary friction.
+        """True values of free parameters, log-uniform about their initial values, and of all ordinary friction.
 
-        Those with a prior lie about as far from their start as it says.
-        """
+        Parameters with a prior deviate from their initial values by about the prior's standard deviation."""
         system, priors = self.problem.system, self.problem.options.prior_stds
         start = dict(zip(system.parameters.names, map(float, self.problem.theta), strict=True))
         drawn = {name: start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1) for name in self.problem.free}
@@ -262,7 +261,7 @@ class BlindCaseGenerator:
 
     @property
     def _ordinary_friction(self) -> tuple[EffectBase, ...]:
-        """Friction of the nominal model that the other engine has in its own terms."""
+        """Friction of the nominal model that MuJoCo simulates in its own terms."""
         known = {(effect.kind, effect.location) for effect in self.simulated_system.effects}
         own = (effect for effect in self.problem.system.effects if isinstance(effect, EffectBase))
         return tuple(effect for effect in own if (effect.kind, effect.location) not in known)
@@ -292,7 +291,7 @@ class BlindCaseGenerator:
         return replace(made, name=name, description="", source="", true_parameters={})
 
     def _linearize_clean_recordings(self) -> AllCandidatesLinearization:
-        """The candidates' signatures on clean recordings."""
+        """The candidates' signatures on recordings without effects."""
         rng = self._rng(0)
         names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
         *clean, other = [
@@ -315,14 +314,14 @@ class BlindCaseGenerator:
         )
 
     def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
-        """Compute JSON-compatible sensitivities of all candidates. Their detectable sizes follow from these."""
+        """Compute JSON-compatible sensitivities of all candidates, which define their detectable sizes."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
     def set_candidate_sensitivities_from_json(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Set the candidates' sensitivities to those that `candidate_sensitivities_to_json` returned elsewhere."""
+        """Set the candidates' sensitivities to the values of another generator's `candidate_sensitivities_to_json`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -335,7 +334,7 @@ class BlindCaseGenerator:
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
     def draw_planned_case(self, wanted: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
-        """Draw recordings and label of a planned case by its seed. `ModelError` if no draw succeeds."""
+        """Draw recordings and label of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
         name = f"case_{wanted.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_CASE_DRAWS):
@@ -372,7 +371,7 @@ class BlindCaseGenerator:
         return tuple(e for i, (e, _) in enumerate(drawn) if e.label not in labels[:i]), drawn[0][1]
 
     def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
-        """An effect of the library at a multiple of its detectable size, or as near to it as its range allows."""
+        """An effect of the library at a multiple of its detectable size, or the nearest size within its range."""
         groups: dict[str, dict[str, list[_Detectable]]] = {}
         for entry in self._detectable:
             if entry[0].kind in INJECTABLE_EFFECT_KINDS:
@@ -390,7 +389,7 @@ class BlindCaseGenerator:
     def _sized(
         self, entry: _Detectable, rng: np.random.Generator, wanted: float
     ) -> tuple[InjectedEffect, float] | None:
-        """Amplitudes in a random proportion at a multiple of the detectable size, as far as the range allows."""
+        """Amplitudes in random proportion at a multiple of the detectable size, limited to the range."""
         (effect, shape, factor), names = entry, entry[0].amplitude_names
         neutral = np.array([effect.neutral_values[n] for n in names])
         low, high = np.array([effect.prior_ranges[n] for n in names]).T - neutral
@@ -427,7 +426,7 @@ class BlindCaseGenerator:
         return InjectedEffect(kind, location, {"size": size})
 
     def _largest_torque(self, joint: str) -> float:
-        """Of a joint in the problem's first recording [N m]; 10 where none is recorded."""
+        """Largest torque of a joint in the problem's first recording [N m]; 10 if none is recorded."""
         recorded = self.problem.episodes[0].recording.joints
         if recorded is None or recorded.effort is None or joint not in recorded.names:
             return 10.0
@@ -465,7 +464,7 @@ def simulate_random_motion(
 
 
 def first_recorded_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
-    """First recorded position of every driven joint. `ConfigError` if one is not recorded."""
+    """First recorded position of every driven joint. Raises `ConfigError` if one is not recorded."""
     joints = recording.joints
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
@@ -476,7 +475,7 @@ def first_recorded_driven_joint_positions(system: System, recording: Recording) 
 
 
 def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
-    """Scale joint stiffness and damping for the same tubes with more links."""
+    """Scale joint stiffness and damping to the same tubes with more links."""
     start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)

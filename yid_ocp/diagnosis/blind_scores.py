@@ -1,8 +1,7 @@
 """Score blind diagnoses against their labels, and calibrate thresholds from an ensemble.
 
-With n values of a statistic on cases of one kind, a further such case stays at or below the k-th smallest of them with
-probability k/(n + 1) at least (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715).
-"""
+Given n values of a statistic on cases of one kind, a further case lies at or below their k-th smallest with a
+probability of at least k/(n + 1) (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715)."""
 
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", _
 
 @dataclass(frozen=True)
 class BlindCaseScore:
-    """Score of one blind diagnosis against its label, with correct answers, gap closure, errors and time."""
+    """Score of one blind diagnosis against its label: correct answers, gap closure, errors and time."""
 
     case: str
     category: str
@@ -74,17 +73,17 @@ class BlindCaseScore:
 
     @property
     def _named_effect_labels(self) -> tuple[str, ...]:
-        """Labels of the effects that the diagnosis names: the confusable set, or the first effect added."""
+        """Labels of the effects named by the diagnosis: the confusable set, or the first effect added."""
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
     @property
     def _true_class_label(self) -> str:
-        """Name of the case's row in the confusion matrix: the kind of a single effect, else the category."""
+        """Row of the case in the confusion matrix: the kind of a single effect, else the category."""
         return self.truth.partition("@")[0] if self.category == "single" else self.category
 
     @property
     def _answered_class_label(self) -> str:
-        """Name of the answer's column in the confusion matrix: the kind of the first effect added, else the verdict."""
+        """Column of the answer in the confusion matrix: the kind of the first effect added, else the verdict."""
         return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
 
@@ -149,7 +148,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]]) -> bool:
-    """Whether every true effect has one of its own among those named: itself, or one in a small set with it."""
+    """Whether each true effect has its own named effect: itself, or one in a small confusable set with it."""
     if not true:
         return True
     small = [group for group in groups if len(group) <= _MAX_CONFUSABLE_SET]
@@ -168,10 +167,9 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 
 
 def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Rates over an ensemble, such as false alarms, detections and correct answers. None without cases.
+    """Rates over an ensemble, such as false alarms, detections and correct answers. A rate without cases is None.
 
-    Cases that are not judged count in no rate; `not_judged` says how many they are.
-    """
+    Cases that are not judged are excluded from all rates and counted as `not_judged`."""
 
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
@@ -228,7 +226,7 @@ def _rates(intervals: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Cases, those not judged, false alarms and right answers of one experiment."""
+    """Cases, cases not judged, false alarms and correct answers of one experiment."""
     every, own = own, [m for m in own if m.verdict != _NOT_JUDGED]
     return {
         "cases": len(every),
@@ -266,7 +264,7 @@ _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
 def permissive_thresholds(limits: Thresholds) -> Thresholds:
-    """Make thresholds that call any residual a gap and accept the best candidate, to calibrate against chance."""
+    """Thresholds that call any residual a gap and accept the best candidate, to calibrate the rates of chance."""
     sure = 1.0 + 1e-9
     return replace(
         limits,
@@ -282,14 +280,14 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
 
 
 def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
-    """chi2/n - 1 by which a residual counts as a gap, if it is significant at all."""
+    """chi2/n - 1 of the residual, if it is significant at all."""
     if said["chi2_per_dof"] is None:
         return math.inf  # it could not be followed at all
     return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.gap_significance_level else -math.inf
 
 
 def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
-    """That of the worst channel, if any candidate is significant."""
+    """chi2/n - 1 of the worst channel, if any candidate is significant."""
     is_sure = said["candidate"] < limits.gap_significance_level
     return (said["largest_channel"] or 1.0) - 1 if is_sure else -math.inf
 
@@ -299,14 +297,14 @@ def _of(name: str) -> _Statistic:
 
 
 def _rivals(said: _Statistics, limits: Thresholds, truth: str) -> Mapping[str, _Statistics]:
-    """Effects refitted alone that leave little but noise, if the true one does: likelihood tells only these apart."""
+    """Single-effect refits that leave only noise, if the true effect does; only then does likelihood separate them."""
     most, behind = 1 + limits.min_excess_chi2_per_dof, said["behind"].items()
     found = {label: own for label, own in behind if own["left"] is not None and own["left"] < most}
     return found if truth in found else {}
 
 
 def _odds(said: _Statistics, limits: Thresholds, truth: str) -> float:
-    """Log odds of the likeliest effect alone against the true one alone."""
+    """Log odds of the most likely single effect against the true effect alone."""
     known = {label: own["squares"] for label, own in _rivals(said, limits, truth).items()}
     return 0.5 * (known[truth] - min(known.values())) if known else -math.inf
 
@@ -366,9 +364,9 @@ def calibrate_thresholds(
 ) -> dict[str, Any]:
     """Compute thresholds as conformal quantiles, and their effect on the ensemble (`yid-calibration/1`).
 
-    Labels, marks and answers are of the same cases. An answer is a `result` with its `statistics`, and those with open
-    thresholds (`open`) where no gap was seen; `limits` are those by which it was given.
-    """
+    `labels`, `marks` and `answers` belong to the same cases. An answer holds the `result` with its `statistics`, and
+    `open`, the statistics with permissive thresholds if no gap was detected. The answers were obtained with
+    `limits`."""
     every = zip(labels, marks, answers, strict=True)
     known = ((label, mark, entry["result"].get("statistics"), entry.get("open") or {}) for label, mark, entry in every)
     cases = [(label.category, mark, said, wide) for label, mark, said, wide in known if said is not None]
@@ -406,7 +404,7 @@ def calibrate_thresholds(
 
 
 def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Return the recommended settings: quantiles rounded outwards to two digits, within each rule's limit."""
+    """Recommended settings: quantiles rounded outwards to two digits, within each rule's limit."""
     settings: dict[str, float] = {}
     for own in rules.values():
         most, value, limit = own["side"] == "most", own["quantile"], float(own["limit"])
@@ -418,7 +416,7 @@ def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, f
 
 
 def _rounded(value: float, up: bool) -> float:
-    """To two digits, up or down."""
+    """A number rounded up or down to two digits."""
     if value == 0:
         return 0.0
     digits = 1 - math.floor(math.log10(abs(value)))
@@ -434,7 +432,7 @@ _MIN_RECORDED_OVERLAP = 0.5  # part of a signature from which it is kept that tw
 
 
 def evidence_to_json(finding: DiagnosisResult) -> dict[str, Any]:
-    """Numbers on which a diagnosis' rules rest. `judge_recorded_case` judges the diagnosis again from them."""
+    """The numbers on which a diagnosis' rules are based; `judge_recorded_case` uses them to judge it again."""
     record, plain = finding.record, to_lossless_plain_data
     pairs = {
         name: [[[e.label for e in both], decrease] for both, _, decrease in own] for name, own in record.pairs.items()
@@ -473,7 +471,7 @@ def _screening_to_json(screened: ScreeningResult) -> dict[str, Any]:
 
 
 class _RecordedCase:
-    """What `evidence_to_json` wrote, as the objects that rules take."""
+    """The output of `evidence_to_json`, as the objects that the rules need."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         self._effects = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
@@ -523,12 +521,10 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
 
 
 def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Judge a recorded case again, from what `evidence_to_json` returned. The result is the part that is scored.
+    """Judge a recorded case again, from the output of `evidence_to_json`. Returns the part that is scored.
 
-    Thresholds are those of the diagnosis, as far as there still are such, with `changes`. The verdict is `not_judged`
-    where they ask for a refit that was not made. What steers the search before the first screening (events, the time
-    step, other starts) is as it was.
-    """
+    The thresholds are those of the diagnosis that still exist, with `changes`. The verdict is `not_judged` if they need
+    a refit that was not made. Steps before the first screening (events, time step, other starts) are not repeated."""
     known = {entry.name for entry in fields(Thresholds)}
     kept = {name: value for name, value in data["thresholds"].items() if name in known}
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))

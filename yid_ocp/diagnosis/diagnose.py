@@ -91,23 +91,23 @@ def diagnose(
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
-    """Diagnose the gap between model and recordings. The result says whether it exists, where, why, and what closes it.
+    """Diagnose the gap between model and recordings: whether it exists, where, its causes, and what closes it.
 
     Parameters
     ----------
     problem : EstimationProblem
-        Of the nominal model, with the stiffnesses free.
+        Problem of the nominal model, with free stiffnesses.
     candidates, exclude : "all" or sequence of str
-        Effects that are tried, and of these some that are not: `kind` or `kind@location`.
+        Effects to try, and exceptions from these, as `kind` or `kind@location`.
     held_out : sequence of Recording
-        Never touched by a fit; the problem's own where absent. Where there are none, alternate blocks are held out.
+        Recordings that no fit uses. Default: those of the problem. Without any, alternate blocks are held out.
     progress : Progress, optional
-        The package's log when absent.
+        Default: the package's log.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline, optional
-        Estimates of earlier runs of the same model (`read_estimates`): priors, so that the question is
-        what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is.
-        An `EarlierRunsBaseline` may have reference recordings too, made without what is
-        looked for; the effects found are taken out for them.
+        Estimates of earlier runs of the same model (`read_estimates`), used as priors, so that changes since then are
+        diagnosed. A problem that already has these priors (`with_baseline_prior`) is used as it is. An
+        `EarlierRunsBaseline` can also hold reference recordings made without the sought effects. The effects found
+        are then removed to predict them.
 
     Returns
     -------
@@ -117,8 +117,8 @@ def diagnose(
     Raises
     ------
     ConfigError, ModelError, DataError, SolverError
-        Candidates that do not fit the system; held-out recordings that are estimated on, no noise level; a nominal
-        model that cannot be rolled out, or is not whitened.
+        A candidate does not fit the system; a held-out recording is also estimated on; there is no noise level; the
+        nominal model cannot be rolled out, or its residual is not whitened.
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
@@ -151,7 +151,7 @@ class _Examined:
 
     @property
     def is_search_worthwhile(self) -> bool:
-        """Whether there is a gap, and enough samples to say what makes it."""
+        """Whether there is a gap, and enough samples to determine its cause."""
         limits = self.search.thresholds
         return self.evidence.has_gap(limits) and self.evidence.has_enough_samples(limits)
 
@@ -194,7 +194,7 @@ def _examined_about_fit(
     cuts: tuple[TruncatedHeldOutRecording, ...],
     clock: dict[str, float],
 ) -> _Examined:
-    """Events about a nominal fit taken out, then null tests and screening."""
+    """Remove events found with a nominal fit, then run null tests and screening."""
     search.progress.begin_stage("looking for events", 2.0, 8.5)
     whole = _undivided(search.problem, problem)
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
@@ -271,7 +271,7 @@ def _diagnosed(
 def _law(
     problem: EstimationProblem, seen: _Examined, verdict: str, final: RefittedModel, where: Sequence[GapLocation]
 ) -> GapLaw | None:
-    """The law of what a model leaves, where no effect explains it or the named ones leave something."""
+    """The law of the remaining gap, if no effect explains it or the accepted effects leave a gap."""
     if verdict != "unknown" and not (final.effects and where):
         return None
     places = [name for place in where for name in (place.location, *place.indistinguishable_from)]
@@ -282,13 +282,13 @@ def _law(
 
 @dataclass(frozen=True)
 class _FinerStepRefitStore:
-    """The refits of another store that were made at a finer time step [s] than stated, under names of their own."""
+    """Refits of another store made at a finer time step [s] than stated, under separate names."""
 
     store: RefitStore
     time_step: float
 
     def get(self, name: str) -> StoredFit | None:
-        """Return the refit stored under a name at this time step; None if there is none."""
+        """The refit stored under a name at this time step, or None."""
         return self.store.get(f"{name} at {self.time_step:g} s")
 
     def put(self, name: str, refitted: StoredFit) -> None:
@@ -299,11 +299,10 @@ class _FinerStepRefitStore:
 def _finer_step_that_explains_gap(
     search: RefitContext, fit: RefittedModel, events: EventSet, ranked: Sequence[CandidateScore]
 ) -> RefitContext | None:
-    """Return all hypotheses at half the time step if that explains more than half of what the best candidate promises.
+    """All hypotheses at half the time step, if it explains over half of the best candidate's predicted decrease.
 
-    The test is one prediction at the nominal `fit` and one Gauss-Newton step from there, on the recordings to
-    estimate on without their `events`; None where it explains less or cannot be predicted.
-    """
+    The test is one prediction at the nominal `fit` and one Gauss-Newton step, on the estimation recordings without
+    their `events`. None if it explains less or the prediction fails."""
     h = fit.problem.step.time_step / 2
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
     finer = search.problem.with_time_step(h)
@@ -320,7 +319,7 @@ def _finer_step_that_explains_gap(
 
 
 def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> EstimationProblem:
-    """The composed problem with all samples, although a diagnosis divides a single recording in blocks."""
+    """The composed problem with all samples, even if a diagnosis divides a single recording in blocks."""
     pairs = zip(composed.problem.episodes, problem.episodes, strict=True)
     episodes = [replace(episode, measurements=own.measurements) for episode, own in pairs]
     return composed.problem.with_episodes(episodes, () if composed.is_split_in_blocks else composed.problem.held_out)
@@ -329,10 +328,9 @@ def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> Es
 def _happened(
     whole: EstimationProblem, fit: RefittedModel, limits: Thresholds, weighted: EstimationProblem | None = None
 ) -> tuple[EventSet, SmoothedUnknownsResult | None]:
-    """Events about a fit in all that was recorded, none where that cannot be predicted, and what the smoother says.
+    """Events in all recordings, from the residual of a fit (none if the prediction fails), and the smoother's result.
 
-    `weighted` is the problem of all that was recorded with weights frozen at the fit, if there is one.
-    """
+    `weighted` is the problem with all samples and with filters fixed at the fit, if there is one."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
     if own.system.unprescribed_coordinate_indices:
@@ -355,7 +353,7 @@ def _happened(
 
 
 def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
-    """r'r of a fit beyond the number of samples that count, in all of a problem's recordings that can be predicted."""
+    """r'r of a fit minus the number of used samples, over all recordings that can be predicted."""
     x, guesses = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
     judged = problem_whitened_at(problem, x, guesses)
     evaluation = judged.evaluate(x, False, guesses)
@@ -372,7 +370,7 @@ def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
 def _without_events(
     search: RefitContext, nominal: RefittedModel, whole: EstimationProblem
 ) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
-    """All that follows without what events explain, the nominal model fitted to that, and what happened about it."""
+    """Remove what events explain, refit the nominal model, and examine it again."""
     first, own = search.problem, None if search.problem.is_split_in_blocks else nominal.problem
     events, smoothed = _happened(whole, nominal, search.thresholds, own)
     for round_ in range(_MAX_EVENT_ROUNDS):
@@ -400,7 +398,7 @@ def _tested(
     events: EventSet,
     smoothed: SmoothedUnknownsResult | None,
 ) -> _Examined:
-    """Null tests and screening at a nominal fit, at which the weights of all hypotheses are frozen."""
+    """Null tests and screening at a nominal fit, where the whitening of all hypotheses is fixed."""
     angles, limits = _largest_joint_angles(nominal), search.thresholds
     effects = tuple(effect.with_prior_ranges_scaled_to_angles(angles) for effect in search.problem.candidate_effects)
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
@@ -414,7 +412,7 @@ def _tested(
 def _followed(
     search: RefitContext, nominal: RefittedModel, before: tuple[TruncatedHeldOutRecording, ...] = ()
 ) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
-    """The nominal model beside held-out recordings as far as it can follow them, fitted again where they were cut."""
+    """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = before
     for margin in KEPT_HELD_OUT_DURATION_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
@@ -442,7 +440,7 @@ def _offsets_stated(problem: EstimationProblem) -> bool:
 
 
 def _better_nominal_fit(search: RefitContext, nominal: RefittedModel) -> RefittedModel | None:
-    """The nominal model refitted from a start that ends far likelier; None if no start does."""
+    """The nominal model refitted from another start with a much higher likelihood; None if there is none."""
     search.progress.begin_stage("fitting the nominal model from other starts", 6.0, 9.5)
     problem, limits = search.problem.problem, search.thresholds
 
@@ -460,7 +458,7 @@ def _better_nominal_fit(search: RefitContext, nominal: RefittedModel) -> Refitte
 
 
 def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> RefittedModel | None:
-    """The nominal model fitted from a start, under weights that were frozen near its end."""
+    """The nominal model fitted from a start, with whitening fixed near its end."""
     composed, limits = search.problem, search.thresholds
     if composed.problem.has_process_noise:
         composed = composed.whitened_at(start)
@@ -484,7 +482,7 @@ def _composed(
     held_out: Sequence[Recording],
     progress: Progress,
 ) -> AllCandidatesProblem:
-    """The problem with all candidates; see `diagnose` for what is refused."""
+    """The problem with all candidates; see `diagnose` for errors."""
     if problem.options.weighting != "whitened":
         what = "a diagnosis needs residuals in units of their noise"
         hint = "set problem.weighting: whitened and the noise levels under `sensors`"
@@ -499,7 +497,7 @@ def _composed(
 def _after(
     before: NullTestResult, last: RefittedModel, where: tuple[GapLocation, ...], judged: Judgement, limits: Thresholds
 ) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
-    """The held-out null test with the accepted effects, the places of the gap, and those of the residual gap."""
+    """Held-out null test with the accepted effects, locations of the gap, and locations of the residual gap."""
     remaining = _held_out_null_test(last, limits)
     left = residuals_exceed_noise((_estimation_null_test(last, limits), remaining), limits.null_test_limits)
     rest = gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.location_z) if left else ()
@@ -521,7 +519,7 @@ def fit_nominal_model(
     store: RefitStore | None = None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
-    """Fit the nominal model within the problem with all candidates. `SolverError` if it cannot be fitted."""
+    """Fit the nominal model within the problem with all candidates. Raises `SolverError` if the fit fails."""
     known = load_stored_refit(composed, (), store)
     if known is not None and composed.problem.has_process_noise:
         known = load_stored_refit(composed.whitened_at(known.values), (), store)

@@ -57,7 +57,7 @@ _UNKNOWN_REASON_TEXTS = {
 
 
 def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
-    """The experiment that separates indistinguishable effects, from what their equations depend on."""
+    """The experiment that separates confusable effects, from what their equations depend on."""
     said = dict.fromkeys(effect.required_excitation for effect in rivals if effect.required_excitation)
     known = [aspect for aspect in ORDERED_EXCITATION_DESCRIPTIONS if aspect in said]
     aspects = [*known, *(aspect for aspect in said if aspect not in known)]
@@ -98,7 +98,7 @@ def insufficient_data_message(verdict: str, seen: NominalEvidence, limits: Thres
 
 
 def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
-    """Say how far the nominal model follows a truncated held-out recording."""
+    """Sentence on how far the nominal model follows a truncated held-out recording."""
     if cut.kept_duration == 0:
         return f"The nominal model cannot follow {cut.recording}; this recording is ignored."
     part = f"{cut.kept_duration:.3g} of {cut.full_duration:.3g} s"
@@ -139,7 +139,7 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
 
 
 def _gap(finding: DiagnosisResult) -> str:
-    """Whether there is one."""
+    """Sentence on whether there is a gap."""
     held, first = finding.nominal_held_out_test, finding.nominal_test
     p, limits = min(first.p_value, held.p_value), finding.thresholds
     fitted, other = (f"{x:.3g}" if math.isfinite(x) else "not known" for x in (first.chi2_per_dof, held.chi2_per_dof))
@@ -161,7 +161,7 @@ def _p_value_relation(p_value: float) -> str:
 
 
 def _places(finding: DiagnosisResult) -> str:
-    """Where it lies, places that the data cannot tell apart together; empty where nothing says so."""
+    """Sentence on the gap's locations, with inseparable locations together; empty if unknown."""
     where = main_gap_locations(finding.gap_locations)
     shares = [(" or ".join([p.location, *p.indistinguishable_from]), round(100 * p.gap_share)) for p in where]
     named = " and ".join(f"{place} ({percent} %)" for place, percent in shares if percent)
@@ -175,7 +175,7 @@ def _places(finding: DiagnosisResult) -> str:
 
 
 def _nameless(finding: DiagnosisResult) -> str:
-    """Why no effect is named, with the numbers that say so."""
+    """Sentence on why no effect is named, with its numbers."""
     added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
     apart = [entry.both_estimates_text for entry in finding.failed_transfer_checks]
     count, closed = finding.assumption_count, finding.gap_closure
@@ -204,7 +204,7 @@ def _nameless(finding: DiagnosisResult) -> str:
 
 
 def _effects(finding: DiagnosisResult) -> list[str]:
-    """Sentences on the added effects, what they close, what they cannot be separated from, and what remains."""
+    """Sentences on the accepted effects, their closure, confusable effects, and the residual gap."""
     last, total, rest = finding.final_model, finding.gap_closure, finding.remaining_test
     names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.accepted_effects)
     verb = "closes" if len(finding.accepted_effects) == 1 else "together close"
@@ -251,7 +251,7 @@ def _figures(effect: EffectBase, fit: RefitStatistics) -> str:
 
 
 def _out_of_range(effect: EffectBase, fit: RefitStatistics) -> list[str]:
-    """Amplitudes beyond the range that an engineer would expect."""
+    """Sentence on amplitudes beyond their expected range."""
     found = []
     for name in effect.amplitude_names:
         (low, high), value = effect.prior_ranges[name], fit.values[name]
@@ -289,7 +289,7 @@ _COUNTERFACTUAL_TEXTS = (
 
 
 def _counterfactual(found: ErrorsWithEffectsRemovedAndAdded) -> list[str]:
-    """Whether taking the effects away predicts the world without them, and adding them the world with them."""
+    """Sentence on predictions with the effects removed from, and added to, the model."""
     text = []
     both = (found.effects_removed, found.effects_added)
     for part, (begin, made, rival) in zip(both, _COUNTERFACTUAL_TEXTS, strict=True):
@@ -306,7 +306,7 @@ def _counterfactual(found: ErrorsWithEffectsRemovedAndAdded) -> list[str]:
 
 
 def _event_sentences(events: EventSet) -> str:
-    """The sentences on all events: what, where, when; empty if there are none."""
+    """Sentences on all events: what, where, when; empty if there are none."""
     text, count = [], len(events.disturbances)
     if count:
         told = "; ".join(_said(event) for event in events.disturbances[:_MAX_EVENTS_LISTED])
@@ -317,7 +317,7 @@ def _event_sentences(events: EventSet) -> str:
 
 
 def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
-    """One sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
+    """One sentence per recording whose end is ignored because a joint exceeds `max_joint_speed`."""
     said, why = "s are ignored in", "moves too fast for the model."
     return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
 

@@ -50,9 +50,9 @@ class NominalParameterChange:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
-    """Result of a diagnosis: verdict, gap, locations, effects and the statistics on which they are based.
+    """Result of a diagnosis: verdict, gap, locations, effects and the statistics behind them.
 
-    `to_dict` returns it in the format of result.json, where every value has its unit beside it.
+    `to_dict` returns it in the format of result.json, with a unit for every value.
 
     Attributes
     ----------
@@ -61,18 +61,18 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     gap_closure : GapClosure
         Fraction of the held-out gap that the accepted effects close [1], with its 95 % interval.
     explained_fraction : float
-        What the effects explain over what unknown forces explain [1].
+        Decrease of r'r by the effects over the decrease by unknown forces [1].
     noise_floor : tuple of AssumedChannelNoiseLevel
-        Root mean square error by noise alone, in the channel's unit (m, rad or N m).
+        Root mean square error expected from noise alone, in the channel's unit (m, rad or N m).
     smoother_result : SmoothedUnknownsResult or None
-        Per recording means and standard deviations, shape (J, nd), of nd unknown forces [N m or N], offsets and biases
-        [m] in J intervals, in units of `reference_std` (nd,); None where there is no gap to locate.
+        Means and standard deviations (J, nd) per recording of nd unknown forces [N m or N], offsets and biases [m] in J
+        intervals, in units of `reference_std` (nd,). None if there is no gap to locate.
     nominal_model, final_model : RefittedModel
         `values` and `std` by parameter, each in its own unit (`problem.system.parameters[name].unit`).
     nominal_changes : tuple of NominalParameterChange
-        Nominal parameters before and after the effects were added, in `unit`.
+        Nominal parameters without and with the accepted effects, in `unit`.
     stage_seconds, search_seconds : mapping of str to float, float
-        [s]
+        Durations [s].
     """
 
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
@@ -114,7 +114,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
-        """Effects of an `effect` or `confusable` verdict in the order they were added. Other verdicts have none."""
+        """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
         return tuple(entry.effect for entry in self.accepted)
 
     @property
@@ -126,7 +126,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
 
     @property
     def model_error_by_unit(self) -> dict[str, tuple[str, float]]:
-        """Channel with the largest held-out error beyond noise in the final model, and its RMS, by unit."""
+        """By unit, the channel with the largest held-out error beyond noise in the final model, and that RMS."""
         noise = {own.channel: own.noise_rmse for own in self.noise_floor}
         found: dict[str, tuple[str, float]] = {}
         for channel, (error, unit) in self.final_model.held_out_loss.channel_rmse.items():
@@ -198,7 +198,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
 
 
 def judgement_to_dict(judged: Judgement, seen: NominalEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
-    """Convert the rule-based part of a diagnosis, which is scored, to a JSON-compatible dictionary."""
+    """Convert the rule-based, scored part of a diagnosis to a JSON-compatible dictionary."""
     closed = judged.gap_closure if judged.accepted else None
     rivals = [entry.equivalent_effects for entry in judged.accepted if len(entry.equivalent_effects) > 1]
     return {
@@ -212,17 +212,14 @@ def judgement_to_dict(judged: Judgement, seen: NominalEvidence, where: Sequence[
 
 
 def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
-    """Collect the statistics that are compared with `Thresholds` in a JSON-compatible dictionary.
+    """Statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. Steps not reached are None.
 
-    `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the worst
-    channel), `candidate` (p-value of the best, as the best of so many), `evidence` (rise of the log evidence by unknown
-    forces, offsets and biases; not where noise drives the motion), `closure` and `closure_low` (held out, of all that
-    was added, accepted or not), `explained` (over what the
-    smoother explains), `assumptions` (how many), `carried` (standard deviations between the values found and those on
-    the held-out recordings, at most), `behind` (of every effect refitted alone, the held-out chi2/n that it leaves and
-    how far it is behind the first: in held-out chi2/n with its standard error, and in r'r of all recordings). None
-    where a step was not come to.
-    """
+    `p_value`, `chi2_per_dof`: null test of both residuals together. `largest_channel`: chi2/n of the worst channel.
+    `candidate`: Bonferroni-corrected p-value of the best candidate. `evidence`: rise of the log evidence by unknown
+    forces, offsets and biases (None with process noise). `closure`, `closure_low`: held out, of all selected effects,
+    accepted or not. `explained`: over the smoother's decrease. `assumptions`: their number. `carried`: largest
+    difference between estimation and held-out estimates [stds]. `behind`, per single-effect refit: `left`, its held-out
+    chi2/n, and `squares`, its penalised r'r over all recordings relative to the first."""
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     added, seen, before = finding.selected_effects, finding.smoother_result, finding.nominal_model
     differences = (entry.estimate_difference_and_std for entry in finding.transfer_checks)
@@ -278,7 +275,7 @@ def _state(fit: RefitStatistics, test: NullTestResult) -> dict[str, Any]:
 
 
 def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
-    """Effects that imitate the gap and are not its cause, each with its closure and the reason of its rejection."""
+    """Effects that imitate the gap but were rejected, each with its closure and the reason."""
     failed, listed = finding.failed_transfer_checks, []
     for entry in finding.selected_effects if finding.unknown_reason == "stand_in" else ():
         own = [check for check in failed if check.effect_label == entry.effect.label] or failed
@@ -295,7 +292,7 @@ def _closure(closed: GapClosure | None) -> dict[str, Any]:
 
 
 def _ranked_candidates(judged: Judgement, seen: NominalEvidence) -> list[dict[str, Any]]:
-    """All candidates ranked: added effects, then other refits by held-out loss, then the rest by score."""
+    """All candidates: selected effects, then other refits by held-out loss, then the rest by score."""
     ranked, first = seen.screening.candidate_scores, judged.single_effect_models
     scores = {score.effect.label: score for score in ranked}
     alone = {fit.effects[0].label: fit for fit in first}

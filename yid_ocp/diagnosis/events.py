@@ -1,11 +1,10 @@
-"""Find events such as pushes, snags and wrong samples, each in its place and time window.
+"""Find events such as pushes, snags and wrong samples, each with location and time window.
 
-Along prescribed joints whose efforts are compared the unknown force is measured minus needed torque, sample by sample;
-elsewhere it is what the smoother's linear model says of the force at one coordinate, everything else as the smoother
-has it. In both cases `detect_force_pulses` looks for what rises and falls beside a rest that follows the load. What a
-sensor says for one to three samples alone is an event of that sensor. What events explain is taken out before anything
-else is judged: torques act beside the recorded ones, and samples in an event's window do not count.
-"""
+At prescribed joints with compared efforts, the unknown force is measured minus required torque, sample by sample.
+Elsewhere it is the smoother's linear model of the force at one coordinate, with all other unknowns at their estimates.
+`detect_force_pulses` searches both for pulses on a background that depends on load. One to three outlying samples of a
+sensor are an event of that sensor. Events are removed before anything else is judged: their torques are added to the
+recorded ones, and samples in their windows are excluded."""
 
 from __future__ import annotations
 
@@ -62,7 +61,7 @@ _WRONG_SAMPLE_Z = 8.0  # standard deviations of noise, and robust ones of its ne
 
 @dataclass(frozen=True)
 class ForceOrFaultEvent:
-    """A brief local disturbance, either an external force on one coordinate or wrong samples of one channel."""
+    """A brief local disturbance: an external force on one coordinate, or wrong samples of one channel."""
 
     recording: str
     location: str
@@ -79,11 +78,11 @@ class ForceOrFaultEvent:
     detected_pulse: DetectedForcePulse | None = None  # shape of a force
 
     def _overlap(self, other: ForceOrFaultEvent) -> float:
-        """Time for which both last, of whatever recording [s]; negative where one begins after the other."""
+        """Time for which both events last, in any recordings [s]; negative if they do not overlap."""
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the event to a dictionary, an entry of `events` in result.json."""
+        """Convert the event to an entry of `events` in result.json."""
         names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
         return object_attributes_to_json_dict(self, f"{names} std=impulse_std")
 
@@ -99,7 +98,7 @@ class _Overspeed:
 
 @dataclass(frozen=True)
 class EventSet:
-    """Events of a diagnosis by recording and time, with overspeeds and force estimates at the events."""
+    """Events of a diagnosis by recording and time, with overspeeds and the force estimates at the events."""
 
     disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
@@ -109,13 +108,13 @@ class EventSet:
         return bool(self.disturbances or self.overspeeds)
 
     def has_same_disturbances(self, other: EventSet) -> bool:
-        """Whether both sets have equally many events, in the same channels at overlapping times."""
+        """Whether both sets have the same number of events, in the same channels at overlapping times."""
         pairs = list(zip(self.disturbances, other.disturbances, strict=False))
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
     def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
-        """Split into force events alone, and all other events with the overspeeds."""
+        """Split into force events, and all other events with the overspeeds."""
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 
@@ -124,7 +123,7 @@ class EventSet:
         return tuple(event for event in self.disturbances if event.recording == recording)
 
     def _end_of(self, recording: str) -> float:
-        """Time after which a recording is ignored [s]; infinite if it is used to its end."""
+        """Time after which a recording is ignored [s]; infinite if all of it is used."""
         return min((fall.start_time for fall in self.overspeeds if fall.recording == recording), default=math.inf)
 
 
@@ -140,9 +139,9 @@ def find_force_and_fault_events(
 ) -> EventSet:
     """Find significant events in all recordings of a problem, at a false-discovery rate over all time windows.
 
-    The problem is whitened by the sensors' noise and has all samples; `x` (nx,) is its fit, at which `evaluation` has a
-    Jacobian where there is `smoothed`. Forces that move the model are sought where the smoother found some.
-    """
+    `problem` is whitened by sensor noise and has all samples. `x` (nx,) is its fit, and `evaluation` its evaluation,
+    with a Jacobian if `smoothed` is given. Forces that move the model are only searched where the smoother found
+    unknown forces."""
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
     told = [(e, result, problem.theta_and_initial_state_deviation(x, i)[0]) for i, (e, result) in enumerate(fitted)]
     shared = problem.theta_and_initial_state_deviation(x, 0)[0]
@@ -174,7 +173,7 @@ def find_force_and_fault_events(
 
 
 def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thresholds) -> Iterator[_Overspeed]:
-    """When a joint of the robot first moves too fast."""
+    """First time at which a joint of the robot exceeds the speed limit."""
     episode, result, _ = run
     names, h = problem.system.mechanism.joint_names, episode.grid.time_step
     places = [names.index(name) for name in arm_joint_names(problem.system)]
@@ -186,7 +185,7 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
 
 
 def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
-    """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
+    """A history up to the recording's overspeed, without the ends distorted by a filter; None if too short."""
     until = ends._end_of(history.recording) - twice_applied_effort_filter(history.filter_cutoff).settling_time
     keep = np.flatnonzero(history.t <= until)
     return None if len(keep) < 10 else history.subset_at_indices(keep)
@@ -195,7 +194,7 @@ def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate |
 def _allowed(
     torques: InverseDynamicsModel, run: _RecordingRollout, nodes: IntArray, limits: Thresholds
 ) -> tuple[Array, Array]:
-    """What the model of every coordinate's torque may be wrong by, and what friction may hold, shape (M, n)."""
+    """Assumed model error of every coordinate's torque, and the torque that friction can hold, (M, n)."""
     episode, result, theta = run
     terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
     joints = episode.recording.joints
@@ -208,7 +207,7 @@ def _allowed(
 def _read_forces(
     problem: EstimationProblem, run: _RecordingRollout, torques: InverseDynamicsModel, limits: Thresholds
 ) -> Iterator[ForceEstimate]:
-    """Histories of prescribed joints whose efforts are compared: needed less measured torque."""
+    """Force estimates of prescribed joints with compared efforts, from required and measured torque."""
     episode, result, _ = run
     unbiased = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
     for samples, predicted in zip(unbiased, result.predicted_outputs, strict=True):
@@ -233,7 +232,7 @@ def _read_forces(
 
 
 def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
-    """A long history in parts that overlap by twice the longest pulse: the work grows with the cube of their points."""
+    """Overlapping parts (twice the longest pulse) of a long history; cost grows with the cube of their points."""
     overlap = math.ceil(2 * limits.max_event_duration / whole.time_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
     for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
@@ -249,7 +248,7 @@ def _driving_forces(
     torques: InverseDynamicsModel,
     limits: Thresholds,
 ) -> list[ForceEstimate]:
-    """Histories of coordinates that move under unknown forces, where the smoother found some for part of the time."""
+    """Force estimates of coordinates moved by unknown forces, if the smoother found some for a part of the time."""
     sought = {trace.recording: _short(smoothed, i, limits) for i, trace in enumerate(smoothed.smoothed_unknowns)}
     found: list[ForceEstimate] = []
     if not any(sought.values()):
@@ -275,7 +274,7 @@ def _driving_forces(
 
 
 def _short(smoothed: SmoothedUnknownsResult, recording: int, limits: Thresholds) -> list[str]:
-    """Unknown forces that are significant, but for a small part of the time only."""
+    """Unknown forces that are significant, but only for a small part of the time."""
     trace, names = smoothed.smoothed_unknowns[recording], []
     for i, source in enumerate(trace.unknown_groups):
         sure = smoothed_unknown_significance_mask(trace, [i], limits.location_z)
@@ -288,7 +287,7 @@ def _short(smoothed: SmoothedUnknownsResult, recording: int, limits: Thresholds)
 def _one_each(
     found: Sequence[tuple[ForceEstimate, DetectedForcePulse]], problem: EstimationProblem
 ) -> list[ForceOrFaultEvent]:
-    """Events of forces; where one push moves the model, it is named at the coordinate that explains most of it."""
+    """Force events; a push that moves the model is assigned to the coordinate that explains most of it."""
     prescribed = set(problem.system.prescribed)
     kept: list[ForceOrFaultEvent] = []
     for history, pulse in sorted(found, key=lambda entry: entry[1].p_value):
@@ -302,7 +301,7 @@ def _one_each(
 
 
 def _recurs(one: ForceOrFaultEvent, other: ForceOrFaultEvent) -> bool:
-    """Whether the same force is there at the same time of another recording."""
+    """Whether the same force occurs at the same time of another recording."""
     if one.recording == other.recording or one.channel != other.channel or one.peak_value * other.peak_value < 0:
         return False
     longer = max(one.end_time - one.start_time, other.end_time - other.start_time)
@@ -313,7 +312,7 @@ def _recurs(one: ForceOrFaultEvent, other: ForceOrFaultEvent) -> bool:
 
 
 def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterator[ForceOrFaultEvent]:
-    """Samples that their neighbours contradict: of sensors beside their prediction, of joints as they were recorded."""
+    """Samples that contradict their neighbours: sensors relative to their prediction, joints as recorded."""
     episode, result, _ = run
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         sensor = samples.sensor
@@ -341,7 +340,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
 
 
 def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:
-    """Noise of what one joint's raw channel says, where the model is moved by it or, smoothed, compared with it."""
+    """Noise of one joint's raw channel, if it drives the model or is compared with it after smoothing."""
     joints, options, system = episode.recording.joints, problem.options, problem.system
     assert joints is not None
     by_torque = joint in system.driven and joint not in system.servos
@@ -363,7 +362,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
 def _alone(
     t: Array, values: Array, noise: Array, recording: str, about: tuple[str, str, str]
 ) -> Iterator[ForceOrFaultEvent]:
-    """Runs of at most `_MAX_WRONG_SAMPLES` samples far from where what is around them leads, as none of these is."""
+    """Runs of at most `_MAX_WRONG_SAMPLES` samples that deviate far more from their surroundings than all others."""
     count, many = len(values), _NEIGHBOUR_COUNT
     if count < 2 * many:
         return
@@ -392,7 +391,7 @@ def _alone(
 
 
 def _beside_neighbours(t: Array, values: Array) -> Array:
-    """Value less the cubic through four samples about it, the smallest of three such differences, shape (M,)."""
+    """Value minus a cubic through four nearby samples, the smallest of three such differences, (M,)."""
     found = np.zeros((len(_STENCIL_STEPS), len(values)))
     for one, step in zip(found, _STENCIL_STEPS, strict=True):
         middle = np.arange(2 * step, len(values) - 2 * step)
@@ -411,12 +410,11 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 
 
 def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
-    """Compensate force events in a problem and exclude affected samples.
+    """Problem with compensated force events and without affected samples.
 
-    Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
-    of an event there, wrong samples, and all that follows an overspeed do not count. Forces on an object and at servos
-    stay in.
-    """
+    Forces at joints driven by recorded torques are added to these torques. Excluded are effort samples of prescribed
+    joints in an event's window, wrong samples, and everything after an overspeed. Forces on an object and at servos are
+    not compensated."""
     system, cutoff = problem.system, problem.options.path_cutoff
 
     def cleaned(episode: Episode) -> Episode:
@@ -437,7 +435,7 @@ def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -
 def _counting(
     episode: Episode, samples: SensorMeasurements, own: Sequence[ForceOrFaultEvent], end: float, cutoff: float
 ) -> SensorMeasurements:
-    """Samples without those that an event spoils."""
+    """Samples without those affected by an event."""
     hidden, is_effort = np.zeros(samples.value.shape, bool), bool(samples.sensor.effort_joints)
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)

@@ -40,10 +40,9 @@ def make_candidate_effects(
 ) -> list[EffectBase]:
     """Make the candidate effects for a system, without effects that its nominal model already has.
 
-    The choice is "all", or names of the form `kind` (wherever a diagnosis tries it) or `kind@location`. `ConfigError`:
-    no such kind, one that has no place here, an effect of the nominal model, an empty list; `ModelError`: no such
-    location.
-    """
+    `choice` is "all", or lists `kind` (at all locations that a diagnosis tries) or `kind@location`. Raises
+    `ConfigError` if a kind does not exist, has no location here or is part of the nominal model, or if the list is
+    empty; `ModelError` if a location does not exist."""
     where, sensors = "diagnosis.candidates", recorded_signal_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
@@ -72,11 +71,10 @@ def make_candidate_effects(
 
 
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Exclude the candidates named as `kind` or `kind@location`.
+    """Candidates without those named as `kind` or `kind@location`.
 
-    They stay in the compiled step at their neutral values, so that no recompilation is needed. `ConfigError` where a
-    name is no candidate, or none is left.
-    """
+    Excluded candidates stay in the compiled step at their neutral values, so nothing is recompiled. Raises
+    `ConfigError` if a name is not a candidate, or if none is left."""
     where = "diagnosis.exclude"
     known = {name for effect in effects for name in (effect.kind, effect.label)}
     for name in names:
@@ -95,13 +93,13 @@ def neutral_effect_parameter_values(effects: Sequence[EffectBase]) -> dict[str, 
 
 
 def join_effect_labels(effects: Sequence[EffectBase]) -> str:
-    """Join the effects' labels `kind@location` with "and". No effects give "the nominal model"."""
+    """Effect labels `kind@location` joined with "and"; "the nominal model" without effects."""
     return " and ".join(effect.label for effect in effects) or "the nominal model"
 
 
 @dataclass(frozen=True)
 class TruncatedHeldOutRecording:
-    """Name and durations of a held-out recording, truncated where the nominal model stops following it."""
+    """A held-out recording truncated where the nominal model stops following it: name and durations."""
 
     recording: str
     kept_duration: float  # how much of it is compared [s]; 0 where nothing is
@@ -112,8 +110,8 @@ class TruncatedHeldOutRecording:
 class AllCandidatesProblem:
     """Estimation problem of a system with all candidate effects. Any can be freed without recompiling.
 
-    Sensors, statics and corrections are differentiated by everything once, recordings are placed on the nodes once, and
-    the tracking filter is that of the nominal start, the same for every hypothesis."""
+    Sensors, statics and corrections are compiled once with all derivatives, and recordings are placed on the nodes
+    once. The tracking filter is computed at the nominal initial values, the same for every hypothesis."""
 
     # of the system with all candidates at their neutral values; frees the nominal parameters
     problem: EstimationProblem
@@ -124,7 +122,7 @@ class AllCandidatesProblem:
     def from_problem(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> AllCandidatesProblem:
-        """Add candidate effects to a problem. `DataError` if a recording is both estimated on and held out."""
+        """Problem with added candidate effects. `DataError` if a recording is both estimated on and held out."""
         effects = tuple(effects)
         joint = compile_step_like(problem.step, problem.step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
@@ -145,7 +143,7 @@ class AllCandidatesProblem:
         return self.problem.free
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
-        """Whiten residuals by sensor and torque noise. The filters are linearised at `values`."""
+        """Problem whitened by sensor and torque noise, with filters linearised at `values`."""
         # what is frozen is about the torques that are estimated there, for which they must be known beforehand
         x, errors = self.problem.vector(values), (episode.input_errors for episode in self.problem.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
@@ -153,7 +151,7 @@ class AllCandidatesProblem:
         return replace(self, problem=problem_with_whitened_held_out(made, x))
 
     def about_input_errors(self, solved: EstimationProblem) -> AllCandidatesProblem:
-        """The problem about the input errors that were estimated with a solved problem of the same recordings."""
+        """Problem linearised about the input errors that a solved problem of the same recordings estimated."""
         pairs = list(zip(self.problem.episodes, solved.episodes, strict=True))
         if any(own.grid.steps != other.grid.steps for own, other in pairs):
             return self
@@ -161,7 +159,7 @@ class AllCandidatesProblem:
         return replace(self, problem=self.problem.with_episodes(episodes, self.problem.held_out))
 
     def with_time_step(self, time_step: float) -> AllCandidatesProblem:
-        """Use another time step [s] for the whole recordings, whitened by sensor noise alone."""
+        """Problem with another time step [s] and the whole recordings, whitened by sensor noise alone."""
         made = self.problem.with_time_step(time_step)
         if self.is_split_in_blocks:
             return replace(self, problem=_in_blocks(made))
@@ -171,11 +169,10 @@ class AllCandidatesProblem:
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], margin: float
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
-        """Truncate held-out recordings where the rollout fails. Also return the truncated recordings.
+        """Truncate held-out recordings where the rollout fails. Also returns the truncated recordings.
 
-        `margin` is the part that is kept of what the nominal model follows. Where nothing worth predicting is left,
-        recordings to estimate on are split in blocks. Weights are those of the sensors' noise; see `whitened_at`.
-        """
+        `margin` is the fraction kept of the duration that the nominal model follows. If nothing useful is left,
+        estimation recordings are split in blocks. Residuals are whitened by sensor noise; see `whitened_at`."""
         problem, x = self.problem, self.problem.vector(values)
         kept, cuts = [], []
         for episode in problem.held_out:
@@ -194,24 +191,23 @@ class AllCandidatesProblem:
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
     def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
-        """Make the estimation problem with the nominal parameters and those of `effects` free."""
+        """Estimation problem with the nominal parameters and those of `effects` free."""
         own = (name for effect in effects for name in effect.parameters.names)
         return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameters, *own))
 
     def with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Free `effects`, and relinearise filters about the torque offsets at the values `at`.
+        """Estimation problem with `effects` free and filters relinearised about the torque offsets at the values `at`.
 
-        Filters of held-out recordings are left as they are: see `with_relinearized_held_out_filters`.
-        """
+        Filters of held-out recordings are unchanged: see `with_relinearized_held_out_filters`."""
         own = self.with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
     def with_relinearized_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Relinearise held-out filters at the fitted values. `own` is from `with_effects_and_relinearized_filters`."""
+        """Relinearise held-out filters at the fitted values. `own`: from `with_effects_and_relinearized_filters`."""
         return (
             problem_with_relinearized_held_out_whitening(own, *_beside(own, effects, at))
             if own.has_process_noise
@@ -220,7 +216,7 @@ class AllCandidatesProblem:
 
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
-    """Unknowns at some values, and with neutral effects, where filters are about the right torques."""
+    """Unknowns at some values, and with neutral effects, for the linearisation of filters."""
     return own.vector(at), own.vector({**at, **neutral_effect_parameter_values(effects)})
 
 
@@ -231,13 +227,13 @@ def _same(a: Recording, b: Recording) -> bool:
 
 
 def _in_blocks(problem: EstimationProblem) -> EstimationProblem:
-    """The problem with every other block of its recordings held out."""
+    """The problem with alternate blocks of its recordings held out."""
     others = [replace(_masked(e, 1), initial_state_shared_with=i) for i, e in enumerate(problem.episodes)]
     return problem.with_episodes([_masked(episode, 0) for episode in problem.episodes], others)
 
 
 def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> int:
-    """Steps of a held-out recording that can be rolled out at some unknowns, to a sixty-fourth of its length."""
+    """Number of steps of a held-out recording that can be rolled out, to within 1/64 of its length."""
 
     def runs(steps: int) -> bool:
         [(_, result)] = problem.with_episodes(problem.episodes, [truncate_episode(episode, steps)]).predict_held_out(x)
@@ -253,7 +249,7 @@ def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> i
 
 
 def _masked(episode: Episode, parity: int) -> Episode:
-    """The episode with the measurements of every other block only; it is rolled out from its start all the same."""
+    """The episode with the measurements of alternate blocks only; its rollout is complete."""
     samples = []
     for entry in episode.measurements:
         t = (entry.node + entry.fraction) * episode.grid.time_step
@@ -263,5 +259,5 @@ def _masked(episode: Episode, parity: int) -> Episode:
 
 
 def mask_out_samples(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
-    """Exclude masked samples from measurements. The mask `hidden` is (M, k)."""
+    """Measurements without the samples in the mask `hidden` (M, k)."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

@@ -1,8 +1,7 @@
-"""Estimate a law for a gap that no named effect explains. It is a torque as a smooth function of known quantities.
+"""Estimate a law for a gap that no named effect explains: a torque as a smooth function of known quantities.
 
-Functions compete with each other, and with a torque over time, by the evidence of a linearised fit; the best few are
-refitted with the nominal parameters and judged on held-out recordings like any effect.
-"""
+Functions compete with each other, and with a function of time, by the evidence of a linearised fit. The best few are
+refitted with the nominal parameters and judged on held-out recordings like any effect."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ _MIN_LEFTOVER_CLOSURE = 0.2  # part of the residual gap that a law beside effect
 
 @dataclass(frozen=True)
 class GapLaw:
-    """A law for a gap that nothing in the library explains, with its held-out closure."""
+    """A law for a gap that no effect of the library explains, with its held-out closure."""
 
     location: str
     tables: tuple[LawTable, ...]  # one for every quantity that it depends on
@@ -65,7 +64,7 @@ class GapLaw:
 
     @property
     def sentence(self) -> str:
-        """Describe the law in a sentence, with place, quantity, size and closed part of the gap."""
+        """Sentence on the law: location, quantity, size and closed fraction of the gap."""
         if self.depends_on == "time":
             head = f"{self.location} carries a torque that depends on nothing the model knows better than on time"
         else:
@@ -84,7 +83,7 @@ class GapLaw:
         return f"{head} ({', '.join(sizes)}); {closed}. It is not in the library."
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the law to a dictionary. Keys: location, depends_on, table, closure, visited_range, runner_up."""
+        """Convert the law to a dictionary: location, depends_on, table, closure, visited_range, runner_up."""
         rows = [
             {"quantity": t.quantity, "unit": LAW_QUANTITY_UNITS[t.quantity], "at": x, "torque": f, "std": s}
             for t in self.tables
@@ -107,7 +106,7 @@ class GapLaw:
 
 @dataclass(frozen=True)
 class _Family:
-    """A law as a function of some quantities at one place: what a linearised fit says of it."""
+    """A law as a function of some quantities at one location, with the results of a linearised fit."""
 
     law: Law  # restricted to the quantities
     log_evidence: float
@@ -122,16 +121,16 @@ def find_gap_law(
     places: Sequence[str],
     events: EventSet,
 ) -> GapLaw | None:
-    """Estimate the law of the gap that a model leaves. None where no place is possible or nothing closes any of it.
+    """Estimate the law of the gap that a model leaves. None if no location is possible or no law closes enough.
 
     Parameters
     ----------
     problem : EstimationProblem
-        Of the nominal model, without candidates.
+        Problem of the nominal model, without candidates.
     last : RefittedModel
-        The model with the effects that are named, or the nominal one.
+        The model with the accepted effects, or the nominal model.
     places : sequence of str
-        Locations of the gap, the likeliest first.
+        Locations of the gap, the most likely first.
     """
     places = [p for p in dict.fromkeys(places) if allowed_law_quantity_names(problem.system, p)][:_MAX_PLACES]
     if not places or search.note_skip_past_deadline("a law"):
@@ -185,7 +184,7 @@ def _refitted_families(
     events: EventSet,
     only: Sequence[str] = (),
 ) -> tuple[RefittedModel | None, list[_RefittedLaw]]:
-    """The model without a law, refitted beside the laws in one step, and the refits of the likeliest families."""
+    """The model without a law, refitted together with the laws in one step, and refits of the best families."""
     composed = _composed_with_laws(search, problem, last, laws, events)
     before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
     if before is None:
@@ -201,10 +200,9 @@ def _refitted_families(
 
 
 def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw], slack: float) -> bool:
-    """Whether a refit is as good as the best, the first, and has no more quantities than any other such refit.
+    """Whether a refit is as good as the best (the first), and no other such refit has fewer quantities.
 
-    It is where its held-out chi2/n is not significantly higher, or by no more than `slack`.
-    """
+    It is as good if its held-out chi2/n is not significantly higher, or higher by at most `slack`."""
 
     def is_as_good(own: _RefittedLaw) -> bool:
         gained, error = held_out_improvement(own.loss, found[0].loss)
@@ -215,19 +213,19 @@ def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw],
 
 
 def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
-    """Whether a fitted law's knots reach far beyond what its model visits."""
+    """Whether a fitted law's knots reach far beyond the values that its model visits."""
     low, high = _visited_range(found.fit, found.law.location, quantity)
     return high - low < _MIN_VISITED_PART * float(np.ptp((found.law.knots or {})[quantity]))
 
 
 def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, least: float) -> bool:
-    """Whether a law closes at least a part of the gap (lower 95 % bound)."""
+    """Whether a law closes at least a required fraction of the gap (lower 95 % bound)."""
     gained, error = held_out_improvement(before, after)
     return gained > error and closure.ci_low > least
 
 
 def _neutral_law(model: RefittedModel, place: str, quantities: Sequence[str], system: System | None = None) -> Law:
-    """A neutral law at a place as a sum over quantities, with knots over what a model visits there."""
+    """A neutral law at a location, a sum over quantities, with knots over the visited range."""
     tables, zeros = [], np.zeros(_N_KNOTS)
     for quantity in quantities:
         low, high = _visited_range(model, place, quantity)
@@ -246,7 +244,7 @@ def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:
 
 
 def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
-    """Values of a quantity in all recordings to estimate on, shape (samples,)."""
+    """Values of a quantity in all estimation recordings, (samples,)."""
     problem, x, found = model.problem, model.problem.vector(model.values), []
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
         theta = problem.predictor.theta_with_episode_values(episode, problem.theta_and_initial_state_deviation(x, i)[0])
@@ -262,7 +260,7 @@ def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[flo
 
 
 def _torque_scale(model: RefittedModel, place: str) -> float:
-    """Standard deviation of the torque at a place [N m], of springs or through a joint; 1 where it is zero."""
+    """Standard deviation of the torque at a location [N m], of springs or through a joint; 1 if it is zero."""
     size = float(np.std(_visited(model, place, "load")))
     return size if size > 0 else 1.0
 
@@ -270,7 +268,7 @@ def _torque_scale(model: RefittedModel, place: str) -> float:
 def _composed_with_laws(
     search: RefitContext, problem: EstimationProblem, last: RefittedModel, laws: Sequence[Law], events: EventSet
 ) -> AllCandidatesProblem:
-    """The problem with the named effects and the laws in one step, corrected and cut as that of the diagnosis was."""
+    """The problem with accepted effects and laws in one step, with the diagnosis' corrections and truncations."""
     held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
@@ -280,7 +278,7 @@ def _composed_with_laws(
 
 
 def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[Law]) -> list[_Family]:
-    """The families that are refitted, by the evidence of a fit linearised about the model without a law."""
+    """The families to refit, by the evidence of a fit linearised about the model without a law."""
     own = composed.with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
     evaluation = own.evaluate(own.vector(before.values), equilibrium_guesses=before.evaluation.equilibrium_guesses)
     if not evaluation.ok or evaluation.jacobian is None:
@@ -307,10 +305,9 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
 
 
 def _family(law: Law, residual: Array, slopes: Array) -> _Family:
-    """Evidence, values and prior of one law: the weight of its curvature that the evidence prefers.
+    """Evidence, values and prior of one law, at the curvature weight with the largest evidence.
 
-    Noise has the size that fits best, as where the model errs more than the sensors, and the prior grows with it.
-    """
+    The noise level is fitted, as model error may exceed sensor noise, and the prior scales with it."""
     n, gram, pull = len(residual), slopes.T @ slopes, slopes.T @ residual
     total = float(residual @ residual)
     best: tuple[float, Array, Array] | None = None
@@ -329,7 +326,7 @@ def _family(law: Law, residual: Array, slopes: Array) -> _Family:
 
 
 def _prior_precision(law: Law, roughness_weight: float) -> Array:
-    """Inverse covariance of the values at a law's knots: of their second differences, and of each alone."""
+    """Inverse prior covariance of the values at a law's knots, from their second differences and their size."""
     blocks = []
     for quantity in law.quantities:
         count = len(law.parameter_names_of(quantity))
@@ -346,7 +343,7 @@ def _prior_precision(law: Law, roughness_weight: float) -> Array:
 def _refitted(
     composed: AllCandidatesProblem, before: RefittedModel, family: _Family, search: RefitContext
 ) -> RefittedModel | None:
-    """The model with a law, its values at the knots under their prior."""
+    """The model with a law, whose values at the knots have a prior."""
     known = composed.problem.options.multivariate_prior
     names = (*known.parameter_names, *family.law.parameters.names)
     covariance = scipy.linalg.block_diag(known.covariance, np.linalg.inv(family.precision))

@@ -1,14 +1,14 @@
 """Detect short pulses of one sign in the history of an unknown force on a slow or load-dependent background.
 
-The data say log p(data | f) = g'f - f'L f / 2 of the force's values f. It is a sum of pulses and a Gaussian rest:
+The likelihood of the force's values f is log p(data | f) = g'f - f'L f / 2. f is a sum of pulses and a Gaussian
+background with the covariance
 
     cov f(s), f(t) = e(s) e(t) (delta(s, t) + exp(-|s - t|/a))/2 + s^2 exp(-|s - t|/b),   e^2 = (c m)^2 + w^2 + h^2/3,
 
-m the error that a model of these torques is allowed anyway, h what friction may hold. c >= 1, w and s are those of the
-largest evidence, with a pulse as without it, so that a dominant model error makes no events. Pulses are added one after
-the other, that which raises the evidence most first: the search for shocks by auxiliary residuals (de Jong
-and Penzer 1998, doi:10.1080/01621459.1998.10473717) with pulses in place of impulses.
-"""
+where m is the assumed model error for these torques and h the torque that friction can hold. c >= 1, w and s maximise
+the evidence, with and without a pulse, so that a dominant model error causes no events. Pulses are added one by one,
+largest rise of the evidence first. This is the search for shocks by auxiliary residuals (de Jong and Penzer 1998,
+doi:10.1080/01621459.1998.10473717), with pulses in place of impulses."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m
 
 @dataclass(frozen=True)
 class _TorqueTermSizes:
-    """Magnitude of the inverse dynamics terms of every coordinate at some nodes of a rollout, shape (M, n) each."""
+    """Magnitudes (M, n) of each inverse dynamics term of every coordinate at some nodes of a rollout."""
 
     # root of the sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal forces,
     # gravity, springs, friction, effects' forces and the torque that was applied or needed [N m or N]
@@ -47,7 +47,7 @@ class _TorqueTermSizes:
 
 
 class InverseDynamicsModel:
-    """Inverse dynamics of a step's system, built once for all recordings: M(q) a + c(q, v) + g(q) = tau."""
+    """Inverse dynamics of a step's system, M(q) a + c(q, v) + g(q) = tau, compiled once for all recordings."""
 
     def __init__(self, step: Step) -> None:
         self._step = step
@@ -57,7 +57,7 @@ class InverseDynamicsModel:
         return _function(self._step.system, self._step.time_step)
 
     def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
-        """Magnitudes of the inverse dynamics' terms at increasing nodes (M,). Accelerations are differences."""
+        """Magnitudes of the inverse dynamics terms at increasing nodes (M,); accelerations are differences."""
         system, time_step = self._step.system, self._step.time_step
         n = system.n_coordinates
         q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
@@ -76,7 +76,7 @@ class InverseDynamicsModel:
 
 
 def _function(system: System, time_step: float) -> ca.Function:
-    """(q, v, a, z, theta) to the sum of squares of all terms, the torque needed, and what friction may hold."""
+    """Function of (q, v, a, z, theta): sum of squares of all terms, required torque, torque that friction can hold."""
     n, names = system.n_coordinates, tuple(system.effect_internal_coordinate_symbols)
     q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
     kinematics = forward_kinematics(system.mechanism, q)
@@ -125,7 +125,7 @@ _MAX_PULSE_RANGE_RATIO = 1.5  # times the range of the history about it that one
 
 @dataclass(frozen=True)
 class ForceEstimate:
-    """Estimate of an unknown force f over time at one place, by its log likelihood g'f - f'L f / 2."""
+    """Estimate of an unknown force f over time at one location, by its log likelihood g'f - f'L f / 2."""
 
     recording: str
     location: str
@@ -145,19 +145,19 @@ class ForceEstimate:
         return float(np.median(np.diff(self.t)))
 
     def subset_at_indices(self, keep: IntArray) -> ForceEstimate:
-        """Restrict the estimate to the time points with the indices `keep`."""
+        """Estimate restricted to the time points with the indices `keep`."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
         return replace(self, information=information, **parts)
 
     @property
     def allowed_model_error(self) -> Array:
-        """Allowed force error of the model at every time point in `unit`, shape (M,)."""
+        """Assumed model error (M,) of the force at every time point, in `unit`."""
         return np.hypot(self.model_error_std, self.friction_limit)
 
     @property
     def max_likelihood_forces(self) -> Array:
-        """Maximum-likelihood force at every time point in `unit`, shape (M,)."""
+        """Maximum-likelihood force (M,) at every time point, in `unit`."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
         return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
 
@@ -175,7 +175,7 @@ class DetectedForcePulse:
 
     @property
     def impulse_per_unit_peak(self) -> float:
-        """Time integral of the pulse shape with a peak of one [s]."""
+        """Time integral [s] of the pulse shape with a peak of one."""
         return (self.end_time - self.start_time) * (1 - _FLAT_RAMP_FRACTION / 2 if self.is_flat_topped else 0.5)
 
     @property
@@ -191,14 +191,14 @@ class DetectedForcePulse:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Profiles of size one: beginnings, ends, and whether they are flat, shape (k,) each."""
+    """Pulse shapes of peak one: starts, ends, and whether they are flat-topped, (k,) each."""
 
     begin: Array
     end: Array
     flat: BoolArray
 
     def at(self, t: Array) -> Array:
-        """At times (M, 1) shape (M, k); at one time for each, (k,), shape (k,)."""
+        """Values (M, k) at times (M, 1), or values (k,) at one time for each pulse."""
         part = np.clip((t - self.begin) / (self.end - self.begin), 0.0, 1.0)
         ramp = np.where(self.flat, _FLAT_RAMP_FRACTION / 2, 0.5)
         return np.asarray(np.sin(np.pi / 2 * np.minimum(np.minimum(part, 1 - part) / ramp, 1.0)) ** 2)
@@ -209,7 +209,7 @@ class _Windows:
 
 @dataclass(frozen=True)
 class _Filter:
-    """A zero-phase filter as weights at delays, shape (L,) each."""
+    """A zero-phase filter as weights at delays, (L,) each."""
 
     delay: Array
     weight: Array
@@ -226,11 +226,11 @@ class _Filter:
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:
-        """Profiles of windows as they are seen at times (M,), shape (M, k)."""
+        """Filtered pulse shapes (M, k) at times (M,)."""
         return self._seen(windows, t[:, None])
 
     def of_many(self, windows: _Windows, t: Array) -> _SparseMatrix:
-        """The same for windows that are short relative to the history."""
+        """The same, for windows that are short relative to the history."""
         reach = float(self.delay[-1])
         first, last = (np.searchsorted(t, ends) for ends in (windows.begin - reach, windows.end + reach))
         count = last - first
@@ -245,7 +245,7 @@ class _Filter:
 
 @dataclass(frozen=True)
 class _Rest:
-    """The data less a rest of known covariance: Sigma^-1 (M, M), Sigma^-1 y (M,), log evidence without pulses."""
+    """The data minus a background of known covariance: Sigma^-1 (M, M), Sigma^-1 y (M,), log evidence."""
 
     precision: Array
     scored: Array
@@ -269,7 +269,7 @@ class _Rest:
         return _Rest(history.information - half.T @ half, history.score - half.T @ told, evidence, none)
 
     def beside(self, taken: Array) -> _Rest:
-        """The same with profiles (M, k) of any size taken in."""
+        """The same, with profiles (M, k) of free size added."""
         if not taken.shape[1]:
             return self
         seen = self.precision @ taken
@@ -280,19 +280,19 @@ class _Rest:
         return _Rest(self.precision - lost @ lost.T, self.scored - lost @ told, evidence, lost)
 
     def information(self, profiles: _SparseMatrix) -> Array:
-        """u' Sigma^-1 u of profiles u (M, k), shape (k,)."""
+        """u' Sigma^-1 u (k,) of profiles u (M, k)."""
         product = self.precision @ profiles
         if scipy.sparse.issparse(profiles):
             return np.asarray(profiles.multiply(product).sum(axis=0)).ravel()
         return np.asarray(np.sum(profiles * product, axis=0))
 
     def gains(self, profiles: _SparseMatrix, bare: Array | None = None) -> Array:
-        """By how much the evidence rises with each profile (M, k) of its best size, (k,); `bare`: of `information`."""
+        """Rise of the evidence (k,) with each profile (M, k) at its best size; `bare`: result of `information`."""
         told, sure = self._sizes(profiles, bare)
         return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
 
     def sizes(self, profiles: Array) -> Array:
-        """Best size of each profile, shape (k,), zero where the data say nothing."""
+        """Best size (k,) of each profile, zero without information in the data."""
         told, sure = self._sizes(profiles)
         return np.where(sure > 0, told / np.where(sure > 0, sure, 1.0), 0.0)
 
@@ -306,10 +306,9 @@ class _Rest:
 def detect_force_pulses(
     history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[list[DetectedForcePulse], float]:
-    """Detect pulses in one force estimate, largest evidence first. Also return the number of windows searched.
+    """Detect pulses in one force estimate, largest evidence first. Also returns the number of windows searched.
 
-    p-values are those of single windows; the number counts disjoint windows of lengths a factor of two apart.
-    """
+    p-values refer to single windows. The number counts disjoint windows, of lengths a factor of two apart."""
     windows, tries, profiles = _looked_at(history.t.tobytes(), history.filter_cutoff, limits.max_event_duration)
     if not len(windows.begin):
         return [], 0.0
@@ -346,7 +345,7 @@ def detect_force_pulses(
 
 @lru_cache(maxsize=8)
 def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, float, _SparseMatrix]:
-    """Windows to look at, how many do not overlap, and their profiles; the same for all joints of a recording."""
+    """Windows to search, the number of disjoint ones, and their profiles; the same for all joints of a recording."""
     t = np.frombuffer(times)
     spacing, first, last = float(np.median(np.diff(t))), float(t[0]), float(t[-1])
     lengths = [_MIN_PULSE_POINTS * spacing]
@@ -361,7 +360,7 @@ def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, f
 
 
 def _both_shapes(begin: Array, end: Array) -> _Windows:
-    """Windows with rounded profiles, and the same with flat ones."""
+    """Windows with rounded and with flat-topped profiles."""
     return _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
 
 
@@ -375,7 +374,7 @@ def _rests(history: ForceEstimate) -> list[_Rest]:
 
 
 def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
-    """A window, its ends and its shape moved to where the evidence is largest."""
+    """A window with start, end and shape moved to the largest evidence."""
     spacing = history.time_spacing
     first, last, shortest = history.t[0] + spacing, history.t[-1] - spacing, _MIN_PULSE_POINTS * spacing
     gain = float(rest.gains(seen(window, history.t))[0])
@@ -394,7 +393,7 @@ def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filte
 
 
 def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
-    """A step or a swing to both sides that explains as much as a pulse does, so that it is not a pulse; shape (M,)."""
+    """A step or biphasic profile (M,) that explains as much as the pulse, which is then not accepted."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, gain = end - begin, float(rest.gains(seen(window, t))[0])
     steps = np.arange(begin - length / 2, end + length / 2, history.time_spacing)
@@ -411,7 +410,7 @@ def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter)
 def _stands_out(
     history: ForceEstimate, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
 ) -> bool:
-    """Whether a pulse is shorter than the longest, larger than what is everywhere in the history, and seen."""
+    """Whether a pulse is short enough, larger than the rest of the history, and measured."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, own = end - begin, seen(window, t)
     # at either bound its length is not found but cut off: jumps of friction are shorter, errors of the model longer
@@ -429,7 +428,7 @@ def _stands_out(
 def _sized(
     history: ForceEstimate, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
 ) -> list[DetectedForcePulse]:
-    """The pulses with their sizes, all together, beside the rest of the largest evidence."""
+    """The pulses with their sizes, estimated together on the background with the largest evidence."""
     if not found:
         return []
     rest = max(rests, key=lambda one: one.beside(taken).evidence)

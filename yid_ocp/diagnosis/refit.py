@@ -1,8 +1,7 @@
-"""Refit the nominal parameters with those of some effects, and judge the fits on held-out recordings.
+"""Refit the nominal parameters together with effects, and judge the fits on held-out recordings.
 
-Every loss is a mean square of whitened residuals over blocks of held-out time, the same blocks for every model, so that
-differences between models are paired. G = max(0, chi2/n - 1) is the gap.
-"""
+A loss is the mean square of whitened residuals in blocks of held-out time. All models use the same blocks, so that
+differences between models are paired. G = max(0, chi2/n - 1) is the gap."""
 
 from __future__ import annotations
 
@@ -65,7 +64,7 @@ class HeldOutLoss:
 
     @property
     def chi2_per_sample(self) -> float:
-        """`total_chi2` divided by the number n of held-out samples. Noise alone gives 1 on average."""
+        """`total_chi2` divided by the number n of held-out samples; 1 on average for noise alone."""
         return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
 
     @property
@@ -76,7 +75,7 @@ class HeldOutLoss:
 
 @dataclass(frozen=True)
 class StoredFit:
-    """Stored values and standard deviations of a refit. `RefittedModel` is restored from them by one evaluation."""
+    """Stored values and standard deviations of a refit. One evaluation restores a `RefittedModel` from them."""
 
     values: dict[str, float]  # of every unknown
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing
@@ -86,7 +85,7 @@ class StoredFit:
 
 @dataclass(frozen=True)
 class RefitStatistics(StoredFit):
-    """Statistics of a refit that rules use, with estimates and predictions of both sets of recordings."""
+    """Statistics of a refit used by rules: estimates, and predictions of estimation and held-out recordings."""
 
     effects: tuple[EffectBase, ...]
     cost: float
@@ -114,10 +113,10 @@ class RefittedModel(RefitStatistics):
 
 
 class RefitStore(Protocol):
-    """Interface of a store of finished refits, from which an interrupted diagnosis resumes. Two threads call it."""
+    """Interface of a store of finished refits, from which an interrupted diagnosis resumes; called by two threads."""
 
     def get(self, name: str) -> StoredFit | None:
-        """Find the refit stored under a name. None if there is none."""
+        """The refit stored under a name, or None."""
 
     def put(self, name: str, refitted: StoredFit) -> None:
         """Store a refit under a name."""
@@ -133,7 +132,7 @@ class NominalSolutionAndRefitStore:
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """Record of the answers that a search for effects received, by name. Other rules can use it without refits."""
+    """Record of all results that a search for effects requested, by name. Other rules can reuse it without refits."""
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None where there is no fit
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # beside effects that were added
@@ -146,11 +145,10 @@ class UnrecordedRefitError(LookupError):
 
 @dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress, store and deadline of one diagnosis. Refits answer what rules ask.
+    """Problem, thresholds, progress, store and deadline of one diagnosis. It makes the refits that rules request.
 
-    With `is_finished` it is answered from the record alone, and `UnrecordedRefitError` says that it is not there; the
-    problem then does not matter.
-    """
+    With `is_finished`, results come from the record alone; a missing result raises `UnrecordedRefitError`, and the
+    problem is not used."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
@@ -163,7 +161,7 @@ class RefitContext:
     is_finished: bool = False
 
     def note_skip_past_deadline(self, *what: str) -> bool:
-        """Whether the deadline for refits has passed. `what` is then noted as skipped."""
+        """Whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
         is_late = time.perf_counter() >= self.deadline
         self.skipped.extend(what if is_late else ())
         return is_late
@@ -171,17 +169,17 @@ class RefitContext:
     def refit(
         self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str = ""
     ) -> RefitStatistics | None:
-        """Refit the model with some effects. `name` says from where; None if no rollout succeeds."""
+        """Refit the model with some effects; None if no rollout succeeds. `name` distinguishes different starts."""
         asked = (self.problem, effects, start, self.store, name, self.thresholds)
         return self._answer(self.record.refits, name or join_effect_labels(effects), lambda: refit_with_effects(*asked))
 
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
-        """Fit the same effects on the held-out recordings. None where that cannot be done."""
+        """Fit the same effects on the held-out recordings. None if that is not possible."""
         name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
         return self._answer(self.record.refits, name, lambda: self._turned(fit, name))
 
     def _turned(self, fit: RefitStatistics, name: str) -> RefittedModel | None:
-        """The effects of a fit where recordings to estimate on and held-out ones have changed places."""
+        """The effects of a fit, refitted with estimation and held-out recordings exchanged."""
         if self.problem.is_split_in_blocks:
             return None
         self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
@@ -194,7 +192,7 @@ class RefitContext:
         return refit_with_effects(turned, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
-        """Screen all candidates beside some effects. `name` says at which fit's values."""
+        """Screen all candidates in addition to some effects. `name` says which fit provides `values`."""
         return self._answer(
             self.record.screenings, name, lambda: screen_candidates(self.problem, base, values, self.thresholds)
         )
@@ -206,7 +204,7 @@ class RefitContext:
         return self._answer(self.record.pairs, without, lambda: tuple(itertools.islice(found, _MAX_RECORDED_PAIRS)))
 
     def _answer(self, answers: dict[str, _Answer], name: str, work: Callable[[], _Answer]) -> _Answer:
-        """What is worked out and put on record, or what the record says."""
+        """A result from the record, or computed and recorded."""
         if self.is_finished:
             if name not in answers:
                 raise UnrecordedRefitError(name)
@@ -225,7 +223,7 @@ _MAX_RECORDED_PAIRS = 48
 
 @dataclass(frozen=True)
 class _Attempt:
-    """Where a run ended, and the problem that it solved, its filters about the torques that are seen there."""
+    """End of a run, and its problem, with filters linearised about the torques there."""
 
     problem: EstimationProblem
     outcome: SolverResult
@@ -240,14 +238,14 @@ def refit_with_effects(
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel | None:
-    """Fit nominal and effect parameters and predict held-out recordings. None if no rollout succeeds.
+    """Fit nominal and effect parameters, and predict held-out recordings. None if no rollout succeeds.
 
     Parameters
     ----------
     start : mapping of str to float
-        Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
+        Initial unknowns. If they cannot be rolled out, they are moved towards neutral effects.
     name : str
-        In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
+        Name in the store. Default: the labels of the effects, which suffice if no other start is tried.
     """
     known = load_stored_refit(problem, effects, store, name)
     if known is not None:
@@ -283,7 +281,7 @@ def refit_with_effects(
 def load_stored_refit(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], store: RefitStore | None, name: str = ""
 ) -> RefittedModel | None:
-    """Restore a refit from the store by one evaluation. None if the store does not have it."""
+    """Restore a refit from the store by one evaluation. None if it is not in the store."""
     known = None if store is None else store.get(name or join_effect_labels(effects))
     unknowns = {*problem.with_nominal_and_effects_free(effects).unknown_names}
     labels = {effect.label for effect in effects}
@@ -318,7 +316,7 @@ def _half_done(
     finish: Evaluation,
     limits: Thresholds,
 ) -> bool:
-    """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
+    """Whether a refit explains much, but by far not all, of the gap left without its effects."""
     own, count = problem.with_nominal_and_effects_free(effects), len(finish.residual)
     x = own.vector({**start, **neutral_effect_parameter_values(effects)})
     before = own.evaluate(x, False, finish.equilibrium_guesses)
@@ -328,12 +326,12 @@ def _half_done(
 
 
 def _leaves_noise(finish: Evaluation, limits: Thresholds) -> bool:
-    """Whether a refit leaves no more than noise may, so that no other place can be better."""
+    """Whether a refit leaves no more than noise, so that no other start can be better."""
     return chi2_p_value(2 * finish.cost, len(finish.residual)) >= limits.significance_level
 
 
 def _cheaper(first: _Attempt | None, second: _Attempt | None) -> _Attempt | None:
-    """The attempt of less cost, the first of equals."""
+    """The attempt with the lower cost, the first if equal."""
     if first is None or second is None:
         return first or second
     return second if second.finish.cost < first.finish.cost else first
@@ -342,7 +340,7 @@ def _cheaper(first: _Attempt | None, second: _Attempt | None) -> _Attempt | None
 def _attempt(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
 ) -> _Attempt | None:
-    """One run from one start; None where the model cannot be rolled out."""
+    """One run from one start; None if the model cannot be rolled out."""
     neutral = neutral_effect_parameter_values(effects)
     own = problem.with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
@@ -363,7 +361,7 @@ def _attempt(
 
 
 def _relinearizing(problem: EstimationProblem) -> Callable[..., Evaluation]:
-    """Evaluate with filters about the torques that are seen at each point, from those of the last one on."""
+    """Evaluate with filters linearised about the torques at each point, starting from the previous filters."""
 
     def evaluate(
         x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
@@ -376,7 +374,7 @@ def _relinearizing(problem: EstimationProblem) -> Callable[..., Evaluation]:
 
 
 def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt | None:
-    """Where a run ended, about the torques that are seen there."""
+    """The end of a run, linearised about the torques there."""
     placed = problem.with_effects_and_relinearized_filters(
         effects, problem.with_nominal_and_effects_free(effects).named_values(outcome.x)
     )
@@ -385,7 +383,7 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
 
 
 def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
-    """Factor F of the covariance F F' of the unknowns, (nx, nx), inflated by the misfit as in `solve`."""
+    """Factor F (nx, nx) of the covariance F F' of the unknowns, inflated by the misfit as in `solve`."""
     factor = unknowns_covariance_factor(problem, finish)
     fit = assess_goodness_of_fit(problem, finish, limits.null_test_limits)
     std = np.sqrt(np.diag(misfit_robust_covariance(problem, finish, fit)))
@@ -393,11 +391,11 @@ def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, lim
 
 
 def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Array, factor: Array) -> dict[str, float]:
-    """Wald's test of each effect: all its amplitudes together, its shapes held, as a weak effect has any shape.
+    """Wald test of each effect: all amplitudes together, at fixed shape parameters, because weak effects have any
+    shape.
 
-    A load that is known well may be divided among its amplitudes in any way, so that none alone differs from neutral.
-    `factor` F gives the covariance F F'. Davies 1987, doi:10.1093/biomet/74.1.33.
-    """
+    A well-known load can be divided among amplitudes in any way, so that no single one differs from neutral. `factor` F
+    gives the covariance F F'. Davies 1987, doi:10.1093/biomet/74.1.33."""
     found = {}
     for effect in effects:
         shapes, sized = ([names.index(n) for n in of] for of in (effect.shape_parameter_names, effect.amplitude_names))
@@ -411,7 +409,7 @@ def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Arr
 
 
 def _mark_uninformative_std(effects: Sequence[EffectBase], std: Mapping[str, float]) -> dict[str, float]:
-    """Standard deviations, infinite where larger than `_UNINFORMATIVE_STD_RATIO` times the width of the prior range."""
+    """Standard deviations, infinite above `_UNINFORMATIVE_STD_RATIO` times the width of the prior range."""
     most = {n: _UNINFORMATIVE_STD_RATIO * (b - a) for effect in effects for n, (a, b) in effect.prior_ranges.items()}
     return {name: math.inf if size > most.get(name, math.inf) else size for name, size in std.items()}
 
@@ -425,9 +423,8 @@ def refit_with_each_effect(
 ) -> list[RefitStatistics]:
     """Refit the model with each of several effects or pairs added to `base`. Failed refits are left out.
 
-    Each of those `tried` stands beside the parameters at which it begins, `values` is where all other unknowns begin,
-    and `where` says so in the store if the same effects are refitted from elsewhere too.
-    """
+    Each entry of `tried` holds effects and their initial parameters. `values` are the initial values of all other
+    unknowns. `where` names this start in the store, if the same effects are also refitted from other starts."""
     if not tried:
         return []
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
@@ -462,13 +459,13 @@ def refit_with_each_effect(
 
 
 def _block_duration(episodes: Sequence[Episode]) -> float:
-    """Length of the blocks of held-out time [s]: about forty blocks, each 0.5 s to 2 s long."""
+    """Length of the held-out time blocks [s]: about forty blocks of 0.5 s to 2 s."""
     total = sum(episode.grid.steps * episode.grid.time_step for episode in episodes)
     return float(np.clip(total / 40, 0.5, 2.0))
 
 
 def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
-    """The loss of a model on the held-out recordings; initial states are found alike for every model."""
+    """Loss of a model on the held-out recordings; initial states are found in the same way for every model."""
     length, found = _block_duration(problem.held_out), problem.predict_held_out(x)
     squares: list[Array] = []
     counts: list[Array] = []
@@ -503,7 +500,7 @@ def held_out_channel_errors(found: Sequence[tuple[Episode, EpisodePrediction | s
 
 
 def _contradiction(problem: EstimationProblem, x: Array) -> float:
-    """Squares of the joint prior's rows."""
+    """Sum of squares of the joint prior's residuals."""
     joint = problem.options.multivariate_prior.restricted_to(problem.shared_parameters)
     at = [problem.unknown_names.index(name) for name in joint.parameter_names]
     apart = (x - problem.initial_unknowns)[at]

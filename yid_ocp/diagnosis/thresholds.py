@@ -20,8 +20,7 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 class Thresholds(SmootherThresholds):
     """Thresholds of every step of a diagnosis, from the null test to the events.
 
-    Every field has its description beside it; the settings' reference (section `diagnosis`) repeats them.
-    """
+    Each field has a description, repeated in the section `diagnosis` of the settings reference."""
 
     # is there a gap
     significance_level: Annotated[
@@ -86,7 +85,7 @@ class Thresholds(SmootherThresholds):
 
     @property
     def null_test_limits(self) -> ExcessResidualCriteria:
-        """Significance level and smallest excess of the null test, in the form that `solve` uses as well."""
+        """Significance level and smallest excess of the null test, also used by `solve`."""
         return ExcessResidualCriteria(self.significance_level, self.min_excess_chi2_per_dof)
 
 
