@@ -1,17 +1,15 @@
 """Screening: detectability and score test of every candidate from one sensitivity sweep.
 
-With r the whitened residual of the nominal fit, J_theta its sensitivity to what that fit frees, J_j that to the
-amplitudes of candidate j and P = I - J_theta J_theta^+:
+r is the whitened residual of the nominal fit, J_theta its sensitivity to the parameters of the nominal fit, J_j that to
+the amplitudes of candidate j, and P = I - J_theta J_theta^+:
 
     G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
 
-S_j = G_j for white noise of unit standard deviation, and the sum of the scores' autocovariances for autocorrelated
-noise, taken as it would be with the candidate's step done (Bartlett's weights, Newey and West 1987,
-doi:10.2307/1913610). The decrease of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude
-would leave its bounds.
-Shape parameters are taken over a grid, the best value as the best of that many tries (Davies 1987,
-doi:10.1093/biomet/74.1.33, bounded by Bonferroni).
-"""
+S_j = G_j for white noise of unit standard deviation. For autocorrelated noise, S_j is the sum of the scores'
+autocovariances after the candidate's step (Bartlett weights, Newey and West 1987, doi:10.2307/1913610). The linear
+model predicts a decrease of r'r by s_j' G_j^-1 s_j, or less if an amplitude would leave its bounds. Shape parameters
+are tried on a grid, and the best p-value is corrected for that many trials (Davies 1987, doi:10.1093/biomet/74.1.33,
+bounded by Bonferroni)."""
 
 from __future__ import annotations
 
@@ -34,7 +32,7 @@ _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding
 
 @dataclass(frozen=True)
 class _EffectSignature:
-    """First-order change of the residual by the amplitudes of a candidate."""
+    """Derivative of the residual with respect to the amplitudes of a candidate."""
 
     effect: EffectBase
     shape_values: dict[str, float]
@@ -44,7 +42,7 @@ class _EffectSignature:
 
 @dataclass(frozen=True)
 class AllCandidatesLinearization:
-    """Residual and candidate signatures linearised at one point. The model's free parameters are projected out."""
+    """Residual and candidate signatures linearised at one point, with the model's free parameters projected out."""
 
     projected_residual: Array  # P r, shape (nr,)
     signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
@@ -61,7 +59,7 @@ class DetectableAmplitudes:
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """Result of a candidate's score test, with predicted values, chi2 decrease and p-value."""
+    """Result of a candidate's score test: predicted values, predicted decrease of chi2, and p-value."""
 
     effect: EffectBase
     predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values
@@ -85,9 +83,8 @@ def linearize_candidates(
 ) -> AllCandidatesLinearization:
     """Linearise the residual at `values` in the amplitudes of all candidates that are not yet in the model.
 
-    Effects of `base` are in the model with all their parameters free, `values` are the unknowns of its fit, and `grid`
-    is the number of values of every shape parameter. `SolverError` where the model cannot be rolled out there.
-    """
+    The model contains the effects in `base`, with all their parameters free; `values` are the fitted unknowns of this
+    model. `grid` is the number of values per shape parameter. Raises `SolverError` if the rollout at `values` fails."""
     labels = {effect.label for effect in base}
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
     own = [name for effect in base for name in effect.parameters.names]
@@ -122,7 +119,7 @@ def linearize_candidates(
 
 
 def _basis(matrix: Array) -> Array:
-    """Orthonormal basis of the columns, those that depend on others left out."""
+    """Orthonormal basis of the columns, without linearly dependent columns."""
     size = np.linalg.norm(matrix, axis=0)
     u, singular, _ = np.linalg.svd(matrix[:, size > 0] / size[size > 0], full_matrices=False)
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
@@ -190,7 +187,7 @@ def _score_candidates(
     series: Sequence[ResidualChannel],
     visible: Sequence[DetectableAmplitudes],
 ) -> tuple[CandidateScore, ...]:
-    """Score every detectable candidate. The largest predicted decrease of r'r comes first."""
+    """Score every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
     scores: dict[str, list[CandidateScore]] = {}
     for signature in point.signatures:
@@ -208,18 +205,18 @@ def _score_candidates(
 
 
 def bonferroni_min_p_value(ranked: Sequence[CandidateScore]) -> float:
-    """Bonferroni-corrected smallest p-value of the candidates. 1 if there are none."""
+    """Bonferroni-corrected smallest p-value of the candidates; 1 without candidates."""
     return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
 
 def _room(effect: EffectBase) -> tuple[Array, Array]:
-    """Largest changes of amplitudes from neutral, to either side."""
+    """Largest changes of amplitudes from neutral, downwards and upwards."""
     own = [q for q in effect.definitions if not q.is_shape_parameter]
     return np.array([q.lower - q.neutral_value for q in own]), np.array([q.upper - q.neutral_value for q in own])
 
 
 def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """The linear model's step within bounds and the decrease of r'r by it; of one, or of a stack of them."""
+    """Step of the linear model within bounds, and its decrease of r'r, for one model or a stack of models."""
     plain = (_pinv(information) @ slope[..., None])[..., 0]
     step = np.clip(plain, lower, upper)
     return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
@@ -244,20 +241,20 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Residu
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
-    """Amplitudes a step from neutral."""
+    """Amplitudes after a step from neutral."""
     named = zip(effect.amplitude_names, map(float, step), strict=True)
     return {name: effect.neutral_values[name] + moved for name, moved in named}
 
 
 @dataclass(frozen=True)
 class ConfusabilityMatrix:
-    """Fractions of each candidate's signature that the others explain, beyond what nominal parameters explain."""
+    """Fractions of each candidate's signature that other candidates explain, beyond nominal parameters."""
 
     labels: tuple[str, ...]
     overlap_fractions: Array  # shape (nj, nj): of row j's signature by column i's
 
     def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
-        """Labels of the other candidates that explain at least the fraction `limit` of one's signature."""
+        """Labels of the other candidates that explain at least the fraction `limit` of a candidate's signature."""
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
@@ -280,10 +277,9 @@ class AllCandidatesScoreModel:
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
     def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
-        """Yield all pairs of candidates labelled in `among`. The largest predicted decrease of r'r comes first.
+        """Yield all pairs of candidates labelled in `among`, largest penalised decrease of r'r first.
 
-        What two effects do together neither need do alone: one of them may hide in what the other leaves.
-        """
+        A pair can explain what neither effect explains alone, because each can hide in the residual of the other."""
         bounds = [_room(effect) for effect in self.effects]
         lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
         columns, wanted = self._columns, [i for i, effect in enumerate(self.effects) if effect.label in set(among)]
@@ -320,7 +316,7 @@ def _make_joint_score_model(
 
 
 def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:
-    """Return the signature fractions that candidates explain of each other, with amplitudes scaled by prior range."""
+    """Fractions of signatures that candidates explain of each other, with amplitudes scaled by prior range."""
     ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram = everything.information * scale[:, None] * scale

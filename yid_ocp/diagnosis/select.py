@@ -1,8 +1,7 @@
 """Select effects one after the other by how much of the held-out gap they close.
 
-1 - G_after/G_before of the held-out losses is what was closed; its interval comes from resampling blocks (Kuensch 1989,
-doi:10.1214/aos/1176347265).
-"""
+The closure is 1 - G_after/G_before of the held-out losses. Its interval comes from resampling blocks (Kuensch 1989,
+doi:10.1214/aos/1176347265)."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """An effect added by forward selection, with its refitted model, cumulative closure and equivalent effects."""
+    """An effect added by forward selection: its refitted model, cumulative closure and equivalent effects."""
 
     effect: EffectBase
     refitted_model: RefitStatistics  # with all effects up to this one
@@ -65,13 +64,13 @@ def held_out_gap_closure(
 
 
 def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
-    """Whether the held-out log likelihood ratio favours `after` decisively, if both models leave only noise."""
+    """Whether the held-out log likelihood ratio clearly favours `after`, if both models leave only noise."""
     fall = before.total_chi2 - after.total_chi2
     return _is_noise(before, limits) and _is_noise(after, limits) and fall > 2 * limits.min_log_bayes_factor
 
 
 def _is_noise(loss: HeldOutLoss, limits: Thresholds) -> bool:
-    """Whether a model leaves little but noise, so that squares are log likelihoods; otherwise they are its errors."""
+    """Whether a model leaves little but noise, so that squares are log likelihoods; else they are model errors."""
     return loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
 
 
@@ -89,8 +88,7 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
 def penalized_chi2_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
     """Difference of r'r between two fits over fitted and held-out recordings, plus a parameter penalty.
 
-    It is that of Schwarz (1978, doi:10.1214/aos/1176344136), so that half the difference is the log odds of `other`.
-    """
+    With the penalty of Schwarz (1978, doi:10.1214/aos/1176344136), half the difference is the log odds of `other`."""
     held = fit.held_out_loss.total_chi2 - other.held_out_loss.total_chi2
     more = fit.effect_parameter_count - other.effect_parameter_count
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
@@ -101,11 +99,11 @@ def _chi2(fit: RefitStatistics) -> float:
 
 
 def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> list[RefitStatistics]:
-    """Models that the recordings cannot tell from the best one: plausible ones first, of these the best.
+    """Models that the recordings cannot distinguish from the best one: plausible models first, each group best first.
 
-    Where the best leaves noise, all recordings are one likelihood: what has odds against it is out. Where it errs, what
-    counts is how well other motions are predicted, in units of what is left; of what does as well the simplest is best.
-    """
+    If the best model leaves only noise, all recordings form one likelihood, and models with odds against them are
+    dropped. Otherwise the held-out prediction error counts, relative to the residual; of equally good models the
+    simplest is best."""
     best = min(fits, key=_chi2)
     if _is_noise(best.held_out_loss, limits):
         best = min(fits, key=lambda fit: penalized_chi2_difference(fit, best))
@@ -120,9 +118,8 @@ def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> li
 def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool:
     """Whether a loss, and the mean logarithm of its blocks, is within a standard error over blocks of the best.
 
-    The sum alone would not do, as few loud blocks make its error. Where errors of the model are all that is left, fewer
-    parameters outweigh a larger loss as in BIC, with the blocks as samples.
-    """
+    The sum alone is not enough, because a few large blocks dominate its error. If model error dominates, fewer
+    parameters outweigh a larger loss as in BIC, with blocks as samples."""
     loss, best = fit.held_out_loss, other.held_out_loss
     (lost, error), count = held_out_improvement(loss, best), len(best.block_chi2)
     ratios = np.log(np.maximum(loss.block_chi2, 1.0) / np.maximum(best.block_chi2, 1.0))
@@ -133,17 +130,17 @@ def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool
 
 
 def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether an effect is significant, and no parameter surely outside its prior range."""
+    """Whether an effect is significant, and no parameter is clearly outside its prior range."""
     return _is_within_range(effect, fit, limits, effect.prior_ranges) and _is_significant(effect, fit, limits)
 
 
 def _has_plausible_size(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether no amplitude is surely outside its prior range: others mend what the effects before it do wrong."""
+    """Whether no amplitude is clearly outside its prior range; a larger one corrects other effects' errors."""
     return _is_within_range(effect, fit, limits, effect.amplitude_names)
 
 
 def _is_within_range(effect: EffectBase, fit: RefitStatistics, limits: Thresholds, names: Iterable[str]) -> bool:
-    """Whether parameters may lie within their prior ranges, widened by a width or a factor."""
+    """Whether parameters can lie within their prior ranges, widened by a width or a factor."""
     room = limits.prior_range_margin_in_widths
     for name in names:
         low, high = effect.prior_ranges[name]
@@ -155,15 +152,14 @@ def _is_within_range(effect: EffectBase, fit: RefitStatistics, limits: Threshold
 
 
 def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the amplitudes together are at least as unlikely by chance as one of `min_z` standard deviations."""
+    """Whether the amplitudes together are at least as significant as one amplitude at `min_z` standard deviations."""
     return fit.p_values[effect.label] <= math.erfc(limits.min_z / math.sqrt(2.0))
 
 
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
-    """Whether an effect is significant, and held-out recordings are surely predicted worse without it.
+    """Whether an effect is significant, and held-out recordings are predicted clearly worse without it.
 
-    Where both models leave noise the likelihood decides, otherwise the part of the gap that it closes.
-    """
+    If both models leave only noise, the likelihood decides, otherwise the fraction of the gap that it closes."""
     before, after = without.held_out_loss, fit.held_out_loss
     (gained, error), gap = held_out_improvement(before, after), before.excess_chi2_per_sample
     is_open = gap > 0 and not _is_explained(without, limits)
@@ -172,7 +168,7 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, effect: EffectBas
 
 
 def _is_explained(fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the effects of a fit leave little but noise; a gap that is as little is one without any."""
+    """Whether a fit has effects and leaves little but noise; without effects, even a gap that small remains one."""
     return bool(fit.effects) and _is_noise(fit.held_out_loss, limits)
 
 
@@ -185,7 +181,7 @@ _Start = tuple[tuple[EffectBase, ...], Mapping[str, float]]
 def _refit_shortlist(
     screened: ScreeningResult, limits: Thresholds, base: Sequence[EffectBase] = (), places: Sequence[str] = ()
 ) -> list[_Start]:
-    """The candidates to refit, with their start values; the best of every place of the gap is among them."""
+    """The candidates to refit, with initial values; they include the best candidate of each gap location."""
     scores, alike = screened.candidate_scores, screened.confusability
     ranked = [score for score in scores if score.p_value < limits.significance_level]
     if not ranked:
@@ -202,7 +198,7 @@ def _refit_shortlist(
 
 
 def _from_before(search: RefitContext) -> list[RefitStatistics]:
-    """Candidates refitted from the earlier run's parameters: the nominal fit's stand in for what is missing."""
+    """Candidates refitted from the earlier run's parameters; the nominal fit supplies missing parameters."""
     try:
         screened = search.screen((), {}, "from the earlier run's parameters")
     except SolverError:
@@ -213,7 +209,7 @@ def _from_before(search: RefitContext) -> list[RefitStatistics]:
 
 
 def _likelier(fits: Sequence[RefitStatistics]) -> list[RefitStatistics]:
-    """Of every effect the fit of least cost, in the order of their first ones."""
+    """The fit with the lowest cost for each effect, in order of first occurrence."""
     best: dict[str, RefitStatistics] = {}
     for fit in fits:
         label = fit.effects[-1].label
@@ -228,13 +224,11 @@ def select_effects(
     places: Sequence[str] = (),
     moved: bool = False,
 ) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
-    """Select effects by forward selection on the held-out gap, then try replacing and removing each.
+    """Select effects by forward selection on the held-out gap, then try replacing and removing each effect.
 
-    `places` are where the smoother says that the gap lies, and `moved` is whether the nominal fit has left what an
-    earlier run found, so that candidates are tried from there as well. Returned are the fits of single effects in the
-    first round, the chosen one first, then by held-out loss (where one stays alone, its last fit first), and what was
-    selected.
-    """
+    `places` are the smoother's locations of the gap. If `moved` (the nominal fit has left the estimates of an earlier
+    run), candidates are also tried from those estimates. Returns the fits of single effects in the first round, the
+    chosen effect first (its last fit if it stays alone), then by held-out loss, and the selected effects."""
     limits, alone, chosen, before = search.thresholds, screened, _Choice(nominal), nominal
     first: list[RefitStatistics] = []
     while len(chosen.fit.effects) < limits.max_effects:
@@ -285,13 +279,13 @@ def select_effects(
 
 @dataclass(frozen=True)
 class _Choice:
-    """The effects that are in the model, refitted together, and what the data cannot tell from each."""
+    """The effects in the model, refitted together, and the equivalent effects of each."""
 
     fit: RefitStatistics
     rivals: Mapping[str, tuple[EffectBase, ...]] = field(default_factory=dict)  # by label, the effect itself first
 
     def replaced(self, fit: RefitStatistics, near: Sequence[EffectBase], untried: Sequence[EffectBase] = ()) -> _Choice:
-        """Other effects, of which the last has the rivals `near`, and those that stay have theirs."""
+        """The choice with other effects; the last has the rivals `near`, and effects that stay keep theirs."""
         *before, last = fit.effects
         kept = {effect.label: self.rivals.get(effect.label, (effect,)) for effect in before}
         known = {effect.label: effect for effect in (last, *near, *untried)}
@@ -299,10 +293,9 @@ class _Choice:
 
 
 def _reconsidered(search: RefitContext, chosen: _Choice, before: RefitStatistics) -> _Choice:
-    """Every effect tried for its place again beside the others: without it, and others instead of it.
+    """Try each effect's place again with the others present: without the effect, and with other effects instead.
 
-    The last one was just tried so, if it was added to the effects of `before`.
-    """
+    The last effect has just been tried so, if it was added to the effects of `before`."""
     is_added = chosen.fit.effects[:-1] == before.effects
     tried = {frozenset(effect.label for effect in before.effects)} if is_added else set()
     while len(chosen.fit.effects) > 1:
@@ -316,7 +309,7 @@ def _reconsidered(search: RefitContext, chosen: _Choice, before: RefitStatistics
 
 
 def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choice:
-    """The effects without one of them, or with it or another one last, and what would do as well there."""
+    """The choice without one effect, or with it or another effect last, and the equivalent effects there."""
     limits, full, label = search.thresholds, chosen.fit, effect.label
     rest = tuple(other for other in full.effects if other is not effect)
     # it begins elsewhere than a refit of the same effects in an earlier round
@@ -346,7 +339,7 @@ def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choi
 def _with_closures(
     search: RefitContext, nominal: RefitStatistics, chosen: _Choice, first: Sequence[RefitStatistics]
 ) -> tuple[SelectedEffect, ...]:
-    """The chosen effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
+    """The selected effects in order, each with the fit of all effects up to it (or of all, if that fit fails)."""
     effects, found = chosen.fit.effects, []
     for i, effect in enumerate(effects, 1):
         known = next((fit for fit in (chosen.fit, *first) if fit.effects == effects[:i]), None)
@@ -359,7 +352,7 @@ def _with_closures(
 def _futile(
     search: RefitContext, fits: Sequence[RefitStatistics], alone: ScreeningResult, rest: ScreeningResult
 ) -> bool:
-    """Whether no refit closes half of the gap and no two effects promise to explain it; never beside torque noise."""
+    """Whether no refit closes half of the gap and no pair is predicted to explain it; False with torque noise."""
     limits, (nominal, current, *tried) = search.thresholds, fits
     best = held_out_gap_closure(nominal.held_out_loss, min(tried, key=_chi2).held_out_loss)
     if nominal.has_process_noise or not best.fraction < 0.5:
@@ -371,7 +364,7 @@ def _futile(
 
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[_Start]:
-    """The pairs of candidates to refit: best penalized decrease first, without confusable duplicates."""
+    """The pairs of candidates to refit: best penalised decrease first, without confusable duplicates."""
     limits = search.thresholds
 
     def same(one: EffectBase, other: EffectBase) -> bool:
@@ -391,7 +384,7 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
 def selection_without(
     search: RefitContext, nominal: RefitStatistics, kept: Sequence[SelectedEffect], entry: SelectedEffect
 ) -> tuple[SelectedEffect, ...]:
-    """Remove one of the selected effects and refit the others. Empty if that is not possible."""
+    """Remove one of the selected effects and refit the others. Empty if the refit fails."""
     full, rest = kept[-1].refitted_model, [other for other in kept if other is not entry]
     name = f"{join_effect_labels(full.effects)} without {entry.effect.label}"
     without = search.refit(tuple(other.effect for other in rest), full.values, name)

@@ -1,8 +1,7 @@
-"""Decide whether there is a gap, whether effects carry over to held-out recordings, and the verdict.
+"""Decide whether there is a gap, whether effects transfer to held-out recordings, and the verdict.
 
-Two or three effects together imitate almost anything on the recordings on which they were fitted. What is true of the
-robot comes out the same wherever it is fitted; so the held-out recordings are fitted in turn, and values are compared.
-"""
+Two or three effects together can imitate almost any gap on the recordings used to fit them. True effects have the same
+parameters on all recordings. The held-out recordings are therefore fitted too, and the estimates are compared."""
 
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ class EffectAmplitudeTransferCheck:
 
     @property
     def both_estimates_text(self) -> str:
-        """Format both estimates with their standard deviations and unit."""
+        """Text of both estimates with their standard deviations and unit."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
@@ -69,7 +68,7 @@ class LocatedGap:
 
 @dataclass(frozen=True)
 class NominalEvidence:
-    """Evidence for a gap before effects are searched for."""
+    """Evidence for a gap before the search for effects."""
 
     nominal_model: RefitStatistics
     nominal_test: NullTestResult  # on the recordings to estimate on
@@ -81,10 +80,8 @@ class NominalEvidence:
     def has_gap(self, limits: Thresholds) -> bool:
         """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
 
-        Along a candidate's signature some channel must be above noise too; the sum over all channels does not notice
-        what only a few samples show. An offset of a torque beyond the stated one needs no such channel where offsets
-        are stated: it is one number among thousands.
-        """
+        Along a signature, some channel must also exceed noise, because a few deviating samples vanish in the sum over
+        all channels. A torque offset beyond its stated size needs no such channel: it is one number among thousands."""
         tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
         largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
         is_seen = largest > 1 + limits.min_channel_excess_chi2_per_dof
@@ -113,12 +110,12 @@ class Judgement:
 
     @property
     def accepted(self) -> tuple[SelectedEffect, ...]:
-        """Effects of an `effect` or `confusable` verdict in the order they were added. Other verdicts have none."""
+        """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     @property
     def assumption_count(self) -> int:
-        """Number of independent assumptions in the effects: one for each kind, but one for each local effect."""
+        """Number of independent assumptions in the effects: one per local effect and one per other kind."""
         effects = (entry.effect for entry in self.selected_effects)
         return len({effect.label if effect.is_local else effect.kind for effect in effects})
 
@@ -129,7 +126,7 @@ class Judgement:
 
     @property
     def closure_by_location(self) -> dict[str, float]:
-        """Part of the gap that the accepted effects at each location close beyond those added before."""
+        """Fraction of the gap that the accepted effects at each location close beyond those added before."""
         closed: dict[str, float] = {}
         most = 0.0
         for entry in self.accepted:
@@ -141,13 +138,12 @@ class Judgement:
     def required_fraction(self, limits: Thresholds) -> float:
         """Fraction of the smoother's explanation that the effects are required to explain.
 
-        Each further assumption has to explain that part of what could be left.
-        """
+        Each further assumption must explain at least `min_explained_fraction` of the remainder."""
         return 1.0 - (1.0 - limits.min_explained_fraction) ** self.assumption_count
 
 
 def _is_little_explained(said: Judgement, limits: Thresholds) -> bool:
-    """Whether effects explain too little where the model was fitted; one may close as much on other motions instead."""
+    """Whether effects explain too little of the fitted data; one effect may close enough held out instead."""
     elsewhere = said.assumption_count == 1 and said.gap_closure.ci_low >= limits.min_explained_fraction
     return said.explained_fraction < said.required_fraction(limits) and not elsewhere
 
@@ -164,7 +160,7 @@ _REASONS_FOR_UNKNOWN: Mapping[UnknownVerdictReason, Callable[[Judgement, Thresho
 
 
 def _with_verdict(said: Judgement, gap: bool, are_data_sufficient: bool, limits: Thresholds) -> Judgement:
-    """The judgement with the first verdict that holds."""
+    """The judgement with the first applicable verdict."""
     reasons: list[UnknownVerdictReason] = [name for name, fails in _REASONS_FOR_UNKNOWN.items() if fails(said, limits)]
     reason = [*reasons, ""][0]
     holds = {
@@ -184,11 +180,10 @@ def judge(
     locate: Callable[[], LocatedGap],
     finished: Callable[[str], None] = lambda _: None,
 ) -> Judgement:
-    """Decide the verdict from the evidence for a gap and from the answers to a search for effects.
+    """Decide the verdict from the evidence for a gap and from the results of a search for effects.
 
-    A function of numbers alone: refits, screenings and the smoother (`locate`) are asked for by name, and are answered
-    from a record as well. `finished` is called with the name of each stage.
-    """
+    It is a function of numbers alone: refits, screenings and the smoother (`locate`) are requested by name and can come
+    from a record. `finished` is called with the name of each stage."""
     limits, nominal = search.thresholds, seen.nominal_model
     has_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
     # what parameters explain by moving is no gap, unless an effect explains it
@@ -213,10 +208,9 @@ def judge(
 
 
 def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, located: LocatedGap | None) -> float:
-    """The effects' decrease of r'r over the smoother's, each less degrees of freedom; 1 if that says nothing.
+    """The effects' decrease of r'r over the smoother's, each minus degrees of freedom; 1 if undefined.
 
-    The smoother knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains.
-    """
+    With process noise it is undefined, because the smoother knows only the spectrum of torque noise."""
     if located is None or nominal.has_process_noise or located.chi2_decrease <= 0:
         return 1.0
     return (2 * (nominal.cost - last.cost) - last.effect_parameter_count) / located.chi2_decrease
@@ -225,11 +219,10 @@ def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, located
 def _effects_with_transfer_checks(
     search: RefitContext, nominal: RefitStatistics, added: tuple[SelectedEffect, ...]
 ) -> tuple[tuple[SelectedEffect, ...], tuple[EffectAmplitudeTransferCheck, ...]]:
-    """Return the selected effects, their standard deviations increased by disagreement, and their transfer checks.
+    """The selected effects, with standard deviations increased by disagreement, and their transfer checks.
 
-    Effects of one place divide a torque between them as the noise happens to fall. Where they do not transfer, one of
-    them is left out if the others transfer without it, the last one first.
-    """
+    Effects at one location divide a torque between them arbitrarily. If they do not transfer, one of them is removed,
+    the last one first, if the others transfer without it."""
     if not added:
         return added, ()
     checks = _check_effect_amplitude_transfer(search, added[-1].refitted_model)
@@ -252,8 +245,7 @@ def _check_effect_amplitude_transfer(
 ) -> tuple[EffectAmplitudeTransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
 
-    Empty if one recording is split, or if the model cannot be fitted there, which is no evidence against it.
-    """
+    Empty if one recording is split, or if the refit fails; neither is evidence against an effect."""
     again = search.refit_on_held_out(fit) if fit.effects else None
     if again is None:
         return ()
@@ -263,7 +255,7 @@ def _check_effect_amplitude_transfer(
 def _compare(
     effect: EffectBase, first: RefitStatistics, second: RefitStatistics, limits: Thresholds
 ) -> list[EffectAmplitudeTransferCheck]:
-    """The amplitudes of one effect in two fits."""
+    """Comparison of the amplitudes of one effect in two fits."""
     neutral, found = effect.neutral_values, []
     width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
     size = max(abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_names)
@@ -281,11 +273,10 @@ def _compare(
 def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
-    """Return the fit with standard deviations increased for amplitudes that disagree between the recordings.
+    """The fit with increased standard deviations of amplitudes that disagree between the recordings.
 
-    Where two fits differ by more than `_DISAGREEMENT_Z` standard deviations of both together, each is known to the
-    spread of the two, the difference over the square root of two.
-    """
+    If two estimates differ by more than `_DISAGREEMENT_Z` of their combined standard deviation, each gets at least the
+    standard deviation of the pair, the difference over the square root of two."""
     std = dict(fit.std)
     for entry in entries:
         (apart, spread), name = entry.estimate_difference_and_std, f"{entry.effect_label}.{entry.parameter}"
