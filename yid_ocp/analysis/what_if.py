@@ -76,9 +76,9 @@ class ChangedExperimentResult:
 class ExperimentRanking(ReprMixin):
     """Changes of an experiment, ranked by the parameters that they make identifiable.
 
-    `single_changes` are sorted by the number of identifiable parameters, then by gain; changes that could not be
-    evaluated come last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make every
-    parameter identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly.
+    `single_changes` are sorted by the number of identifiable parameters, then by gain [nat]; changes that could
+    not be evaluated come last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make
+    every parameter identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly.
     """
 
     unchanged_experiment: ChangedExperimentResult
