@@ -110,12 +110,12 @@ def test_a_cache_that_others_may_write_or_that_cannot_be_made_is_refused(cache, 
     for mode in (0o720, 0o702, 0o777):
         cache.chmod(mode)
         with pytest.raises(OutputError) as caught:
-            compiler._cache_folder()
+            compiler.private_cache_folder()
         assert all(word in str(caught.value) for word in (str(cache), "empty it", "chmod 700", "YID_OCP_CACHE"))
     (cache / "file").write_text("not a folder", encoding="utf-8")
     monkeypatch.setenv("YID_OCP_CACHE", str(cache / "file" / "cache"))
     with pytest.raises(OutputError, match="CC=none"):
-        compiler._cache_folder()
+        compiler.private_cache_folder()
 
 
 def test_without_a_compiler_everything_works_after_one_notice(cache, choose, caplog, pendulum):

@@ -7,6 +7,7 @@ import json
 import casadi as ca
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,7 @@ from yid_ocp.errors import OutputError
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.report import figures
+from yid_ocp.report import animation, figures
 from yid_ocp.report.animation import (
     ConfigurationTrajectory,
     animation_of_trajectories,
@@ -162,6 +163,32 @@ def test_a_robot_without_meshes_is_sticks(single_arm, urdf_folder):
         page = scenes_to_dict([animation_of_trajectories("a", [told])], robot)
         assert page["meshes"] == {}
         assert page["scenes"][0]["motions"][0]["sticks"]
+
+
+def test_meshes_are_read_again_where_a_file_changed(single_arm, tmp_path, monkeypatch):
+    reads, q = list[str](), np.zeros((2, single_arm.n_coordinates))
+    told = ConfigurationTrajectory("p", single_arm, single_arm.parameters.vector(), np.arange(2), q)
+    shape, robot = '<visual><geometry><mesh filename="{}"/></geometry></visual>', tmp_path / "robot.urdf"
+    robot.write_text(f'<robot name="r"><link name="left_wrist">{shape.format("box.stl")}</link></robot>')
+    monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(
+        animation, "load_robot_meshes_by_joint", lambda *a: reads.append("") or load_robot_meshes_by_joint(*a)
+    )
+
+    def width(edge: float | None = None) -> float:
+        if edge is not None:
+            trimesh.creation.box([edge, 0.1, 0.1]).export(tmp_path / "box.stl")
+        [(flat, _)] = scenes_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"].values()
+        return np.ptp(np.reshape(flat, (-1, 3)), axis=0).max() / 1e4
+
+    assert [width(0.2), width(), width(0.3), width()] == pytest.approx([0.2, 0.2, 0.3, 0.3])
+    assert len(reads) == 2
+    # half a file in the cache is no reason to go without
+    for file in (tmp_path / "cache").glob("meshes-*"):
+        file.write_text(file.read_text()[:9])
+    assert (width(0.3), len(reads)) == (pytest.approx(0.3), 3)
+    robot.write_text("<robot><visual")
+    assert scenes_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"] == {}
 
 
 def test_what_acts_is_where_it_acts(single_arm):

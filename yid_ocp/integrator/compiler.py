@@ -79,7 +79,8 @@ def _optimization_flag() -> str:
     return f"-O{level}" if level else _OPTIMIZATION_FLAG
 
 
-def _cache_folder() -> Path:
+def private_cache_folder() -> Path:
+    """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it."""
     wanted = os.environ.get("YID_OCP_CACHE")
     folder = Path(wanted or platformdirs.user_cache_dir("yid_ocp"))
     allowed = "a folder that you own, writable by you alone"
@@ -179,7 +180,7 @@ def _library_file(source: str, level: str, make: Callable[[], str | None] | None
         return None
     flags = _flags(path)
     told = [source, level, *flags, *_NATIVE_FLAGS, _machine(), ca.CasadiMeta.version()]
-    folder, key = _cache_folder(), hashlib.sha256("\0".join(told).encode()).hexdigest()[:32]
+    folder, key = private_cache_folder(), hashlib.sha256("\0".join(told).encode()).hexdigest()[:32]
     if (kept := _kept(folder, key)) is not None:
         return kept
     said = ""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -14,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import YidError
-from yid_ocp.files import read_input_text
+from yid_ocp.errors import OutputError, YidError
+from yid_ocp.files import file_sha256, json_sha256, read_input_text, write_text
+from yid_ocp.integrator.compiler import private_cache_folder
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
-from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint
+from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint, mesh_sources_sha256
 
 _MAX_FRAMES = 150  # moments of a motion that a page holds; between two it goes straight
 _PUSHED_POINT = "75%"  # of a segment, where an unknown push acts
@@ -82,7 +85,7 @@ def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dic
 
     The meshes of the robot's URDF are drawn on the arm of a scene's last model, or of its measured motion if the scene
     has no model. If no mesh can be read, the arm is drawn as sticks."""
-    meshes: dict[str, TriangleMesh] | None = None
+    meshes: dict[str, list[list[int]]] | None = None
     made = []
     for scene in scenes:
         motions = [motion.to_dict() for motion in scene.motions]
@@ -93,29 +96,45 @@ def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dic
             motions[i]["poses"] = _joint_poses(system, theta, q, [name for name in meshes if name])
         t = [round(float(t), 4) for t in scene.t]
         made.append({"title": scene.title, "t": t, "scale": _POSITION_SCALE, "motions": motions})
-    parts = {
-        name: [np.rint(_POSITION_SCALE * mesh.vertices).astype(int).ravel().tolist(), mesh.faces.ravel().tolist()]
-        for name, mesh in (meshes or {}).items()
-    }
-    return {"scenes": made, "meshes": parts}
+    return {"scenes": made, "meshes": meshes or {}}
 
 
-def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, TriangleMesh]:
-    """Thinned meshes of a robot by the name of their joint; the empty name is the fixed base."""
-    try:
-        # the libraries that read meshes take a third of a second to import
+def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[list[int]]]:
+    """Vertices and faces of a robot's thinned meshes by the joint that carries them, "" for what does not move.
+
+    Reading and thinning takes a second: the user's cache keeps them for the same files, mounted in the same way.
+    """
+    with contextlib.suppress(OSError, YidError, SyntaxError):  # the last of a damaged URDF
         if robot is None or "<visual" not in read_input_text(resolve_urdf_path(robot)):
             return {}
-        found = load_robot_meshes_by_joint(robot, system.numeric_mechanism())
-    except (OSError, YidError):
-        return {}
+        mechanism = system.numeric_mechanism()
+        told = (file_sha256(Path(__file__)), mesh_sources_sha256(robot, mechanism), system.mechanism.joint_names)
+        file = private_cache_folder() / f"meshes-{json_sha256(told)[:32]}.json"
+        if file.is_file():
+            with contextlib.suppress(ValueError):
+                return dict(json.loads(file.read_text(encoding="utf-8")))
+        found = load_robot_meshes_by_joint(robot, mechanism)
+        names = (*system.mechanism.joint_names, "")
+        made = {names[j]: _integer_lists(mesh) for j, mesh in _thinned(found).items()}
+        with contextlib.suppress(OutputError):
+            write_text(file, json.dumps(made, separators=(",", ":")))
+        return made
+    return {}
+
+
+def _integer_lists(mesh: TriangleMesh) -> list[list[int]]:
+    return [np.rint(_POSITION_SCALE * mesh.vertices).astype(int).ravel().tolist(), mesh.faces.ravel().tolist()]
+
+
+def _thinned(found: dict[int, TriangleMesh]) -> dict[int, TriangleMesh]:
+    """Meshes by joint with merged vertices, so that those that move and those that do not have few enough faces."""
     for moving, most in _MAX_MESH_FACES.items():
         own, cell = {j: mesh for j, mesh in found.items() if (j >= 0) == moving}, _FIRST_MESH_CELL
         while sum(len(mesh.faces) for mesh in own.values()) > most:
             own = {j: _with_merged_vertices(mesh, cell) for j, mesh in own.items()}
             cell *= _CELL_GROWTH
-        found |= own
-    return {system.mechanism.joint_names[j] if j >= 0 else "": mesh for j, mesh in found.items()}
+        found = found | own
+    return found
 
 
 def _with_merged_vertices(mesh: TriangleMesh, cell: float) -> TriangleMesh:

@@ -11,6 +11,7 @@ Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations
 from __future__ import annotations
 
 import math
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -26,7 +27,7 @@ from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
-from yid_ocp.files import check_input_file, is_file
+from yid_ocp.files import check_input_file, file_sha256, is_file, json_sha256, read_input_text
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
@@ -299,6 +300,17 @@ def load_robot_meshes_by_joint(
     return {joint: TriangleMesh.concatenate(entries) for joint, entries in parts.items()}
 
 
+def mesh_sources_sha256(urdf: str | Path, mechanism: Mechanism) -> str:
+    """SHA-256 of all from which `load_robot_meshes_by_joint` makes visual meshes: files and where joints carry them."""
+    path = resolve_urdf_path(urdf)
+    robot = ElementTree.fromstring(read_input_text(path))
+    links = [name for entry in robot.iter("link") if (name := entry.get("name", "")) in mechanism.frames]
+    carried = [(name, joint, pose.tolist()) for name in links for joint, pose in [_carrier(mechanism, name)]]
+    meshes = {str(mesh.get("filename")) for mesh in robot.iterfind("link/visual/geometry/mesh")}
+    files = (Path(__file__), path, *(_resolve_mesh_path(name, path) for name in sorted(meshes)))
+    return json_sha256([carried, list(map(file_sha256, files))])
+
+
 def _carrier(mechanism: Mechanism, frame: str) -> tuple[int, Array]:
     """Joint that carries a frame, and the frame's pose relative to it."""
     found = mechanism.frames[frame]
@@ -352,8 +364,13 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
     return made
 
 
-@lru_cache(maxsize=64)
 def _load_mesh_file(file: Path) -> TriangleMesh:
+    return _mesh_of_file(file, file.stat().st_mtime_ns if is_file(file) else 0)
+
+
+@lru_cache(maxsize=64)
+def _mesh_of_file(file: Path, changed: int) -> TriangleMesh:
+    """The mesh of a file that was last `changed` at a time [ns]."""
     import trimesh
 
     try:
