@@ -120,6 +120,34 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     np.testing.assert_allclose(again.evaluate(x).residual, moved.evaluate(x).residual, atol=0.1)
 
 
+def test_candidates_of_other_places_are_left_out_of_a_refit(step):
+    """A step of one place's candidates gives the residuals of all, also where others add internal coordinates."""
+    made = composed(step, True, "joint_viscous", "joint_presliding", "effort_offset")
+    all_places, at = (
+        made.whitened_at({"elbow.stiffness": 2.5}),
+        {"elbow.stiffness": 2.6, "joint_viscous@shoulder.b": 0.02},
+    )
+    friction = next(e for e in made.candidate_effects if e.label == "joint_viscous@shoulder")
+    elsewhere = next(e for e in made.candidate_effects if e.location != "shoulder")
+    one_place = all_places.without_other_places([friction])
+    assert one_place.problem.step.sizes["nx"] < all_places.problem.step.sizes["nx"]
+    assert all_places.without_other_places(()) is all_places
+    assert all_places.without_other_places([friction, elsewhere]) is all_places
+    assert made.without_other_places([friction]).problem.whitening_filters == (None,)
+    found = []
+    for hypotheses in (all_places, one_place):
+        own = hypotheses.with_effects_and_relinearized_filters([friction], at)
+        own = hypotheses.with_relinearized_held_out_filters(own, [friction], at)
+        x = own.vector(at)
+        evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
+        rows = own.whitened_held_out_prediction_residual(0, *held).residual
+        found.append((own.unknown_names, evaluation.residual, evaluation.jacobian, rows))
+    names, values = zip(*((own[0], own[1:]) for own in found), strict=True)
+    assert names[0] == names[1]
+    for every, single in zip(*values, strict=True):
+        np.testing.assert_allclose(single, every, rtol=1e-6, atol=1e-6 * np.abs(every).max())
+
+
 def test_noise_that_drives_the_motion_is_no_gap(step):
     """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
     made = composed(step, True)

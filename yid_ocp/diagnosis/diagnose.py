@@ -43,6 +43,7 @@ from yid_ocp.diagnosis.refit import (
     RefittedModel,
     StoredFit,
     load_stored_refit,
+    model_in_step_of_all_candidates,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import CandidateScore, screen_candidates
@@ -229,9 +230,11 @@ def _diagnosed(
 
     judged = judge(search, evidence, located, finished)
     where = () if smoothed is None else located().locations
-    accepted = judged.accepted
-    final = accepted[-1].refitted_model if accepted else nominal
-    assert isinstance(final, RefittedModel)
+    accepted, final = judged.accepted, nominal
+    if accepted:
+        assert isinstance(accepted[-1].refitted_model, RefittedModel)
+        final = model_in_step_of_all_candidates(search.problem, accepted[-1].refitted_model)
+        judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     remaining, rest = held, where
     if accepted:
         remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)

@@ -14,6 +14,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.inference.whitening import (
+    WhiteningFilter,
     problem_relinearized_at_torque_bias,
     problem_whitened_at,
     problem_with_relinearized_held_out_whitening,
@@ -21,9 +22,12 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.model.system import System
+from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, truncate_episode
+from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
@@ -117,6 +121,8 @@ class AllCandidatesProblem:
     problem: EstimationProblem
     candidate_effects: tuple[EffectBase, ...]  # those that are tried: neutral in the nominal model and not left out
     is_split_in_blocks: bool  # whether a single recording is both estimated on and held out, in alternate blocks
+    # functions of the nominal system with the effects of one place alone, for a time step [s]
+    functions_of_place: CasadiLockedCache[tuple[str, float], ModelFunctions] | None = None
 
     @staticmethod
     def from_problem(
@@ -135,7 +141,18 @@ class AllCandidatesProblem:
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
-        return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held)
+
+        def functions(key: tuple[str, float]) -> ModelFunctions:
+            place, time_step = key
+            if time_step != problem.step.time_step:
+                return alone((place, problem.step.time_step)).with_time_step(time_step)
+            own = [effect for effect in effects if effect.location == place]
+            names = (*problem.free, *(name for effect in own for name in effect.parameters.names))
+            step = compile_step_like(problem.step, problem.step.system.with_effects(own))
+            return ModelFunctions(step, names, problem.options.initial_state_fit_parameters)
+
+        alone = CasadiLockedCache[tuple[str, float], ModelFunctions](functions)
+        return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held, alone)
 
     @property
     def nominal_free_parameters(self) -> tuple[str, ...]:
@@ -190,6 +207,19 @@ class AllCandidatesProblem:
         cut = problem.with_episodes(problem.episodes, kept) if kept else _in_blocks(problem)
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
+    def without_other_places(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
+        """Problem on the step of the candidates at the place of `effects` alone, where torque noise makes it worth it.
+
+        A step of all candidates costs three times as much. The problem is unchanged without effects, and where they
+        have several places, or the filters contain states of other candidates.
+        """
+        places = {effect.location for effect in effects}
+        if self.functions_of_place is None or len(places) != 1 or not self.problem.has_process_noise:
+            return self
+        functions = self.functions_of_place((places.pop(), self.problem.step.time_step))
+        own = _on_step_of_fewer_effects(self.problem, functions)
+        return self if own is None else replace(self, problem=own, functions_of_place=None)
+
     def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Estimation problem with the nominal parameters and those of `effects` free."""
         own = (name for effect in effects for name in effect.parameters.names)
@@ -213,6 +243,35 @@ class AllCandidatesProblem:
             if own.has_process_noise
             else own
         )
+
+
+def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFunctions) -> EstimationProblem | None:
+    """The problem, its episodes and filters on another step; None where filters contain states that it lacks."""
+    whole, part, n = problem.system, functions.step.system, problem.system.n_coordinates
+    joints = np.array([whole.mechanism.joint_index(name) for name in part.mechanism.joint_names], np.int64)
+    hidden = [*whole.effect_internal_coordinate_symbols]
+    inner = np.array([2 * n + hidden.index(name) for name in part.effect_internal_coordinate_symbols], np.int64)
+    kept = np.concatenate([joints, n + joints, inner])
+    filters = [own for own in (*problem.whitening_filters, *problem.held_out_whitening_filters) if own is not None]
+    if any(isinstance(own, WhiteningFilter) and np.delete(own.state_mask, kept).any() for own in filters):
+        return None
+
+    def placed(episode: Episode) -> Episode:
+        loop, start, rest = episode.tracking_feedback, episode.fixed_initial_state, episode.equilibrium_guess
+        return replace(
+            episode,
+            tracking_feedback=loop
+            and replace(loop, state_indices=np.searchsorted(kept, loop.state_indices).astype(np.int32)),
+            fixed_initial_state=start and replace(start, state=start.state[kept]),
+            equilibrium_guess=None if rest is None else rest[joints],
+        )
+
+    def masked(own: ProcessNoiseWhitener | None) -> ProcessNoiseWhitener | None:
+        return replace(own, state_mask=own.state_mask[kept]) if isinstance(own, WhiteningFilter) else own
+
+    episodes, held_out = (list(map(placed, own)) for own in (problem.episodes, problem.held_out))
+    made = (list(map(masked, own)) for own in (problem.whitening_filters, problem.held_out_whitening_filters))
+    return problem.with_model_functions(functions).with_episodes(episodes, held_out, *made)
 
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:

@@ -247,6 +247,7 @@ def refit_with_effects(
     name : str
         Name in the store. Default: the labels of the effects, which suffice if no other start is tried.
     """
+    problem = problem.without_other_places(effects)
     known = load_stored_refit(problem, effects, store, name)
     if known is not None:
         return known
@@ -294,6 +295,16 @@ def load_stored_refit(
         return None
     own = problem.with_relinearized_held_out_filters(own, effects, known.values)
     return _model(known, effects, own, finish, x, True)
+
+
+def model_in_step_of_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
+    """A refit with its problem and evaluation in the step of all candidates; its statistics are kept."""
+    if fit.problem.step is problem.problem.step:
+        return fit
+    own = problem.with_effects_and_relinearized_filters(fit.effects, fit.values)
+    finish = own.evaluate(own.vector(fit.values))
+    own = problem.with_relinearized_held_out_filters(own, fit.effects, fit.values)
+    return replace(fit, problem=own, evaluation=finish)
 
 
 def _model(

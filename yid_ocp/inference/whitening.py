@@ -55,6 +55,7 @@ from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
 
 _MIN_TORQUE_GAIN = 0.1  # acting over recorded torque at which errors of one are converted into those of the other
+_MIN_START_SLOPE = 1e-12  # derivatives of an initial state up to here are rounding
 _MAX_ROLLOUTS = 6  # each about the torque offset estimated from the one before
 _TORQUE_BIAS_TOLERANCE = 0.05  # change of the torque offset, in stated standard deviations, below which these end
 
@@ -154,10 +155,11 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     """The whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course)
-    live = moving_observable_state_mask(step, course.theta, course.rollout, seen=slopes.visible_state_mask)
+    start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
+    ends = {"seen": slopes.visible_state_mask, "disturbed": np.any(np.abs(start) > _MIN_START_SLOPE, axis=1)}
+    live = moving_observable_state_mask(step, course.theta, course.rollout, **ends)
     kept = np.flatnonzero(live)
     rows_of_node, slopes = slopes.residual_indices_by_first_node(count), slopes.select_states(kept)
-    start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
     first = unit @ unit.T

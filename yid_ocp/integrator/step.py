@@ -347,12 +347,14 @@ def moving_observable_state_mask(
     rollout: Rollout,
     loads: tuple[Array, Array] | None = None,
     seen: BoolArray | None = None,
+    disturbed: BoolArray | None = None,
 ) -> BoolArray:
     """Mask of the states that move and affect other states, efforts or sensors, shape (nx,).
 
     Internal states of a neutral effect are excluded. Only the first and the last step of the rollout are examined.
     `loads` are extra excitations as in `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend
-    on directly.
+    on directly. With `disturbed` (nx,), states with an error at the start, states that neither these
+    nor errors of torques reach are excluded too.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))
@@ -363,6 +365,11 @@ def moving_observable_state_mask(
     by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
     by_state, moved = by_all[:, :nx], np.any(by_all > 0, axis=1)
     moved[list(step.system.prescribed_coordinate_indices)] = False
+    if disturbed is not None:
+        reached = disturbed | np.any(by_all[:, nx:] > _MIN_SLOPE, axis=1)
+        while np.any(more := ~reached & np.any(by_state[:, reached] > _MIN_SLOPE, axis=1)):
+            reached |= more
+        moved &= reached
     felt = np.arange(len(moved)) < 2 * step.sizes["n"]
     felt |= False if seen is None else seen
     efforts = [effort[0, : step.sizes["nc"], :nx] for _, effort in ends]

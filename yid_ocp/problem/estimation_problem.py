@@ -381,6 +381,11 @@ class EstimationProblem(ReprMixin):
             theta[self.system.parameters.index(name)] = value
         return self._changed(theta=theta)
 
+    def with_model_functions(self, functions: ModelFunctions) -> EstimationProblem:
+        """Use functions of a system with the free and some fixed parameters. Episodes are kept as they are."""
+        index, names = self.system.parameters.index, functions.step.system.parameters.names
+        return self._changed(model_functions=functions, theta=self.theta[[index(name) for name in names]])
+
     def with_episodes(
         self,
         episodes: Sequence[Episode],
