@@ -245,9 +245,7 @@ class BlindCaseGenerator:
         return np.random.default_rng([self.seed, ALLOWED_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
     def _draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
-        """True values of free parameters, log-uniform about their initial values, and of all ordinary friction.
-
-        Parameters with a prior deviate from their initial values by about the prior's standard deviation."""
+        """True values of free parameters, log-uniform or according to a prior, and of all ordinary friction."""
         system, priors = self.problem.system, self.problem.options.prior_stds
         start = dict(zip(system.parameters.names, map(float, self.problem.theta), strict=True))
         drawn = {name: start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1) for name in self.problem.free}

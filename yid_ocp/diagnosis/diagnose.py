@@ -302,10 +302,7 @@ class _FinerStepRefitStore:
 def _finer_step_that_explains_gap(
     search: RefitContext, fit: RefittedModel, events: EventSet, ranked: Sequence[CandidateScore]
 ) -> RefitContext | None:
-    """All hypotheses at half the time step, if it explains over half of the best candidate's predicted decrease.
-
-    The test is one prediction at the nominal `fit` and one Gauss-Newton step, on the estimation recordings without
-    their `events`. None if it explains less or the prediction fails."""
+    """All hypotheses at half the time step, if it explains over half of the predicted decrease; else None."""
     h = fit.problem.step.time_step / 2
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
     finer = search.problem.with_time_step(h)
@@ -331,9 +328,8 @@ def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> Es
 def _happened(
     whole: EstimationProblem, fit: RefittedModel, limits: Thresholds, weighted: EstimationProblem | None = None
 ) -> tuple[EventSet, SmoothedUnknownsResult | None]:
-    """Events in all recordings, from the residual of a fit (none if the prediction fails), and the smoother's result.
-
-    `weighted` is the problem with all samples and with filters fixed at the fit, if there is one."""
+    """Events in all recordings, from the residual of a fit (none if the prediction fails), and the smoother's
+    result."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
     if own.system.unprescribed_coordinate_indices:

@@ -200,9 +200,7 @@ def _refitted_families(
 
 
 def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw], slack: float) -> bool:
-    """Whether a refit is as good as the best (the first), and no other such refit has fewer quantities.
-
-    It is as good if its held-out chi2/n is not significantly higher, or higher by at most `slack`."""
+    """Whether a refit's held-out chi2/n is close to the best (the first), with the fewest quantities of such refits."""
 
     def is_as_good(own: _RefittedLaw) -> bool:
         gained, error = held_out_improvement(own.loss, found[0].loss)
@@ -305,9 +303,7 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
 
 
 def _family(law: Law, residual: Array, slopes: Array) -> _Family:
-    """Evidence, values and prior of one law, at the curvature weight with the largest evidence.
-
-    The noise level is fitted, as model error may exceed sensor noise, and the prior scales with it."""
+    """Evidence, values and prior of one law, at the curvature weight and noise level with the largest evidence."""
     n, gram, pull = len(residual), slopes.T @ slopes, slopes.T @ residual
     total = float(residual @ residual)
     best: tuple[float, Array, Array] | None = None

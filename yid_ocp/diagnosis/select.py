@@ -157,9 +157,7 @@ def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds
 
 
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
-    """Whether an effect is significant, and held-out recordings are predicted clearly worse without it.
-
-    If both models leave only noise, the likelihood decides, otherwise the fraction of the gap that it closes."""
+    """Whether an effect is significant, and held-out recordings are predicted clearly worse without it."""
     before, after = without.held_out_loss, fit.held_out_loss
     (gained, error), gap = held_out_improvement(before, after), before.excess_chi2_per_sample
     is_open = gap > 0 and not _is_explained(without, limits)
@@ -293,9 +291,7 @@ class _Choice:
 
 
 def _reconsidered(search: RefitContext, chosen: _Choice, before: RefitStatistics) -> _Choice:
-    """Try each effect's place again with the others present: without the effect, and with other effects instead.
-
-    The last effect has just been tried so, if it was added to the effects of `before`."""
+    """Try each effect's position again with all others present: without it, and with other effects instead."""
     is_added = chosen.fit.effects[:-1] == before.effects
     tried = {frozenset(effect.label for effect in before.effects)} if is_added else set()
     while len(chosen.fit.effects) > 1:

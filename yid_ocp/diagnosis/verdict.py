@@ -208,9 +208,7 @@ def judge(
 
 
 def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, located: LocatedGap | None) -> float:
-    """The effects' decrease of r'r over the smoother's, each minus degrees of freedom; 1 if undefined.
-
-    With process noise it is undefined, because the smoother knows only the spectrum of torque noise."""
+    """Decrease of r'r by effects over that by the smoother, minus degrees of freedom; 1 with process noise."""
     if located is None or nominal.has_process_noise or located.chi2_decrease <= 0:
         return 1.0
     return (2 * (nominal.cost - last.cost) - last.effect_parameter_count) / located.chi2_decrease
@@ -273,10 +271,7 @@ def _compare(
 def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
-    """The fit with increased standard deviations of amplitudes that disagree between the recordings.
-
-    If two estimates differ by more than `_DISAGREEMENT_Z` of their combined standard deviation, each gets at least the
-    standard deviation of the pair, the difference over the square root of two."""
+    """The fit with stds of at least |difference|/sqrt(2) for amplitudes that disagree between recordings."""
     std = dict(fit.std)
     for entry in entries:
         (apart, spread), name = entry.estimate_difference_and_std, f"{entry.effect_label}.{entry.parameter}"

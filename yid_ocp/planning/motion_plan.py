@@ -167,8 +167,7 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
 
 
 def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> TargetMotionPlan:
-    """Find the best motion of one duration, and refine it with shorter time steps to resolve the residual
-    oscillation."""
+    """Find the best motion of one duration, refined with shorter time steps to resolve residual motion."""
     options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
     lower, upper = mover.coefficient_bounds()
     for halved in range(_MAX_STEP_HALVINGS + 1):

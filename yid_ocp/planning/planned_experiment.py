@@ -85,9 +85,7 @@ class ParameterizedExperiment:
         return ParameterizedExperiment(problem, known, mover, tuple(names) or problem.free)
 
     def _noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
-        """Noise-free predicted recording of a motion (K, nc), with its sensors' standard deviations.
-
-        The samples of point sensors above the rate `fastest` [Hz] are thinned; their information per second is kept."""
+        """Noise-free predicted recording of a motion; points above the rate `fastest` [Hz] are thinned."""
         mover, base = self.simulator, self.configured_problem.episodes[0]
         rollout, system = mover.simulate_path(w), mover.step.system
         if not rollout.status.is_converged:

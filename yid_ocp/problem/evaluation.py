@@ -121,7 +121,7 @@ def whitened_episode_residual(
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
-    Constant sensor errors count as noise (`whitened_for_sensor_biases`). `threshold` is that of the Huber loss."""
+    Constant sensor errors count as noise (`whitened_for_sensor_biases`). `threshold` is the Huber threshold."""
     by_constants = whitened_measurement_sensitivities_to_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)

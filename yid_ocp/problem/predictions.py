@@ -359,9 +359,7 @@ def _commanded(
 def _levels(
     predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...]
 ) -> tuple[Array | None, Array | None, Array | None]:
-    """Standard deviations (nj,) of angle, torque and constant torque error, as the estimation assumes them.
-
-    For driven joints they are the input errors, else the stated levels; None if nothing is stated."""
+    """Standard deviations (nj,) of angle, torque and torque offset assumed by the estimation; None if not stated."""
     joints, driven = episode.recording.joints, predictor.system.driven
     assert joints is not None
     effort = predictor.options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())

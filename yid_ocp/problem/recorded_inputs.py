@@ -197,7 +197,7 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
     """Remove effort noise from gear loads: the model's loads plus the slow part of measured minus model.
 
     `measured` and `own` (the model's) are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
-    difference is constant. `cutoff` [Hz] is that of the filter of paths and efforts."""
+    difference is constant. `cutoff` [Hz] is the cutoff of the filter of paths and efforts."""
     gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 

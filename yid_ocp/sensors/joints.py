@@ -141,9 +141,9 @@ def smoothed_effort_data(
 ) -> SensorData:
     """Low-pass filter an effort sensor's measurements and thin them until their noise is nearly independent.
 
-    `values` (M, k) are in the sensor's unit. `std` (k,) is that of their white noise, `bias` (k,) that of a constant
-    error. With `is_sample`, a value belongs to its time, otherwise it is the mean of the interval until the next value.
-    Raises `DataError` if the recording is too short for the filter."""
+    `values` (M, k) are in the sensor's unit, with white noise `std` (k,) and constant errors `bias` (k,) (stds). With
+    `is_sample`, a value belongs to its time, otherwise it is the mean of the interval until the next value. Raises
+    `DataError` if the recording is too short for the filter."""
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
     # the mean of an interval belongs to its middle
     late = 0.0 if is_sample else 0.5 * period
@@ -161,9 +161,9 @@ def nodes_and_decorrelated_values(
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
 
-    `values` (M, k) belong to the times `t` + `late` [s]. The filter is that of the path (`like_path`) or of efforts,
-    whose prediction is smoothed again. Raises `DataError`, with the name `noun`, if the recording is too short for the
-    filter."""
+    `values` (M, k) belong to the times `t` + `late` [s]. `like_path` selects the path filter; the default is the effort
+    filter, which is also applied to predictions. Raises `DataError`, with the name `noun`, if the recording is too
+    short."""
     low_pass = around.path_filter if like_path else around.effort_filter
     times, smooth = around.node_times, low_pass(t, values)
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)

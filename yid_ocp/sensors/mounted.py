@@ -117,8 +117,7 @@ def _with_encoder_noise(
 ) -> tuple[Array, Array | None]:
     """Noise std (M, k) and correlation (M, k, k) of smoothed readings that are predicted from noisy encoders.
 
-    The smoothed path of prescribed joints has errors of angles, velocities and accelerations. The readings respond to
-    them linearly at the recorded joint angles, at standstill, with all other coordinates at zero."""
+    The responses to errors of angles, velocities and accelerations are linearised at standstill."""
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     known = None if joints is None else encoders.std if encoders.std is not None else joints.position_std
     names = () if joints is None else tuple(name for name in around.system.prescribed if name in joints.names)

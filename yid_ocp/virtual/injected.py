@@ -530,9 +530,7 @@ def run_experiment_with_effects(
 
 
 class _InjectedTerms:
-    """Effects of `_MUJOCO_MODEL_KINDS`, `_FORCES` or `OUT_OF_LIBRARY_FORCE_BUILDERS` as `InjectedSimulatorTerms`.
-
-    Amplitudes of `held_frictions` (joint friction that the engine's solver simulates) at one joint add up."""
+    """Injected effects as `InjectedSimulatorTerms`; amplitudes of `held_frictions` at one joint add up."""
 
     def __init__(
         self,

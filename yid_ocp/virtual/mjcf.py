@@ -329,9 +329,7 @@ def _bodies(
     world: Element,
     gears: Mapping[str, Mapping[str, str]],
 ) -> dict[int, Element]:
-    """Add bodies with joints and masses. Returns the body of each joint by its index, with -1 for the world.
-
-    `gears` holds, by motor joint, the attributes of the joint between the motor and its load."""
+    """Add bodies with joints, masses and `gears`. Returns the body of each joint by its index (-1: the world)."""
     carried = {frame.joint_index: name for name, frame in reversed(sites)}
     elements: dict[int, Element] = {-1: world}
     for j, joint in enumerate(tree.joints):

@@ -467,9 +467,7 @@ def _require_compatible(run: RunSettings) -> None:
 def _blind_experiments_and_refinable_subset(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, _BlindExperiment], frozenset[str]]:
-    """Virtual experiments by name, and the names of those whose object's links can be divided further.
-
-    Variations that a configuration does not allow are omitted, such as a missing object that carries frames."""
+    """Virtual experiments that a configuration allows, by name, and those whose links can be divided further."""
     found: dict[str, _BlindExperiment] = {}
     chains = set()
     for name, config in configs.items():

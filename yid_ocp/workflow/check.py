@@ -203,9 +203,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
-    """Lowest natural frequencies with twice the links, and with half and a quarter of the time step.
-
-    `links` and `time_step` are lists of {value, hertz, growing, message}, empty if nothing can be varied."""
+    """Lowest natural frequencies with twice the links (`links`), and with half and a quarter of the `time_step`."""
     system = build_system(run)
     h = run.problem.time_step_or_default if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)

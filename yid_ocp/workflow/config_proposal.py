@@ -364,9 +364,7 @@ def _places(
 def _samples_to_place_by(
     tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[Segment], holder: str
 ) -> PointGroup:
-    """Samples of a group, only those at standstill if moving points are farther away than a single segment is long.
-
-    A late clock causes such distances."""
+    """Samples of a group, only those at standstill if points are too far away in motion (a late clock)."""
     at = _poses(tree, recording, holder, group.t)[:, :3, 3]
     apart = np.linalg.norm(group.position - at[:, None], axis=2)
     farthest = float(np.max(apart, initial=0.0, where=np.isfinite(apart)))
@@ -401,9 +399,7 @@ def _near(
     branches: Sequence[Segment],
     holder: str,
 ) -> tuple[str, str]:
-    """Most probable frame of a point, from its measured positions relative to the holder, and the reason.
-
-    `part_when_straight` is its fraction of a single segment's length in a straight pose, or NaN without such a pose."""
+    """Most probable frame of a point, from its positions relative to the holder, and the reason."""
     seen = np.isfinite(position).all(axis=1)
     if not seen.any():
         return "", "it was never seen"

@@ -157,9 +157,7 @@ def recording_doubt_lines(recording: Recording) -> list[str]:
 def _merged(
     files: Sequence[str], options: Mapping[str, Any], offsets: Mapping[str, float] | None, progress: Progress
 ) -> Recording:
-    """One recording from several files. An option applies to every file whose format or columns support it.
-
-    Joints and points are selected, and currents converted to torques, after the merge."""
+    """One recording from several files. An option applies to every file that supports it."""
     known = {file: () if has_native_recording_suffix(file) else reader_option_names(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):

@@ -356,9 +356,7 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
 
 
 def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Values of every parameter that is free in one of two runs, and their difference over the larger std.
-
-    The difference is None if a run could not identify the value."""
+    """Values of parameters that are free in one of two runs, and their difference [larger std] or None."""
     parameters: dict[str, Any] = {}
     for name in dict.fromkeys(name for own in found for name, entry in own.items() if entry.get("free", True)):
         known = {label: own[name] for label, own in zip(labels, found, strict=True) if name in own}

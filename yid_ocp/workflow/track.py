@@ -62,9 +62,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 def _run_track(
     run: RunSettings, out: str | Path | None, progress: Progress, workers: WorkerConfig | None
 ) -> CommandOutcome[None]:
-    """Track the frames of `track.frames_path` or of a virtual camera. Results of an interrupted run are reused.
-
-    If no frame is good, an error is raised and the run folder holds the reasons."""
+    """Track the frames of `track.frames_path` or of a virtual camera. Results of an interrupted run are reused."""
     settings = run.track
     with atomic_run_folder(run, out, "track") as folder:
         folder.record_run_start(run, "track")

@@ -1,7 +1,6 @@
-"""Input data, registration and rendering of report sections. Each file of this folder registers some.
+"""Input data, registration and rendering of report sections. Each file of this folder registers some sections.
 
-A file outside the package does as well, once it is imported; its template `NAME.html` stands beside it.
-"""
+A plug-in can register sections too; its template `NAME.html` is next to its file."""
 
 from __future__ import annotations
 
@@ -23,11 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Input data of a report, with `result` as in result.json, and problem, solution and further objects of a run.
+    """Input data of a report: `result` as in result.json, and problem, solution and further objects of a run.
 
-    `animations` are what moves where that does not follow from `problem`, `solution` and `held_out`; `section_data` is
-    whatever else a command's own sections need; `robot` is the URDF file whose meshes arms wear.
-    """
+    `animations` replaces the animations made from `problem`, `solution` and `held_out`. `section_data` holds other data
+    for the sections of a command. `robot` is the URDF file of the arms' meshes."""
 
     name: str
     description: str
@@ -55,11 +53,10 @@ REPORT_SECTIONS: Registry[_ReportSection] = Registry("report section")
 
 
 def register_report_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
-    """Register a function as the report section `name` (decorator). Sections of lower `order` come first.
+    """Decorator that registers a function as the report section `name`. Sections with lower `order` come first.
 
-    It returns what the template `NAME.html` needs, or pairs of title and figure, which need none; None, or no pair,
-    where it has nothing to say.
-    """
+    The function returns the context of the template `NAME.html`, or pairs (title, figure) for a section without a
+    template. It returns None, or no pair, if the section has no content."""
 
     def enter(prepare: _PrepareContext) -> _PrepareContext:
         REPORT_SECTIONS.register(name)(_ReportSection(order, title, prepare))
@@ -71,7 +68,7 @@ def register_report_section(name: str, order: int, title: str) -> Callable[[_Pre
 def figures_by_unit(
     rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any]
 ) -> list[tuple[str, Any]]:
-    """Draw one figure per unit from the rows (name, unit, row) with that unit. Pairs have an empty title."""
+    """Draw one figure per unit from rows (name, unit, row). Returns pairs (empty title, figure)."""
     grouped: dict[str, dict[str, _Row]] = {}
     for name, unit, row in rows:
         grouped.setdefault(unit, {})[name] = row
@@ -79,7 +76,7 @@ def figures_by_unit(
 
 
 def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
-    """Render name, title and HTML of every section with content, in order."""
+    """Render all sections with content, in order: name, title and HTML."""
     result = []
     sections = {name: REPORT_SECTIONS[name] for name in REPORT_SECTIONS}
     for name, section in sorted(sections.items(), key=lambda entry: entry[1].order):

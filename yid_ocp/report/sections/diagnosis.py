@@ -1,4 +1,4 @@
-"""Report section on the gap, locations, candidates and predictions of a diagnosis."""
+"""Report sections of a diagnosis: gap, locations, candidates and predictions."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
 
 
 def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int, kept: list[int]) -> tuple[Any, str]:
-    """Map of the unknowns `kept` over recording i, and a sentence on the most significant value."""
+    """Heat map of the unknowns `kept` over recording i, and a sentence on the most significant value."""
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
@@ -271,7 +271,7 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
 
 
 def _library_curves(table: LawTable, at: Array) -> dict[str, Array]:
-    """The curve of the library's laws that is nearest to a table, by weighted least squares of its amplitudes."""
+    """The curve of the library's laws that best fits a table, by weighted least squares of its amplitudes."""
     shapes: dict[str, Callable[[Array], Sequence[Array]]] = {}
     if table.quantity == "speed":
         shapes = {

@@ -1,4 +1,4 @@
-"""Report sections common to all commands, on conclusions, estimates, motion and measurements."""
+"""Report sections common to all commands: conclusions, estimates, motion and measurements."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _remaining_tables(findings: ReportData) -> Mapping[str, Any] | None:
 
 
 def _result_blocks(findings: ReportData) -> tuple[list[str], list[StatementTableOrCode], list[StatementTableOrCode]]:
-    """Conclusions and verdicts of a result, and the other blocks up to its key table and after it."""
+    """Conclusions and verdicts of a result, then the other blocks, split at the end of its key table."""
     known = SUMMARY_BY_RESULT_FORMAT.get(str(findings.result.get("format")))
     blocks = [] if known is None else known(findings.result)
     ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, SummaryTable) and block.is_key_table)
