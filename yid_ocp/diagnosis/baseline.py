@@ -31,7 +31,7 @@ from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers import Status
 
 _MIN_INFORMED_FRACTION = 0.05
-"""Part of a prior's variance that the data take away, below which they say nothing of the parameter."""
+"""Relative reduction of a prior's variance below which the data do not inform a parameter."""
 
 
 @dataclass(frozen=True)

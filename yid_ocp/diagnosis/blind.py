@@ -131,9 +131,9 @@ _OUT_OF_LIBRARY_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "stiffness_drift": ("segment", 0.2, 0.5, ""),
     "one_way_damping": ("segment", 0.3, 1.0, ""),
 }
-"""Of effects outside the library: where they sit, their least and largest size, and what of it they are parts of."""
+"""Effects outside the library, by kind: type of location, smallest and largest size, reference of relative sizes."""
 _GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.08
-"""How far the grippers go, one alone and several on one object, which they soon bring to snap [m]."""
+"""Travel of a single gripper, and of several grippers on one object, which snaps easily [m]."""
 
 
 @dataclass(frozen=True)
@@ -196,8 +196,7 @@ class SyntheticMeasurementConditions:
 
 
 _Detectable = tuple[EffectBase, Mapping[str, float], Array]
-"""A candidate, values of its shape parameters, and F (p, p): |F a| is by how many standard deviations of the data the
-amplitudes a move the residual."""
+"""A candidate, values of its shape parameters, and F (p, p): amplitudes a move the residual by |F a| [data stds]."""
 
 
 class BlindCaseGenerator:

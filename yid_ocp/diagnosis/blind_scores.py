@@ -40,7 +40,7 @@ _OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
 """Categories whose true effect is not among the candidates."""
 _MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
 _NOT_JUDGED = "not_judged"
-"""Verdict of a recorded case where other thresholds ask for a refit that was not made."""
+"""Verdict of a recorded case if other thresholds need a refit that was not made."""
 _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", _NOT_JUDGED)
 
 
@@ -59,8 +59,8 @@ class BlindCaseScore:
     kind_second: bool  # whether the true kind is among the first two candidates
     location_first: bool
     confusable: tuple[str, ...]  # set that was named as not separable
-    # as the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, each of a
-    # pair likewise, unknown at the right place outside the library
+    # whether the answer is right: no_gap for a clean case, the true effect alone or in a set of at most three, each
+    # effect of a pair likewise, unknown at the right location for an effect outside the library
     right: bool
     closure: float  # fraction of the held-out gap closed by the effects added
     best: float  # the same by a refit of the true effects

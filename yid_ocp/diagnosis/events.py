@@ -69,8 +69,7 @@ class ForceOrFaultEvent:
     kind: str  # "force" or "sample"
     start_time: float  # since the start of the recording [s]
     end_time: float
-    # largest value with its sign, in `unit`: a force beside what the model and the recording have, or measured
-    # less true
+    # largest signed value, in `unit`: of the force beyond model and recording, or of measured minus true
     peak_value: float
     impulse: float  # integral over time [unit x s]
     impulse_std: float  # standard deviation of the impulse, counting what the model is allowed to be wrong by

@@ -35,8 +35,8 @@ CandidateNamesOrAll = Literal["all"] | Sequence[str]
 _BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
 _MIN_PREDICTED_DURATION = 1.0  # shortest beginning of a held-out recording that is worth predicting [s]
 KEPT_HELD_OUT_DURATION_FRACTIONS = (0.9, 0.5, 0.0)
-"""Parts of what a model can be rolled out on that are kept, one after the other while it still fails: near its end a
-model is lost already, and a fit on less of the recording may fail earlier."""
+"""Fractions of the successful part of a rollout to keep, tried in order while the rollout still fails: before it
+fails, a model has already deviated, and a fit on a shorter recording may fail earlier."""
 
 
 def make_candidate_effects(

@@ -39,8 +39,8 @@ _STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m
 class _TorqueTermSizes:
     """Magnitudes (M, n) of each inverse dynamics term of every coordinate at some nodes of a rollout."""
 
-    # root of the sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal forces,
-    # gravity, springs, friction, effects' forces and the torque that was applied or needed [N m or N]
+    # root sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal forces,
+    # gravity, springs, friction, effects' forces and the applied or required torque [N m or N]
     rss_torque: Array
     torque_rate: Array  # of the torque needed [N m/s or N/s]
     static_friction_limit: Array  # what friction may hold at rest, gone above `_STANDSTILL_SPEED` [N m or N]
@@ -110,7 +110,7 @@ def _function(system: System, time_step: float) -> ca.Function:
 _SparseMatrix = Any  # scipy.sparse.csc_array or, of few profiles, ndarray; the former has no types
 
 _MODEL_ERROR_TIME, _SLOW_FORCE_TIME = 0.3, 2.0
-"""Times in which the error of a model and the rest forget their values, a and b [s]."""
+"""Correlation times a of the model error and b of the slow background [s]."""
 _MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS = (1.0, 2.0, 4.0), (0.0, 0.5, 1.0), (0.25, 1.0)
 """c, w in units of the robust spread of the history, s in units of its root mean square."""
 _MIN_PULSE_POINTS = 2.5  # points that the shortest pulse covers

@@ -218,7 +218,7 @@ class RefitContext:
 
 
 _MAX_RECORDED_PAIRS = 48
-"""Pairs of candidates that a search looks at; beyond them all promise less than those that are refitted."""
+"""Number of recorded pairs of candidates; all further pairs predict a smaller decrease than the refitted pairs."""
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,7 @@ class ConfusabilityMatrix:
 
 
 CandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
-"""Two candidates, their values after the step of the linear model, and by how much more than by chance r'r falls."""
+"""Two candidates, their values after the step of the linear model, and its decrease of r'r beyond chance."""
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ _REASONS_FOR_UNKNOWN: Mapping[UnknownVerdictReason, Callable[[Judgement, Thresho
     "little": _is_little_explained,
     "stand_in": lambda said, limits: bool(said.failed_transfer_checks),
 }
-"""Rules that effects have to pass, in the order in which the first that fails is the reason why none is accepted."""
+"""Rules that effects must pass, in order; the first failed rule is the reason why no effect is accepted."""
 
 
 def _with_verdict(said: Judgement, gap: bool, are_data_sufficient: bool, limits: Thresholds) -> Judgement:

@@ -100,10 +100,9 @@ class InputErrorModel:
     has_encoder_measurements: bool
     torque_bias: Array  # value of b that is subtracted from the recorded torque, (nu,)
     torque_noise: Array  # value of w that is subtracted in every step, (N, nu)
-    # noise of the recorded torque that w implies, subtracted before effects on torques apply, (N, nu) [N m]; then the
-    # part of w that this already removes from the acting torque
+    # noise of the recorded torque that follows from w, subtracted before effects on torques apply, (N, nu) [N m]
     recorded_torque_noise: Array
-    transmitted_torque_noise: Array
+    transmitted_torque_noise: Array  # part of w that this subtraction removes from the applied torque, (N, nu)
     smoothed_reference: Array | None = None  # of the tracking filter, in place of the measured motion, (N, nb)
 
     @property

@@ -20,16 +20,15 @@ from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import Sensor, sensor_reading_function
 
-# Width of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
-# deviation of a measured point [rad]; other joints in proportion to their stiffness.
+# Width of the elastic prior [rad]: this bend at a joint of mean stiffness costs as much as one standard deviation of a
+# measured point. The cost of other joints is proportional to their stiffness.
 _BEND_STD = 0.5
 # Joints without a spring, or with one far softer than the rest, are still held a little.
 _MIN_STIFFNESS_RATIO = 1e-4
 # Standard deviation of a coordinate's rate where the points leave it open [rad/s].
 _RATE_STD = 3.0
 _CONSTRAINT_STD = 1e-5
-# The object is first pulled into place softly, by measurements with so many times their noise: pulled hard at once,
-# it ends in knots.
+# The fit starts with the noise of measurements multiplied by this factor: a stiff fit from the start ends in knots.
 _NOISE_FACTORS = (1000.0, 100.0, 10.0, 1.0)
 # The stage before which the best of all trials is chosen: there the object has its place and hardly its details.
 _SELECTION_STAGE = 2

@@ -32,7 +32,7 @@ _MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # of places that are listed
 _MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
 _MAX_TERMINAL_PARAMETERS = 6  # parameters that have a column of their own on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak", None)
-"""Verdicts of parameters whose values count; a diagnosis gives its parameters none."""
+"""Verdicts of parameters whose values count; None for the parameters of a diagnosis."""
 _MAX_RUN_DIFFERENCE = 2  # between two runs, from which on a parameter is named [std]
 
 

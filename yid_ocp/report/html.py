@@ -20,7 +20,7 @@ from yid_ocp.report.terminal import CodeBlock, SummaryTable
 
 log = logging.getLogger(__name__)
 _SHARED_SCRIPT_LEVELS = 2
-"""Levels above a page where a script that it may share is looked for: a batch is two above the pages of its runs."""
+"""Levels above a page that are searched for a shared script: a batch is two levels above the pages of its runs."""
 _WRAP_LENGTH = 24  # characters from which the cells of a column are wrapped
 _NUMBER = re.compile(
     r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"

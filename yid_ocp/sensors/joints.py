@@ -167,9 +167,9 @@ def nodes_and_decorrelated_values(
     low_pass = around.path_filter if like_path else around.effort_filter
     times, smooth = around.node_times, low_pass(t, values)
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
-    # Smoothed values repeat their neighbours: only as many are kept as count as independent, none between the samples.
-    # Both ends are left out: the filter sees one side alone there, the impulse at node 0 depends on the motion before
-    # the recording and that at the last node on the motion after it.
+    # Neighbouring smoothed values are correlated: only nearly independent ones at samples are kept. Both ends are
+    # omitted: there the filter has data on one side only, and the impulses depend on the motion before or after the
+    # recording.
     step, steps = around.time_step, len(times) - 1
     apart = max(1, round(float(np.median(np.diff(t))) / step))
     ends = apart * math.ceil(max(1, math.ceil(low_pass.settling_time / step)) / apart)
@@ -231,8 +231,8 @@ def _joint_noise_std(
 joint_angle_noise_std = partial(_joint_noise_std, group=JOINT_POSITION_GROUP_NAME)
 """Noise standard deviation of joints' encoders, stated or estimated, shape (len(names),) [rad].
 
-Unless the settings give it, a step of the encoder adds the variance step^2/12; it is that of the recording's
-`position_resolution`, else the one that gaps between values show.
+Unless the settings give the noise, the encoder's resolution adds the variance step^2/12. The step is the recording's
+`position_resolution` or, if not stated, is estimated from the gaps between values.
 """
 joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME)
 """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""

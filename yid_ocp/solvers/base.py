@@ -289,27 +289,27 @@ class AcceptedIterateRecorder:
         return SolverResult(status, message, x, tuple(self.history), self.n_evaluations, equilibrium_guesses)
 
 
-# A start from which the rollout fails is approached over shorter horizons, each the start of the next [fraction].
+# If the rollout fails at the start, shorter horizons are solved first; each result is the start of the next [fraction].
 _HORIZON_FRACTIONS = (0.06, 0.12, 0.25, 0.5)
-# A fit whose chi2 per degree of freedom exceeds this may be a wrong minimum (a soft object has several shapes at rest):
-# it is started again from these multiples of the initial values, and the best is kept.
+# A fit with more chi2 per degree of freedom may be a wrong minimum (a soft object has several equilibrium shapes). It
+# is repeated from these multiples of the initial values, and the best fit is kept.
 _POOR_CHI2_PER_DOF = 5.0
 INITIAL_VALUE_RESTART_FACTORS = (4.0, 2.0, 10.0)
-# Beside noise that drives the motion a wrong minimum may have chi2 per degree of freedom of only 1.03. Where a
-# relative std exceeds the first, or a value falls below the second part of its start, another start is tried.
+# With process noise, a wrong minimum can have a chi2 per degree of freedom of only 1.03. Another start is tried if a
+# relative std exceeds the first number, or the ratio of a value to its initial value falls below the second.
 _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
-# An arm that folds the object for a moment separates minima that lie near each other: where the model does not explain
-# the recording, starts these factors off the best fit are tried, stiffer ones, with which less folds.
+# If the arm folds the object for a moment, minima can be close together. If the model does not explain the recording,
+# the best fit is multiplied by these factors and tried again: a stiffer object folds less.
 _NEARBY_START_FACTORS = (1.25, 1.6)
-# A branch that is seen a few times a second has the phase of several frequencies: what is known worse than this part of
-# its value may have other minima. It is moved by these factors, the others as the fit's covariance says, and where the
-# cost then rises by less than this part of what the fit predicts, the search goes on from there, twice at most.
+# A branch measured a few times a second fits several frequencies, so a parameter with a relative std above the first
+# number can have other minima. It is multiplied by these factors, and the others follow the fit's covariance. If the
+# cost rises by less than the second number times the predicted rise, the search continues there (twice at most).
 _MIN_SCANNED_RELATIVE_STD, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = 0.03, 0.2, 2
 _SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
-# Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
+# Process noise is linearised at the start of a pass; passes end when one changes nothing.
 _MAX_WHITENING_PASSES = 6
-# A search that comes this near to a known fit takes that fit [standard deviations]. Two searches may well end farther
-# apart in one minimum, by the tolerance of a solver or the weights of the last pass, and the better end counts.
+# A search that comes this close to a known fit returns that fit [standard deviations]. Two searches can end farther
+# apart in the same minimum, because of solver tolerance or the last pass's whitening; the better end is kept.
 _SAME_FIT_STDS = 0.01
 _STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 

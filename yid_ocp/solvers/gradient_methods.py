@@ -32,11 +32,11 @@ from yid_ocp.solvers.base import (
     projected_gradient_norm,
 )
 
-# A positive unknown falls by no more than this factor in one step, until it is this part of its typical size.
+# A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
-# So many accepted steps in a row are the end if together they save no more of the cost than this, a tenth of what one
-# standard deviation is worth, and move no unknown by more than this part of its standard deviation, and if the linear
-# model promises no more than what a 95 % interval is worth.
+# The search ends after this many accepted steps that together lower the cost by no more than this (a tenth of the cost
+# of one standard deviation) and move no unknown by more than this fraction of its standard deviation, if the predicted
+# decrease is at most the cost of a 95 % interval.
 _PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = 20, 0.05, 0.1
 _LOWEST = "the cost cannot be lowered any further"
 

@@ -402,8 +402,7 @@ def _cord(size: float, way: Array) -> Array:
 
 
 def _one_way_damping(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    # MuJoCo gets it as its own damping, which it integrates implicitly: a light branch under so much explicit
-    # damping bursts
+    # as MuJoCo's own damping, which is integrated implicitly: with explicit damping a light branch becomes unstable
     both = scene.bend_joint_ids(model, segment)
     usual = model.dof_damping[both].copy()
 
@@ -472,7 +471,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
     # a grasp that holds, lets the tube slip along itself, and holds again [m a slip]
     "slipping_grasp": _in_motion(_slipping_grasp),
 }
-"""Effects outside the library by kind: forces by the scene, MuJoCo's model, a place and a size."""
+"""Effects outside the library, by kind: makers of forces from scene, MuJoCo model, location and size."""
 
 
 @dataclass(frozen=True)

@@ -234,8 +234,8 @@ class RobustCostDerivatives:
     gradient: Array  # (10,)
     hessian: Array  # (10, 10), of Gauss and Newton
     curvature_ratio: float  # of the sum, as a share of that
-    # (10, 10), outer products of gradients summed over frames and over patches, less those of each patch in each
-    # frame, which both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011)
+    # (10, 10): outer products of gradients, summed over frames plus over patches minus over each patch in each frame
+    # (counted twice), and at least the last sum (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
 
     def data_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:

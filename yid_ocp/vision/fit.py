@@ -40,7 +40,7 @@ from yid_ocp.vision.shape_evidence import (
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _Left = tuple[BoolArray, BoolArray]
-"""Which of a frame's nodes and points count."""
+"""Masks of the nodes and points of a frame that are used."""
 _NODE_RADIUS_FRACTION = math.pi / 4  # of a tube's, at which the mean of its visible half lies from its axis
 _END_OFFSET_STDS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
 _MAX_POINT_DISTANCE_SCALES = 3.0  # times the last scale, beyond which a point says nothing of the shape

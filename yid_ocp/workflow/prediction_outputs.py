@@ -120,7 +120,7 @@ def predicted_configuration_trajectory(
 SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
 DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/1"
 EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, EpisodePrediction]
-"""A held-out recording, its prediction by the nominal model and that with the effects."""
+"""A held-out recording, its prediction by the nominal model, and its prediction with the effects."""
 
 
 def write_solve_trajectories(
