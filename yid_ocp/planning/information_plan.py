@@ -43,7 +43,7 @@ class _ParameterPrecision:
     std_recorded: float
     std_planned: float
     std_combined: float
-    verdict: str  # by the planned recording alone
+    verdict: str  # from the planned recording alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class InformativeMotionPlan(PlannedMotion):
     start_results: tuple[MotionSearchResult, ...]  # of the random initial motions, in the order drawn
     best_start_index: int
     active_limits: Mapping[str, tuple[str, ...]]  # joints, springs or frames that reach a limit, by kind of limit
-    unobservable_parameters: Mapping[str, str]  # which no motion informs, each with the measurement that would
+    unobservable_parameters: Mapping[str, str]  # parameters that no motion informs, each with a measurement that would
     unidentifiable_directions: tuple[str, ...]  # sentences on what the planned recording would leave unidentifiable
 
 

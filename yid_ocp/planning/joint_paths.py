@@ -140,7 +140,7 @@ class FramePositionEvaluator:
 
 
 _SPLINE_DEGREE = 5
-_N_REST_CONTROL_POINTS = 3  # control points alike at either end: no velocity and no acceleration there
+_N_REST_CONTROL_POINTS = 3  # equal control points at each end, for zero velocity and acceleration there
 
 
 @dataclass(frozen=True)
@@ -256,9 +256,9 @@ class PathSimulator:
         return np.asarray(self.start_equilibrium.state[: self.step.system.n_coordinates])
 
 
-_TRAVEL_WEIGHT = 1e-2  # of a joint's travel [rad] beside the distance to the place in units of what counts as reached
+_TRAVEL_WEIGHT = 1e-2  # weight of a joint's travel [rad] relative to the distance to the target [position tolerances]
 _MIN_POINT_MOBILITY = 1e-9  # motion of the point by a joint's, in metres per radian or metre, that counts as none
-TARGET_REACHED_TOLERANCE_FACTOR = 1.5  # of that unit: beyond it a place is out of reach
+TARGET_REACHED_TOLERANCE_FACTOR = 1.5  # in position tolerances; beyond it, a target is out of reach
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from yid_ocp.planning.joint_paths import (
 from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionSearch, TargetMotionSearchResult
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
-_MAX_STEP_HALVINGS = 3  # of the time step
+_MAX_STEP_HALVINGS = 3  # largest number of halvings of the time step
 _CONVERGED_TOLERANCE_FRACTION = 0.1  # change by halving it, in parts of the tolerances, that counts as none
 
 
@@ -257,7 +257,7 @@ def _outcome(
         message += "; the model could not be stepped to the end of the motion"
     if broken:
         message += "; take a longer plan.duration, a nearer place, or a higher plan.limits where the machine allows it"
-    # what errs least over all likely parameters need not arrive with the likeliest ones
+    # the motion with the smallest mean error need not reach the target at the most likely parameters
     doubt = float(np.linalg.norm(std)) if std is not None and rows.options.minimize_parameter_sensitivity else 0.0
     far = not error <= TARGET_REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
     if shot.is_converged and far:

@@ -28,9 +28,9 @@ from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions, memoize_last_call
 from yid_ocp.planning.planned_experiment import ParameterizedExperiment
 
-_LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
+_LIMIT_NODE_STRIDE = 2  # node spacing at which limits on free coordinates are evaluated
 _QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]
-_ACCELERATION_WEIGHT = 1e-3  # of their mean square, in parts of their limit: of equal motions the calmer one
+_ACCELERATION_WEIGHT = 1e-3  # of the mean square acceleration [limits], to prefer the calmer of two equal motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,8 @@ class PlanResidualAndLimitFunctions:
 
     simulator: PathSimulator
     options: PlanOptions
-    point: FramePositionEvaluator  # of the frame that is to arrive, and of all frames that are to rest
-    target: Array  # (3,), where it is to arrive [m]
+    point: FramePositionEvaluator  # evaluator of the target frame, and of all frames that must come to rest
+    target: Array  # (3,), target position in the world [m]
     quasi_static_coefficients: Array  # (K, nc); of motions that do equally well, the one nearest to them is wanted
     inside: FramePositionEvaluator | None = None  # frames that stay in the box
 
@@ -254,7 +254,7 @@ class TargetMotionSearch:
         residual, by_x, limited, limits_by_x = self._residual_and_limit_values(x)
         root = np.sqrt(penalty)
         sides = ((1.0, limited - self._upper, pull[0]), (-1.0, self._lower - limited, pull[1]))
-        # a one beside them: the search ends where the cost falls by little of what counts as reached
+        # cost plus one: the search ends if the cost falls by little compared with a reached target
         values, slopes = [np.ones(1), residual], [np.zeros((1, len(x))), by_x]
         for sign, over, raised in sides:
             shifted = np.maximum(over + raised / penalty, 0.0)
@@ -304,10 +304,10 @@ class EffectDiscriminationCriterion:
     d_ij^2 = min_b |J_i a - J_j b|^2 is the distance of effect i from the best imitation by effect j and the nuisance
     unknowns. The smallest distances dominate the sum."""
 
-    amplitude_columns: tuple[tuple[int, ...], ...]  # of every effect
+    amplitude_columns: tuple[tuple[int, ...], ...]  # columns of the amplitudes of every effect
     # of the amplitudes, in units of the columns, (amplitudes, cases): one case where they are known, else one for each
     amplitude_cases: tuple[Array, ...]
-    parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
+    parameter_columns: tuple[int, ...]  # columns with a prior: nominal parameters and parameters of effects
 
     def pairwise_effect_distances(self, rows: Array) -> Array:
         """Distances [data stds] of effect i (row) from its best imitation by effect j; infinite diagonal."""
@@ -346,9 +346,9 @@ DOptimalityOrDiscriminationCriterion = DOptimalityCriterion | EffectDiscriminati
 _MIN_TRUST_RADIUS, _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 1e-3, 0.05, 0.4  # for every unknown [rad or m]
 _MIN_STEP = 1e-9  # step in the linear picture that counts as none [rad or m]
 _MAX_INNER_ITERATIONS = 100  # iterations of the inner search
-_LIMIT_SLACK = 1e-3  # by which the linear limits are tighter, in parts of the limits
-_MIN_GAIN = 1e-2  # of the criterion [nat]: less in a round is the end
-_MAX_LIMIT_CORRECTIONS = 2  # of the linear limits where a step passes the true ones
+_LIMIT_SLACK = 1e-3  # margin of the linear limits, as a fraction of the limits
+_MIN_GAIN = 1e-2  # gain of the criterion below which the search ends [nat]
+_MAX_LIMIT_CORRECTIONS = 2  # largest number of corrections of the linear limits after a step violates the true limits
 
 
 @dataclass(frozen=True)
@@ -360,7 +360,7 @@ class MotionSearchResult:
     final_criterion: float
     is_converged: bool
     n_iterations: int
-    configured_criterion: float = -np.inf  # in the configured problem; minus infinity where that cannot be simulated
+    configured_criterion: float = -np.inf  # in the configured problem; minus infinity if its rollout fails
 
 
 class InformativeMotionSearch:
@@ -380,7 +380,7 @@ class InformativeMotionSearch:
         """Limited quantities of a motion over their limits, and whether its rollout succeeds and satisfies them."""
         value = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w), w)[0] / self._unit
         flat = w.ravel()
-        within = np.all((value <= self._high) & (value >= self._low))  # not where a value is not finite
+        within = np.all((value <= self._high) & (value >= self._low))  # False for values that are not finite
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
     def shrink_to_limits(self, w: Array) -> Array:
@@ -423,7 +423,7 @@ class InformativeMotionSearch:
                     break
                 radius = max(0.3 * radius, 0.5 * _MIN_TRUST_RADIUS)
             progress.report_parts_done(done, rounds, f"{value - first:.3g} nat beyond the start")
-            # a motion from which no step gains anything at all is too rough to be improved, as where the object snaps
+            # if no step has any gain, the criterion is not smooth enough to be improved, as for a snapping object
             finished = gained < _MIN_GAIN and (done > 1 or gained > 0.0 or still)
             if gained == 0.0:
                 break
@@ -455,7 +455,7 @@ class InformativeMotionSearch:
 
     def _inner(self, rows: Array, slopes: Array, w: Array, normal: Array, room: Array, radius: float) -> Array:
         """Maximise the criterion of linear sensitivities over steps with normal @ step + room >= 0."""
-        # in parts of the radius, so that the first step of the inner search is neither tiny nor far
+        # in fractions of the radius, so that the first inner step is neither tiny nor large
         flat, normal = radius * slopes.reshape(len(slopes), -1), radius * normal
 
         def cost(x: Array) -> tuple[float, Array]:

@@ -38,21 +38,21 @@ from yid_ocp.problem.signal_filters import twice_applied_effort_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 
 _PLANNED_RECORDING_NAME = "planned"
-_MIN_POINT_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]
-_MAX_SEARCH_POINT_RATE = 40.0  # of points while a motion is searched: thrice the band in which it may be wrong [Hz]
+_MIN_POINT_RATE = 20.0  # lowest rate at which the information of a slow sensor is spread over the motion [Hz]
+_MAX_SEARCH_POINT_RATE = 40.0  # of points in the search: three times the bandwidth of motion errors [Hz]
 _PATH_ERROR_BANDWIDTH = 12.0  # up to which the motion may be wrong: beyond it efforts are smoothed away [Hz]
-_PATH_DIFFERENCE_STEP = 1e-6  # of the arms' motion, by which its errors' effect is differenced [rad or m]
-_SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
+_PATH_DIFFERENCE_STEP = 1e-6  # difference step of the arms' motion for the effect of its errors [rad or m]
+_SPLINE_DIFFERENCE_STEP = 1e-5  # difference step of a motion's coefficient [rad or m]
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterizedExperiment:
     """A planned experiment whose predicted recording and sensitivities depend on spline coefficients w (K, nc)."""
 
-    configured_problem: EstimationProblem  # of the settings; its first recording defines sensors, noise and rates
-    parameter_values: Mapping[str, float]  # at which the sensitivities are taken
-    simulator: PathSimulator  # of the same system with its arms prescribed
-    free_parameters: tuple[str, ...]  # of the problem, and amplitudes of effects that are to be discriminated
+    configured_problem: EstimationProblem  # from the settings; its first recording defines sensors, noise and rates
+    parameter_values: Mapping[str, float]  # values at which sensitivities are computed
+    simulator: PathSimulator  # simulator of the same system with prescribed arms
+    free_parameters: tuple[str, ...]  # parameters of the problem, and amplitudes of effects to discriminate
 
     @staticmethod
     def from_options(
@@ -207,7 +207,7 @@ class ParameterizedExperiment:
             std = np.zeros(len(joints.names)) if joints.effort_std is None else np.asarray(joints.effort_std)
             joints = replace(joints, effort_std=np.where(std > 0, std, DEFAULT_TORQUE_STD))
         if self.configured_problem.system.driven:
-            # how wrong the motion may be is said by `_blur`
+            # `_blur` represents the error of the motion
             joints = replace(joints, position_std=None)
             sensors.pop(JOINT_POSITION_GROUP_NAME, None)
         options = self._options(

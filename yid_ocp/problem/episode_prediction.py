@@ -189,7 +189,7 @@ class EpisodePredictor:
             torque = mean_step_inputs(*where, delay, self.system.servos)
             by_recorded = mean_step_input_delay_derivative(*where, delay, self.system.servos)[:, :, None] * by_delay
         if errors is not None:
-            # what multiplies or follows a reading would else take its noise for torque, and shrink to be rid of it
+            # otherwise effects that multiply or lag a reading would treat noise as torque and shrink to avoid it
             torque, first = torque - errors.recorded_torque_noise, first - errors.recorded_torque_noise[0]
         if nu and (late is not None or corrections.corrects_efforts):
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
@@ -505,7 +505,7 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
         return episode
     try:
         fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
-        # an equilibrium near there has the details
+        # an equilibrium near this configuration has the details
         shape = fit(at, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path, roughly=True).state[:n]
     except DataError:
         return episode

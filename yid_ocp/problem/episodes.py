@@ -57,7 +57,7 @@ class EpisodePrediction:
     predicted_outputs: tuple[Array, ...]  # predictions of every sample, in the sensor's unit, (M, k) per sensor
     output_sensitivities: tuple[Array, ...] | None  # (M, k, d) each
     equilibrium_guess: Array | None = None  # configuration at `equilibrium`, for similar parameters, (n,)
-    # what the tracking filter adds to the recorded torque where encoders are measurements, (N, nu) [N m]
+    # correction of the recorded torque by the tracking filter, if encoders are measurements, (N, nu) [N m]
     torque_correction: Array | None = None
     torque_correction_sensitivity: Array | None = None  # (N, nu, d)
 
@@ -75,14 +75,14 @@ class InitialStateWithSensitivity:
     """Initial state of a rollout, its derivative and its equilibrium, or the reason why there is no initial state."""
 
     state: Array  # (q, p, z), (nx,)
-    state_sensitivity: Array  # with respect to (wanted parameters, state offset), (nx, d)
+    state_sensitivity: Array  # by the wanted parameters, then the state offset, (nx, d)
     equilibrium: Equilibrium | None
     failure_message: str
 
 
 log = logging.getLogger(__name__)
 
-# least error of a torque beside encoders, in parts of how far it varies: no model follows them for seconds uncorrected
+# lowest torque error with encoders, relative to the torque's variation: no model follows encoders without correction
 _MIN_TORQUE_ERROR_FRACTION = 1e-3
 
 
@@ -103,7 +103,7 @@ class InputErrorModel:
     # noise of the recorded torque that follows from w, subtracted before effects on torques apply, (N, nu) [N m]
     recorded_torque_noise: Array
     transmitted_torque_noise: Array  # part of w that this subtraction removes from the applied torque, (N, nu)
-    smoothed_reference: Array | None = None  # of the tracking filter, in place of the measured motion, (N, nb)
+    smoothed_reference: Array | None = None  # reference of the tracking filter in place of the measured motion, (N, nb)
 
     @property
     def estimated_torque_error(self) -> Array:
@@ -185,17 +185,17 @@ class Episode:
     initial_known_coordinates: Array  # driven, then prescribed, at node 0, (nk,)
     measured_driven_angles: Array  # measured angles of the driven joints at every node, (N + 1, nu)
     measurements: tuple[SensorMeasurements, ...]
-    # recorded effort of driven, then prescribed joints, where their true angle depends on it, (N + 1, nk) [N m]
+    # recorded effort of driven, then prescribed joints, if their true angle depends on it, (N + 1, nk) [N m]
     joint_loads: Array
-    # the measured ones, smooth enough to be differenced; as measured where no filter needs them, (N + 1, nu)
+    # measured angles, smoothed for differentiation; raw if no filter needs them, (N + 1, nu)
     smoothed_driven_angles: Array
-    tracking_feedback: TrackingFeedback | None = None  # of the driven joints, its gains of the nominal parameters
+    tracking_feedback: TrackingFeedback | None = None  # for driven joints, with gains at the nominal parameters
     known_parameters: Mapping[str, float] = field(default_factory=dict)  # values that differ among recordings
-    input_errors: InputErrorModel | None = None  # of the torques and angles that drive the rollout
+    input_errors: InputErrorModel | None = None  # errors of the torques and angles that drive the rollout
     fixed_initial_state: PrecomputedInitialState | None = None  # given or fitted to points; else it is an equilibrium
     # index of the estimation episode whose initial state this held-out part of the same recording shares
     initial_state_shared_with: int | None = None
-    equilibrium_guess: Array | None = None  # near the initial equilibrium, where that is not of least energy, (n,)
+    equilibrium_guess: Array | None = None  # near the initial equilibrium, if that is not of least energy, (n,)
 
     @property
     def feedback_about_smoother_estimate(self) -> TrackingFeedback | None:

@@ -78,7 +78,7 @@ class ResidualVectorLayout:
 class Evaluation(ReprMixin):
     """Cost, residual, Jacobian and predictions of an estimation problem at one unknown vector."""
 
-    cost: float  # 1/2 |r|^2, or the robust loss; infinite where the rollout failed
+    cost: float  # 1/2 |r|^2, or the robust loss; infinite if the rollout failed
     residual: Array  # (nr,)
     jacobian: Array | None  # (nr, nx)
     ok: bool

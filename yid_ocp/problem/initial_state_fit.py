@@ -25,14 +25,14 @@ from yid_ocp.sensors import Sensor, sensor_reading_function
 _BEND_STD = 0.5
 # Joints without a spring, or with one far softer than the rest, are still held a little.
 _MIN_STIFFNESS_RATIO = 1e-4
-# Standard deviation of a coordinate's rate where the points leave it open [rad/s].
+# Standard deviation of a coordinate's velocity that the points do not determine [rad/s].
 _RATE_STD = 3.0
 _CONSTRAINT_STD = 1e-5
 # The fit starts with the noise of measurements multiplied by this factor: a stiff fit from the start ends in knots.
 _NOISE_FACTORS = (1000.0, 100.0, 10.0, 1.0)
-# The stage before which the best of all trials is chosen: there the object has its place and hardly its details.
+# Stage before which the best trial is chosen: the object then has its pose, but not its details.
 _SELECTION_STAGE = 2
-# A parameter fitted along with the start is tried from so many values across its bounds.
+# Number of initial values, spread over its bounds, of a parameter fitted with the initial state.
 _TRIALS_PER_PARAMETER = 4
 
 
@@ -72,7 +72,7 @@ class InitialStateFitter:
         self.fitted_parameters = tuple(fitted_parameters)
         system, e = step.system, step.equations
         self._known = [*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]
-        # what follows its load at once has no start of its own
+        # compliant coordinates follow their load and have no initial state
         idle = {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
         self._free = [i for i in range(system.n_coordinates) if i not in set(self._known) | idle]
         self._sensor: CasadiLockedCache[Sensor, ca.Function] = CasadiLockedCache(

@@ -17,9 +17,9 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.sensors import Sensor, SensorData
 
-# half an hour in steps of 10 ms; a clock in milliseconds or one that jumps asks for more
+# half an hour in steps of 10 ms; exceeded by a clock in milliseconds or with jumps
 _MAX_STEPS = 200_000
-_MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as seconds asks for a thousand
+_MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as seconds needs a thousand
 
 
 @dataclass(frozen=True)
@@ -81,15 +81,15 @@ class SensorMeasurements:
     """M samples of a sensor's k outputs, located between rollout nodes, with weights and noise levels."""
 
     sensor: Sensor
-    node: IntArray  # before each sample, (M,), or (M, k) where outputs are late by different times
+    node: IntArray  # node before each sample, (M,), or (M, k) if outputs have different delays
     fraction: Array  # fraction of a step after `node`; predictions are interpolated linearly between nodes
-    value: Array  # measured outputs, NaN where there is none, (M, k)
-    weight: Array  # factor that turns a difference into a residual, zero where there is no measurement, (M, k)
-    std: Array  # standard deviation of the noise, in the sensor's unit; NaN where it is not known, (M, k)
+    value: Array  # measured outputs, NaN if missing, (M, k)
+    weight: Array  # factor from a difference to a residual, zero without measurement, (M, k)
+    std: Array  # standard deviation of the noise, in the sensor's unit; NaN if unknown, (M, k)
     predictable_nodes: tuple[int, int]  # first and last node at which the sensor can be predicted
-    bias_std: Array  # standard deviation of a constant error of every output, zero where there is none, (k,)
-    noise_correlation: Array | None = None  # of the noise of a sample's outputs, if not independent, (M, k, k)
-    change_by_clock: Array | None = None  # of the outputs by one std of the clock's offset, (M, k)
+    bias_std: Array  # standard deviation of a constant error of every output, or zero, (k,)
+    noise_correlation: Array | None = None  # noise correlation of a sample's outputs, if not independent, (M, k, k)
+    change_by_clock: Array | None = None  # change of the outputs by one std of the clock offset, (M, k)
 
     @property
     def has_uncertain_errors(self) -> bool:
@@ -112,7 +112,7 @@ class SensorMeasurements:
     def evaluation_nodes(self) -> IntArray:
         """Sorted indices of the nodes at which the sensor is predicted, for interpolation to the samples."""
         if self.node.ndim > 1:
-            # with the neighbours that a slope needs
+            # including the neighbours needed for derivatives
             low = int(self.node.min(initial=self.predictable_nodes[1]))
             high = int(self.node.max(initial=self.predictable_nodes[0]))
             return np.arange(max(low - 1, self.predictable_nodes[0]), min(high + 2, self.predictable_nodes[1] + 1))

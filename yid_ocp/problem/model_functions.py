@@ -38,7 +38,7 @@ class CorrectedInputs:
     prescribed_path_sensitivity: Array | None = None
     driven_angles_sensitivity: Array | None = None
     momentum_shift: Array | None = None  # momentum that effects add to driven joints in the measured motion, (N, nu)
-    momentum_shift_sensitivity: Array | None = None  # by the initial state's unknowns too, where they are asked for
+    momentum_shift_sensitivity: Array | None = None  # also by the initial state's unknowns, if requested
 
     @property
     def initial_known_coordinates(self) -> Array:
@@ -106,7 +106,7 @@ class CorrectedInputs:
         rows = [int(row) for row in feedback.state_indices]
         if not momenta:
             return [(column, driven.index(row)) for column, row in enumerate(rows) if row in driven]
-        # momenta come after all coordinates, those of driven joints in the same order
+        # the momenta of driven joints follow all coordinates, in the same order
         later = [column for column, row in enumerate(rows) if row not in driven]
         return list(zip(later, range(len(driven)), strict=False))
 

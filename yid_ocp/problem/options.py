@@ -58,7 +58,7 @@ class ExcessResidualCriteria:
 class DividedLinksModel:
     """Model of an object with each link divided in two. Factors on parameters keep its stiffness."""
 
-    build_step: Callable[[bool], Step]  # of whether it is compiled
+    build_step: Callable[[bool], Step]  # function of whether the step is compiled
     parameter_factors: Mapping[str, float]
 
 

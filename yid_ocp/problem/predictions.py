@@ -134,10 +134,10 @@ class ChannelPrediction(ReprMixin):
     recording: str
     channel: str
     unit: str
-    t: Array  # on the channel's own clock, (M,) [s]
-    measured: Array  # NaN where nothing was measured, (M, w)
+    t: Array  # times on the channel's own clock, (M,) [s]
+    measured: Array  # NaN if not measured, (M, w)
     predicted: Array
-    noise_std: Array  # of the sensor; NaN where it is not known, (M, w)
+    noise_std: Array  # noise std of the sensor; NaN if unknown, (M, w)
 
     @property
     def predicted_minus_measured(self) -> Array:
@@ -324,7 +324,7 @@ def _joints(
     bias = np.zeros(len(names)) if bias_std is None else bias_std
     effort = effort + _noisy(np.zeros(len(names)), bias, rng)
     levels: dict[str, Any] = {"position_std": angle_std, "effort_std": effort_std, "effort_bias_std": bias_std}
-    # of prescribed joints it is the effort at the nodes
+    # for prescribed joints, the effort at the nodes
     kind: EffortSamplingKind = "command" if system.driven else "sample"
     return JointGroup(names, episode.grid.node_times, position, effort=effort, effort_kind=kind, **levels)
 

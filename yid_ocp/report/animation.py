@@ -25,13 +25,13 @@ from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint, mesh_sources_sha256
 
 _MAX_FRAMES = 150  # moments of a motion that a page holds; between two it goes straight
-_PUSHED_POINT = "75%"  # of a segment, where an unknown push acts
+_PUSHED_POINT = "75%"  # location on a segment at which an unknown push is drawn
 _ARM_RADIUS = 0.03  # how thick an arm is drawn [m]
 _POSITION_SCALE = 1e4  # places are kept as whole numbers of a tenth of a millimetre
-_MAX_MESH_FACES = {True: 6000, False: 4000}  # triangles on a page of all links that move, and of those that do not
+_MAX_MESH_FACES = {True: 6000, False: 4000}  # largest number of triangles on a page, for moving and fixed links
 _FIRST_MESH_CELL, _CELL_GROWTH = 0.004, 1.3  # edge of the cubes in which vertices become one [m], and what it grows by
 _QUATERNION_SCALE = 1e4
-_MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # what counts as one place [m], as one time [s]
+_MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # shortest stick [m], and tolerance of equal times [s]
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _Animate
         stacked = np.array(places.map(len(q))(q.T, np.tile(told.theta[:, None], (1, len(q)))))
         return stacked.T.reshape(len(q), -1, 3)
 
-    # joints of one link share a place: those that are together at two postures
+    # joints of one link share a position: those that coincide at two configurations
     both = positions(np.stack([np.zeros(system.n_coordinates), np.linspace(0.3, 1.1, system.n_coordinates)]))
     apart = np.linalg.norm(both[:, :, None] - both[:, None], axis=3).max(axis=0)
     first = np.argmax(apart < _MIN_STICK_LENGTH, axis=1).tolist()
@@ -251,7 +251,7 @@ def _link_radii(system: System, theta: Array) -> dict[str, float]:
     radii = np.array(evaluate(theta)).ravel().tolist() if layouts else []
     carried = [(layout.link_joints, radius) for layout, radius in zip(layouts, radii, strict=True)]
     owned = {joint: radius for links, radius in carried for link in links for joint in link}
-    # what an effect put below the object is part of it, a robot's hand that carries it is not
+    # an effect's frame below the object belongs to it, the robot's hand that carries it does not
     for j, name in reversed(list(enumerate(tree.joint_names))):
         children = [tree.joint_names[k] for k, joint in enumerate(tree.joints) if joint.parent_index == j]
         if "@" in name and children and all(child in owned for child in children):

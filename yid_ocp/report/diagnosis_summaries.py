@@ -28,7 +28,7 @@ from yid_ocp.report.terminal import (
     torque_offset_table_rows,
 )
 
-_MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # of places that are listed
+_MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # smallest share of the gap, and largest number of windows, that are listed
 _MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
 _MAX_TERMINAL_PARAMETERS = 6  # parameters that have a column of their own on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak", None)
@@ -182,7 +182,7 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         differ: TableRows = [head, *(tuple(own[key] for key in head) for own in rescored["changed"])]
         tables = {"Score": marks, "Judged otherwise": differ, **tables}
     if (calibration := result.get("calibration_of_thresholds")) is not None:
-        # quantiles beside what is set
+        # quantiles next to the present settings
         kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}
         first = ("diagnosis.", "is", "advised", "what", "quantile", "coverage", "of", "effects beyond it, by size")
         thresholds: TableRows = [(*first, "strange ones beyond it")]
@@ -274,7 +274,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             cells = []
             for method, entry in runs.items():
                 found = entry["parameters"][name]
-                # elsewhere the curvature is no measure of uncertainty, nor where noise is left out
+                # elsewhere, and without noise, the curvature is no measure of uncertainty
                 ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
                 known = (found["std"], found["interval"]) if ended else (None, None)
                 lost = own["verdict"] == "not_identifiable"

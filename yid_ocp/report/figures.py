@@ -15,7 +15,7 @@ from yid_ocp.report.terminal import scale_and_unit_with_metres_as_mm
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-# on a dark page each becomes what templates/dark.json says; figures use no other colors
+# on a dark page, templates/dark.json maps each color; figures use no other colors
 _TEXT_COLOR, _GRID_COLOR, _BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
 LINE_COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
 _LINE_DASHES, _SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "diamond", "square", "cross")
@@ -24,7 +24,7 @@ _DIVERGING_COLORS = ("#2166ac", "#92c5de", _BACKGROUND_COLOR, "#f4a582", "#b2182
 _SEQUENTIAL_COLORSCALE = ((0.0, _BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
-_ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # in a figure of rows [px]
+_ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # of a figure with rows [px]
 _TOP_MARGIN, _BOTTOM_MARGIN = 64, 44  # [px]
 _SHADE = {"fillcolor": _GRID_COLOR, "opacity": 0.7, "line": {"width": 0}, "layer": "below"}
 _AXIS_STYLE = {"gridcolor": _GRID_COLOR, "zeroline": False, "linecolor": _GRID_COLOR}
@@ -48,7 +48,7 @@ def _line_color(i: int) -> str:
 
 def figure_html(figure: Figure) -> str:
     """Convert a figure to an HTML element. The page's script draws it in light or dark colors."""
-    figure.update_layout(template=None)  # all is said here; the default one is some kilobytes each
+    figure.update_layout(template=None)  # all settings are given here; the default template adds kilobytes
     told = str(figure.to_json()).replace("<", "\\u003c")
     script = f'<script type="application/json">{told}</script>'
     return f'<div class="plot" style="height:{figure.layout.height}px">{script}</div>'
@@ -113,7 +113,7 @@ def prediction_and_residual_plots(
     drawn = {name: (t, values) for name, values in lines.items()}
     if course is not None:
         drawn[next(iter(lines))] = course
-    # with NaN in long gaps between measurements
+    # NaN in long gaps between measurements
     known, steps = t[seen], np.diff(t[seen])
     breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
     times = np.insert(known, breaks, known[breaks])
@@ -135,7 +135,7 @@ def time_plots_figure(
     colors = lines or {name: _line_color(i) for i, name in enumerate(names)}
     heights = [_LOW_ROW_HEIGHT if curve.is_low_row else _ROW_HEIGHT for curve in curves]
     inner = sum(heights) + _ROW_GAP * (len(curves) - 1)
-    # all at once: a figure that grows by one trace after the other is checked anew each time
+    # all traces at once, because plotly validates the whole figure after each added trace
     axes: dict[str, Any] = {}
     traces, shapes, titles = list[dict[str, Any]](), list[dict[str, Any]](), list[dict[str, Any]]()
     told: set[str] = set()
@@ -150,7 +150,7 @@ def time_plots_figure(
         dot = {"color": dots, "size": 3 if len(curve.t) > 60 else 6}
         drawn = [("measured", curve.t, curve.measured, {"mode": "markers", "marker": dot})] if len(curve.t) else []
         for name, (t, value) in curve.lines.items():
-            # what is measured seldom may have neighbours on neither side
+            # sparse measurements may have no neighbours
             mode = "lines+markers" if curve.is_low_row and len(t) <= 60 else "lines"
             style = {"mode": mode, "line": {"color": colors[name], "width": 1.5}, "marker": {"size": 4}}
             drawn.append((name, t, value, style))
@@ -163,7 +163,7 @@ def time_plots_figure(
         for begin, end in curve.marked_intervals:
             mark = _shade(number, (begin, end), (0, 1), along_time=True)
             shapes.append(mark | {"fillcolor": AFTER_COLOR, "opacity": 0.2})
-        # beside a low row a turned title has no room, and collides with that of the next one
+        # next to a low row, a rotated title would collide with the next title
         titles.append({**_axis_title(curve.axis_title, top), "font": {"size": 12}})
         top -= (height + _ROW_GAP) / inner
     axes[f"xaxis{last}"]["title"] = {"text": "time [s]"}
@@ -417,7 +417,7 @@ class TimeHeatMapRow:
 
     name: str
     group: str
-    values: Array  # shape (J,), NaN where there is nothing to show
+    values: Array  # (J,), NaN if there is nothing to show
     hover_texts: Sequence[str]  # J
 
 
@@ -478,7 +478,7 @@ def candidate_ranking_figure(
         points = {"x": values, "y": list(done), "error_x": asymmetric_error_bars(values, lows, highs)}
         marker = {"color": LINE_COLORS[0], "size": 11}
         figure.add_scatter(**points, mode="markers", marker=marker, showlegend=False, row=1, col=1)
-        # what makes a prediction worse can do so without end
+        # a worse prediction has no lower limit of closure
         left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6
         figure.update_xaxes(title_text=closed, range=[left, 108], row=1, col=1)
         figure.add_vline(x=0, line={"color": _TEXT_COLOR, "width": 1}, row=1, col=1)

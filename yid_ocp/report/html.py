@@ -37,7 +37,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
         return False
     import jinja2
 
-    # a plug-in's template stands beside its function
+    # the template of a plug-in is next to its file
     folders = {str(Path(inspect.getfile(REPORT_SECTIONS[name].prepare_context)).parent) for name in REPORT_SECTIONS}
     loader = jinja2.ChoiceLoader([jinja2.PackageLoader("yid_ocp.report"), jinja2.FileSystemLoader(sorted(folders))])
     environment = jinja2.Environment(

@@ -96,7 +96,7 @@ def _save(figure: Figure, path: Path, dpi: int = 120) -> None:
 
 
 _STRUCTURAL_COLOR, _NONZERO_COLOR, _BLOCK_EDGE_COLOR = "#a9cfe0", LINE_COLORS[0], LINE_COLORS[1]
-_MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; beyond, those of one owner share one
+_MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; beyond, one label per owner
 
 
 def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern]]) -> None:

@@ -40,7 +40,7 @@ _BASELINE_DESCRIPTIONS = {
     "linear_carry": "the clamps' motion carried along the cable",
 }
 _MAX_DIRECTIONS = 8
-_MAX_NOISE_RATIO = 2.0  # of an error over what noise makes, or over that of the fit, from which on a sentence says why
+_MAX_NOISE_RATIO = 2.0  # of an error over noise, or over the fit's error, above which a sentence explains it
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # characters of a cell
 _NEGLIGIBLE_STDS = 1e-6  # standard deviations: beneath are the tolerance of a rest and what hundred steps make of it

@@ -87,7 +87,7 @@ class ChannelSpecification:
 
     Noise levels are the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`; for points, the dataset `std`."""
 
-    group: str  # of the recording; there may be several, `GROUP` and `GROUP_NAME`, each with its own clock
+    group: str  # recording group; several are allowed, `GROUP` and `GROUP_NAME`, each with its own clock
     quantity: str  # dataset of the group, with one column for every name of the group
     unit: str
     components: tuple[str, ...] = ()  # names of the components of each value; none for a number
@@ -210,7 +210,7 @@ class Sensor(ABC):
 
     channel: ClassVar[ChannelSpecification]  # kind of its recorded channels
     group_name: str  # key of its settings: a group of points, such as `points_camera`, or `joints.effort`
-    # what a trivial prediction without a model is: zero, or the first measured value
+    # prediction without a model: zero, or the first measured value
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
     has_paper_weight: ClassVar[bool] = True  # whether the source paper's cost, in square metres, counts it
     frame_names: tuple[str, ...]  # the mechanism's frame that each channel marks; none for joints
@@ -322,7 +322,7 @@ class SensorDataInputs:
     effort_filter: _SmoothingFilter  # filter of prescribed joints' efforts
     path_filter: _SmoothingFilter  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
-    has_uncertain_clocks: bool = False  # of points, where nothing is said
+    has_uncertain_clocks: bool = False  # of point groups, if the settings do not specify it
 
 
 @dataclass(frozen=True)
@@ -331,12 +331,12 @@ class SensorData:
 
     sensor: Sensor
     t: Array  # shape (M,) [s]
-    value: Array  # outputs in the sensor's unit, NaN where there is none, shape (M, k)
+    value: Array  # outputs in the sensor's unit, NaN if missing, (M, k)
     std: Array  # standard deviations of their noise, shape (M, k)
     predictable_nodes: tuple[int, int] | None = None  # the first and the last one; all when absent
     bias_std: Array | None = None  # std of every output's constant error in the recording, shape (k,)
     noise_correlation: Array | None = None  # correlation of the outputs' noise in a sample, (M, k, k)
-    change_by_clock: Array | None = None  # of the outputs by one std of the clock's offset in the recording, (M, k)
+    change_by_clock: Array | None = None  # change of the outputs by one std of the recording's clock offset, (M, k)
 
 
 SENSOR_READERS: Registry[Callable[[SensorDataInputs], list[SensorData]]] = Registry("kind of sensor")

@@ -33,7 +33,7 @@ JOINT_POSITION_GROUP_NAME = "joints.position"
 _EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelSpecification("joints", "effort", "N m"))
 _POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelSpecification("joints", "position", "rad"))
 _MAX_STEPS_PER_GAP = 0.1  # median gap between a quantized channel's values, in smallest gaps and per value
-NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: they remove motion slow against sampling
+NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate noise: they remove motion slower than the sampling
 
 
 @dataclass(frozen=True)

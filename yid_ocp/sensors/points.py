@@ -62,7 +62,7 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
     mechanism = around.system.mechanism
     known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
     for point in wanted:
-        # what is listed by name is meant
+        # points listed by name are used
         if point not in known and (choice.points is not None or point in choice.frames):
             what = f"point '{point}' of '{group.name}' marks the frame '{frames[point]}', which the model does not have"
             hint = f"{nearest_name_hint(frames[point], mechanism.frames)} (see sensors.{group.name})"

@@ -228,7 +228,7 @@ class SolverResult:
     history: tuple[Iterate, ...]
     n_evaluations: int
     equilibrium_guesses: EquilibriumGuesses | None = None
-    evaluation: Evaluation | None = None  # at `x`, with Jacobian, where the solver has it
+    evaluation: Evaluation | None = None  # at `x`, with Jacobian, if the solver has computed it
     stopped_at_noise_level: bool = False  # many steps lowered the cost negligibly compared with the noise
     stopped_by_callback: bool = False  # `StopSearch`
 
@@ -421,7 +421,7 @@ class _MultiStartSearch:
         try:
             again = _fit_from(self._problem, self._solver, x, _noting(self._callback, note), self._fits)
         except YidError as error:
-            # another start is a chance, never a reason to lose what is there
+            # a failed restart must not lose the present fit
             log.info("no fit from there: %s", error)
             return
         self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
@@ -496,7 +496,7 @@ def _fit_from(
                     continue
                 part = _minimize_cost(solver, shorter, x, _noting(callback, note))
             except YidError as error:
-                # so short a piece may hold too little for a filter or a node, or nothing to compare with
+                # a very short part may be too short for a filter or node, or have no measurements
                 log.info("the %s are left out: %s", note, error)
                 continue
             x, evaluations = part.x, evaluations + part.n_evaluations
@@ -549,13 +549,13 @@ def _other_minima(fit: _Fit) -> list[Array]:
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, finish)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     found: list[tuple[float, Array]] = []
-    # what is hardly known stays where it is
+    # poorly known unknowns stay unchanged
     known = std < np.abs(x)
     for i in np.flatnonzero(problem.positive_unknowns_mask & known & (std > _MIN_SCANNED_RELATIVE_STD * np.abs(x))):
         for factor in _SCAN_FACTORS:
             along = np.where(known, covariance[:, i] / covariance[i, i], 0.0)
             moved = np.clip(x + along * (factor - 1.0) * x[i], *problem.bounds)
-            # a stiffness counts by its logarithm where that says less: a slope that fades is no minimum
+            # a stiffness is compared on a log scale if that is smaller: a vanishing slope is no minimum
             expected = 0.5 * (min(abs(factor - 1.0), abs(math.log(factor))) * x[i] / std[i]) ** 2
             there = problem.evaluate(moved, derivatives=False, equilibrium_guesses=finish.equilibrium_guesses)
             rise = there.cost - finish.cost

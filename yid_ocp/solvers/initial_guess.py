@@ -208,7 +208,7 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
     size = np.maximum(np.abs(x), problem.unknown_scales)
     others = np.setdiff1d(np.arange(len(x)), amplitudes)
     low, high = (lower - x) / size, (upper - x) / size
-    # the others may move by their size, no further: the model is linear about a start
+    # other unknowns may move by at most their size, because the model is linear about a start
     low[others], high[others] = np.maximum(low[others], -1.0), np.minimum(high[others], 1.0)
     scaled = found.jacobian * size
     step = bounded_levenberg_marquardt_step(scaled, found.residual, 1e-10, low, high)

@@ -331,7 +331,7 @@ class _StepFilter:
             return False
         if any(trial.defect >= margin * defect and trial.cost >= margin * cost for defect, cost in self._points):
             return False
-        # with defects as good as closed the cost has to fall as it should
+        # with nearly closed defects, the cost must decrease sufficiently
         if slope < 0 and (-slope / max(now.cost, 1e-300)) ** 2.3 > now.defect**1.1:
             return trial.cost <= now.cost + 1e-4 * slope
         if trial.defect <= margin * now.defect or trial.cost <= margin * now.cost:
@@ -364,7 +364,7 @@ class _ShootingIntervals:
                 message = "effort channels depend on whole steps, which node states do not carry"
                 raise SolverError(message, where=episode.name, hint="use gauss_newton")
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
-        # equilibria are looked for near those of the problem's start, whatever the point
+        # equilibria are searched near those of the problem's initial values, at any point
         x = problem.initial_unknowns
         thetas = (problem.theta_and_initial_state_deviation(x, i)[0] for i in range(len(problem.episodes)))
         starts = map(problem.initial_state_of_episode, problem.episodes, thetas)

@@ -96,10 +96,10 @@ class MappedFunctionTerm:
     """A function of few unknowns that a nonlinear program evaluates at K places, for example at every time step."""
 
     name: str
-    row_names: tuple[str, ...]  # of the ny outputs
+    row_names: tuple[str, ...]  # names of the ny outputs
     local_function: LocalVariableFunction
-    variable_indices: IntArray  # local variables of each place among the unknowns; none twice in a row, (K, nv)
-    data_indices: IntArray  # data of each place among the parameters, shape (K, nd)
+    variable_indices: IntArray  # each place's local variables among the unknowns, no repetition, (K, nv)
+    data_indices: IntArray  # indices of each place's data among the parameters, (K, nd)
     shared_data_indices: IntArray  # data that all places share, shape (ns,)
 
     @property

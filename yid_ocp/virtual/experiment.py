@@ -42,7 +42,7 @@ _Generators = Mapping[str, np.random.Generator]
 _RANDOM_STREAMS = (
     *("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias", "clock"),
 )
-_CAMERA_DIRECTION = np.array([0.93, 0.0, 0.37])  # from the object
+_CAMERA_DIRECTION = np.array([0.93, 0.0, 0.37])  # direction from the object to the camera
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
@@ -75,7 +75,7 @@ class ArmSensorNoise:
     point_std: float = 1e-3
     records_effort_std: bool = True
     position_resolution: float = 0.0  # step of the encoders, which count after the noise; none at zero [rad]
-    lost_fraction: float = 0.0  # of the joints' samples that are not recorded, never the first or last two
+    lost_fraction: float = 0.0  # fraction of the joints' samples that are lost, never the first or last two
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +110,8 @@ class PointCamera:
     `pose` (4, 4) is in the world (x right, y down, z forward). By default it is 2 m from the object, opposite the
     robot."""
 
-    point_std: float = 5e-3  # of the white noise on each coordinate of a point [m]
-    frame_rate: float = 3.0  # on average; periods vary by a quarter either way [Hz]
+    point_std: float = 5e-3  # std of the white noise on each coordinate of a point [m]
+    frame_rate: float = 3.0  # mean rate; periods vary by up to a quarter [Hz]
     has_dropouts: bool = True  # whether frames are lost for 1 to 1.5 s about once every 2.5 s of recording
     hidden_probability: float = 0.1  # that a point is hidden in a frame (NaN)
     pose: ArrayLike | None = None
@@ -123,8 +123,8 @@ class VirtualExperimentSettings:
 
     Each sensor's noise has its own random stream from `seed`, so removing a sensor does not change the others."""
 
-    motion: MultisineMotion | None = None  # `random_multisine_motion` with `seed` where absent
-    initial_joint_angles: Mapping[str, float] | None = None  # [rad or m]; `grasping_joint_angles` where absent
+    motion: MultisineMotion | None = None  # default: `random_multisine_motion` with `seed`
+    initial_joint_angles: Mapping[str, float] | None = None  # [rad or m]; default: `grasping_joint_angles`
     simulation: SimulationOptions = field(default_factory=SimulationOptions)
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     camera: PointCamera | None = field(default_factory=PointCamera)
@@ -132,7 +132,7 @@ class VirtualExperimentSettings:
     seed: int = 0
     recording_name: str = "virtual"
     description: str = ""  # how the recording was made is appended
-    gear_play: Mapping[str, float] = field(default_factory=dict)  # of gears behind servos, full width [rad], by joint
+    gear_play: Mapping[str, float] = field(default_factory=dict)  # full backlash of gears behind servos, by joint [rad]
 
 
 def run_virtual_experiment(
@@ -286,7 +286,7 @@ def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera)
     return np.asarray(times)
 
 
-# what is misread, by true position and effort
+# reading as a function of true position and effort
 _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[str, float]], Array]]] = {
     "effort_gain": ("effort", lambda q, u, size: u * size["scale"]),
     "effort_offset": ("effort", lambda q, u, size: u + size["offset"]),
@@ -310,7 +310,7 @@ def recording_with_sensor_error(
         raise ModelError("the recording has no efforts", where=f"{kind}@{place}", allowed="arms that torques move")
     if kind == "effort_delay":
         effort = joints.effort.copy()
-        # what is recorded now acts only after the delay
+        # the presently recorded effort acts only after the delay
         for name in joint_names_by_arm(system)[place]:
             column = joints.names.index(name)
             effort[:, column] = np.interp(joints.t + values["delay"], joints.t, joints.effort[:, column])

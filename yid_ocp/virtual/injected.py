@@ -25,21 +25,21 @@ from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error, run_virtual_experiment
 from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
 
-_ForceCallback = Callable[[Any, Any], None]  # of MuJoCo's model and data; adds to `qfrc_passive`
+_ForceCallback = Callable[[Any, Any], None]  # function of MuJoCo's model and data that adds to `qfrc_passive`
 _Values = Mapping[str, float]
 
 _AIR_DENSITY = 1.2  # [kg/m^3]
 _FRICTION_SMOOTHING_SPEED = 0.02  # v_s of dry friction [rad/s]
-_NO_FRICTION = 1e-9  # of a joint before the motion begins: MuJoCo's constraint of it exists from the start [N m]
+_NO_FRICTION = 1e-9  # friction before the motion starts; MuJoCo's constraint must exist from the start [N m]
 _FRICTION_TIME_STEPS = 10  # inner steps that are the time constant of the constraint that holds a joint
-_MAX_PAYLOAD_DISTANCE = 1.0  # of a payload's mass from its frame [m]
+_MAX_PAYLOAD_DISTANCE = 1.0  # largest distance of a payload's mass from its frame [m]
 _CREASED_LINK, _CREASE_ANGLE = 1, 0.03  # link before which a tube is creased; angle beyond which it softens [rad]
-_CORD_LENGTH = 0.3  # of a tether [m]
-_MAGNET_DISTANCE, _MAGNET_POLE_SIZE = 0.06, 0.04  # of a magnet from the tip at rest, and of its pole [m]
+_CORD_LENGTH = 0.3  # length of a tether [m]
+_MAGNET_DISTANCE, _MAGNET_POLE_SIZE = 0.06, 0.04  # distance from the tip at equilibrium, size of the pole [m]
 _DRIFT_TIME = 5.0  # over which a drifting stiffness decreases [s]
-_SLIP_TIMES, _SLIP_DURATION = (1.5, 3.5), 0.05  # of a grasp [s]
+_SLIP_TIMES, _SLIP_DURATION = (1.5, 3.5), 0.05  # times and duration of a grasp's slips [s]
 _LOAD_SLIDE_ANGLE, _LOAD_SLIDE_TIME = 0.02, 0.2  # joint angle after which a loose load slides [rad], time constant [s]
-_WALL_DISTANCE = 0.01  # of a soft wall from the tip at rest [m]
+_WALL_DISTANCE = 0.01  # distance of a soft wall from the tip at equilibrium [m]
 _WARM_UP_TIME = 1.5  # time constant with which a cold gear loses its friction [s]
 
 # a change of the system's description; servos are MuJoCo's own actuators, which delay and clip
@@ -108,7 +108,7 @@ def ordinary_friction_range(effect: EffectBase, system: System) -> tuple[float, 
     return low * rated, high * rated
 
 
-_ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]  # of a model, at a place, of a size
+_ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]  # from context, model, location and size
 
 
 def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallback:
@@ -260,7 +260,7 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
                 sizes[key][names.index(effect.location)] += value
             elif key == "v_stribeck":
                 speeds[names.index(effect.location)] = value
-    # as firm as the inner step allows
+    # as stiff as the inner step allows
     model.dof_frictionloss[at] = _NO_FRICTION
     model.dof_solref[at, 0], model.dof_solimp[at, :2] = _FRICTION_TIME_STEPS * model.opt.timestep, 0.999
     gear_load = _gear_load(scene, model, at) if np.any(sizes["share"]) else None
@@ -292,7 +292,7 @@ def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], 
         weight = model.body_subtreemass[body, None] * model.opt.gravity
         outside = np.einsum("ij,ij->i", data.xaxis[at], np.cross(reach, weight))
         if data.ne and len(others):
-            # what grasps pull is known from the object's joints, which have no friction
+            # the pull of grasps follows from the object's joints, which have no friction
             rows = data.efc_J.reshape(-1, model.nv)[: data.ne]
             pull = np.linalg.lstsq(rows[:, others].T, data.qfrc_constraint[others], rcond=None)[0]
             outside += rows[:, at].T @ pull
@@ -306,7 +306,7 @@ def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) ->
     state: list[float] = []
 
     def push(model: Any, data: Any) -> None:
-        # the controller works with a model of its own, whose grasps are off: there no torque is applied
+        # the controller's model has no grasps and applies no torque
         if model.opt.disableflags & apart:
             return
         command, now = float(data.qfrc_applied[at]), float(data.time)
@@ -345,7 +345,7 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-_FORCES: Mapping[str, _ForceBuilder] = {  # of the library's effects
+_FORCES: Mapping[str, _ForceBuilder] = {  # effects of the library
     "cubic_stiffness": _spring_law(lambda size, angle, stiffness, t: -size["k3"] * angle**3),
     "standard_linear_solid": _memory_law(
         np.copy,
@@ -446,10 +446,10 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
     "cross_stiffness": _bend_law(lambda size, q: -size * np.roll(q, len(q) // 2)),  # couples the two [N m/rad]
     "quadratic_stiffness": _bend_law(lambda size, q: -size * q**2),  # stiffer one way than the other [N m/rad^2]
     "gusts": _in_motion(_gusts),  # wind that comes and goes, spread over a segment's links [N]
-    "crease": _crease,  # a tube that gives way at one place once bent there: stiffness lost beyond an angle [N m/rad]
+    "crease": _crease,  # a tube that creases at one location: stiffness lost beyond an angle [N m/rad]
     # a cord from the floor side to a tip, or from above to an arm's link, taut beyond its length [N/m]
     "tether": _attached((0.0, 0.0, -_CORD_LENGTH), _cord),
-    "magnet": _attached(  # a pole beside the tip that draws it, the more the nearer it is [N]
+    "magnet": _attached(  # a pole near the tip whose attraction grows as the distance shrinks [N]
         (_MAGNET_DISTANCE, 0.0, 0.0),
         lambda size, way: size * _MAGNET_POLE_SIZE * way / (float(way @ way) + _MAGNET_POLE_SIZE**2),
     ),
@@ -461,7 +461,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
         _spring_law(lambda size, angle, stiffness, t: size * t / _DRIFT_TIME * stiffness * angle)
     ),
     "one_way_damping": _one_way_damping,  # bends that are damped one way only [N m s/rad]
-    "saturating_drive": _saturating_drive,  # gives no more torque than this, whatever is commanded and recorded [N m]
+    "saturating_drive": _saturating_drive,  # limits the torque, whatever the command and the record [N m]
     # viscous friction that fades while the gear warms up [N m s/rad]
     "warming_gear": _in_motion(_joint_law(lambda size, q, v, t: -size * math.exp(-t / _WARM_UP_TIME) * v)),
     # a loose load that slides to the other side once the joint has turned [N m]

@@ -24,8 +24,8 @@ _ELBOW_UP_ANGLES: Mapping[str, float] = {
     f"{side}_{joint}": sign * value if joint in ("s0", "e0", "w0", "w2") else value
     for side, sign in (("left", 1.0), ("right", -1.0))
     for joint, value in zip(BAXTER_JOINT_NAMES_WITHOUT_SIDE, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
-}  # of Baxter, where a search begins [rad]: elbow above the hand, the right arm mirrored
-_SECOND_HARMONIC = 0.35  # of the amplitude of the first
+}  # initial guess for Baxter [rad]: elbow above the hand, the right arm mirrored
+_SECOND_HARMONIC = 0.35  # amplitude relative to the first harmonic
 _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
 
@@ -80,10 +80,10 @@ class MultisineOptions:
     frequency_band: tuple[float, float] = (0.2, 2.0)  # [Hz]
     ramp_time: float = 1.0  # [s]
     duration: float = 5.0  # [s]
-    # torque that each joint's own inertia takes beside its travel, in sines of equal torque; none at zero [N m]
+    # torque of each joint's own inertia from additional sines of equal torque; zero: none [N m]
     shake_torque_rms: float = 0.0
     shake_frequency_band: tuple[float, float] = (4.0, 9.0)  # [Hz]
-    max_shake_speed: float = 0.15  # of each of these sines, which light wrists reach first [rad/s]
+    max_shake_speed: float = 0.15  # speed limit of each of these sines, which light wrists reach first [rad/s]
     has_second_harmonic: bool = False  # whether every sine has one at twice its frequency
 
 
@@ -257,7 +257,7 @@ def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[i
     lower = np.array([tree.joints[j].lower_limit for j in sought])
     upper = np.array([tree.joints[j].upper_limit for j in sought])
     near = np.clip(posture[sought], lower + 1e-6, upper - 1e-6)
-    # The pull towards the start keeps joints that do not move the gripper where they are.
+    # The pull towards the start keeps joints that do not move the gripper at their angles.
     result = least_squares(
         lambda x: np.append(np.array(gap(at(x))[0]), _PULL * (x - near)),
         near,

@@ -53,7 +53,7 @@ MODEL_ASPECT_DESCRIPTIONS: Mapping[str, str] = {
 
 _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of friction torque tau_c [N m]
 
-_N_COMPARED_STATES = 3  # at which equations are compared
+_N_COMPARED_STATES = 3  # number of states at which equations are compared
 _ROUNDING_TOLERANCE = 1e-9
 MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 # aspects of sensors and recorded torques, which do not enter the mechanics
@@ -66,7 +66,7 @@ _NATIVE_ASPECTS = (
     - {"servo_firmware", "clock", "memory", "force"}
 )
 
-_JOINTS_PER_BODY = 6  # as many as MuJoCo allows
+_JOINTS_PER_BODY = 6  # MuJoCo's limit
 _ROTOR_INERTIA = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
@@ -152,7 +152,7 @@ def effect_joint_terms_and_changed_aspects(
         aspects.add("force")
     else:
         terms = found
-        # an aspect is called as the term is, but for the angle at which a spring is relaxed
+        # an aspect has the name of the term, except for the rest angle of a spring
         sizes = ((name, size) for entry in terms.values() for name, size in vars(entry).items())
         aspects |= {"rest" if name == "constant_force" else name for name, size in sizes if size}
     for joint in system.driven:
@@ -307,7 +307,7 @@ def mujoco_xml(
     SubElement(option, "flag", contact="disable")
     sites = _sites(system, tree, value)
     base = SubElement(SubElement(root, "worldbody"), "body", name="world_base")
-    SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
+    SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # required by Pinocchio
     stops = {"solreflimit": format_xml_numbers([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
     ranges = {name: format_xml_numbers([-width / 2, width / 2]) for name, width in (gear_play or {}).items()}
     gears = {name: {"limited": "true", "range": ends, **stops} for name, ends in ranges.items()}

@@ -26,14 +26,14 @@ from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf, mujoco_xml
 
 DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
-_TRACKING_BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
+_TRACKING_BANDWIDTH = 25.0  # bandwidth of the joint controller [rad/s]; a 10 ms hold leaves it well damped
 _HOLD_STIFFNESS = 2e3  # [N m/rad] while settling; stable explicitly on the lightest wrist
 _HOLD_DAMPING = 60.0  # [N m s/rad]
-_SETTLING_FACTOR = 10.0  # on the object's damping: equilibrium does not depend on it, time to get there does
+_SETTLING_FACTOR = 10.0  # on the object's damping: shortens settling without changing the equilibrium
 _SETTLING_LIMIT = 60.0  # [s]
 _POSTURE_TOLERANCE = 1e-6  # [rad]
 _REST = 1e-7  # [rad/s]
-# warnings after which MuJoCo resets its state and goes on; their numbers differ between its versions
+# warnings after which MuJoCo resets its state and continues; their numbers depend on its version
 _INSTABILITY_WARNINGS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
@@ -57,10 +57,10 @@ class SimulationOptions:
     duration: float = 5.0
     sample_rate: float = 100.0
     time_step: float = DEFAULT_SIMULATOR_TIME_STEP  # must divide the controller's period
-    # at which torques are computed, held in between, a multiple of `sample_rate`, which it is where absent
+    # rate at which torques are computed and held, a multiple of `sample_rate` (the default)
     controller_rate: float | None = None
     effort_kind: EffortSamplingKind = "command"  # recorded; `command` needs a controller no faster than the recording
-    period_jitter_std: float = 0.0  # of the controller's ticks about an even clock, at most a third of a period [s]
+    period_jitter_std: float = 0.0  # std of the controller's ticks about an even clock, at most a third of a period [s]
     jitter_seed: int = 0
 
     def __post_init__(self) -> None:
@@ -116,7 +116,7 @@ class SimulationResult:
     effort: Array  # shape (N + 1, nu)
     point_positions: Array  # shape (N + 1, np, 3) [m]
     frame_times: Array  # the camera's, rounded to the simulator's step, shape (M,) [s]
-    frame_point_positions: Array  # at these, shape (M, np, 3) [m]
+    frame_point_positions: Array  # points at the frame times, (M, np, 3) [m]
 
 
 def simulate_in_mujoco(
@@ -367,7 +367,7 @@ def _play(
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])
             points.append(data.site_xpos[scene.point_site_ids])
-        # what is seen at the last tick is seen then, too
+        # at the last tick, points are those of this tick
         for frame in frames[(frames >= done) & (frames < max(end, done + 1))]:
             if frame > done:
                 mujoco.mj_step(model, data, nstep=int(frame - done))
@@ -388,7 +388,7 @@ def _play(
 REPLAY_FEEDBACK_BANDWIDTH = 5.0  # against drift of driven joints; low, so that recorded torque dominates [rad/s]
 _SMOOTHING_SAMPLES = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
-_AT_ENDS = 0.2  # of a recording in which what moves prescribed joints is not compared [s]: it begins anew there
+_AT_ENDS = 0.2  # duration at both ends that is not compared for prescribed joints [s]: the replay starts anew there
 _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 

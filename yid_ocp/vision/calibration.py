@@ -37,20 +37,20 @@ from yid_ocp.vision.camera_registration import (
 )
 from yid_ocp.vision.point_cloud import weighted_median
 
-_OFF_ARM_DISTANCE = 0.04  # at which a point stops to be the arm's [m]
+_OFF_ARM_DISTANCE = 0.04  # distance from the arm up to which a point belongs to it [m]
 _MAX_START_POINTS = 5000  # points of a frame among which starts are tried
 _MAX_ARM_POINTS, _MAX_START_ARM_POINTS = 500, 150  # near the arm: for its offset, to see which start is best
 _START_CLOCK_STEP, _MAX_START_CLOCK_OFFSET = 0.04, 0.4  # starts: apart, and the furthest [s]
-_REACH_FACTORS = (1.0, 0.7, 0.5, 0.5)  # of the reach, from iteration to iteration
-_MIN_ON_ARM_FRACTION = 0.3  # of the points must lie on the arm, or they are something else
+_REACH_FACTORS = (1.0, 0.7, 0.5, 0.5)  # factors on the reach, by iteration
+_MIN_ON_ARM_FRACTION = 0.3  # fraction of the points that must lie on the arm; otherwise they are something else
 _RESTART_MISFIT_RATIO = 1.5  # times the usual misfit, from which on other starts are tried
-_MAX_BETTER_START_RATIO = 0.8  # of the misfit at the common offset, below which another is believed
-_MIN_STAMP_ERROR = 0.02  # [s]; a stamp that is off by less is like the others
+_MAX_BETTER_START_RATIO = 0.8  # ratio to the misfit at the common offset, below which another offset is accepted
+_MIN_STAMP_ERROR = 0.02  # smallest deviation of a stamp from the common offset [s]
 _STAMP_ERROR_STDS = 4.0  # standard deviations
-_ARM_SHIFT_STD = 1e-3  # of the arm in one frame from where it should be by the calibration [m]
-_CORRELATED_GROUP_SIZE = 3.0  # points drawn at random have errors that are alike in groups of so many
-_MAD_TO_STD, _MIN_POINT_STD = 1.4826, 1e-3  # from the median of sizes; [m]
-_MAX_CLOCK_STEP = 0.05  # of an offset in one iteration [s]
+_ARM_SHIFT_STD = 1e-3  # std of the arm's position in one frame relative to the calibration [m]
+_CORRELATED_GROUP_SIZE = 3.0  # group size of random points with correlated errors
+_MAD_TO_STD, _MIN_POINT_STD = 1.4826, 1e-3  # median absolute deviation to std; [m]
+_MAX_CLOCK_STEP = 0.05  # largest change of an offset in one iteration [s]
 
 
 @dataclass(frozen=True)
@@ -156,15 +156,15 @@ def is_frame_stamp_delay_significant(own: _StampDelay, options: CameraClockOptio
     return abs(own.delay) > max(options.max_frame_offset_deviation, _STAMP_ERROR_STDS * own.std)
 
 
-_MIN_FRAMES, _MAX_START_FRAMES = 3, 6  # of a calibration, and in which starts are tried
+_MIN_FRAMES, _MAX_START_FRAMES = 3, 6  # of a calibration, and of the frames that try initial states
 _MAX_STARTS = 4
-_GOOD_START_FRACTION = 0.9  # of the arm is where a start has led: others are not tried
+_GOOD_START_FRACTION = 0.9  # fraction of the arm that matches: no further initial states are tried
 _STAGE_REACHES = (0.08, 0.06, 0.045)  # reach of nearest surfaces, from stage to stage [m]
 _RAY_REACH = 0.035  # along the camera's rays [m]
 _STAGE_ITERATIONS, _LAST_STAGE_ITERATIONS = 3, 15
-_STAGE_POINTS, _LAST_STAGE_POINTS = 250, 700  # of them, near the arm
-_STEP_TOLERANCE = 1e-5  # of a step: [rad], [m], [s]
-_VIEW_MARGIN = 0.3  # of the directions to the arm that are looked at, to every side, as x/z and y/z
+_STAGE_POINTS, _LAST_STAGE_POINTS = 250, 700  # points per frame near the arm
+_STEP_TOLERANCE = 1e-5  # largest step at convergence: [rad], [m], [s]
+_VIEW_MARGIN = 0.3  # margin around the directions to the arm, as x/z and y/z
 _MIN_REPORTED_DISPLACEMENT = 0.006  # displacement of the arm that is worth a word [m]
 _CONTRADICTION_STDS = 3.0  # standard deviations
 
@@ -211,15 +211,15 @@ class CameraCalibrationOptions:
 class CameraCalibration:
     """Result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
 
-    camera_state: CameraState  # what is used: pose, depth, clock
+    camera_state: CameraState  # used pose, depth and clock
     prior_state: CameraState
-    usual_square_distance: float | None  # misfit of frames by themselves [m^2]; None where no clock was compared
-    # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero where nothing was estimated
+    usual_square_distance: float | None  # misfit of single frames [m^2]; None if no clock was compared
+    # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero if nothing was estimated
     state_covariance: Array
-    estimate_minus_used: Array  # (10,), what the arm says less what is used: of a pose that was to be kept
-    arm_visibility: SurfaceVisibilityFractions | None  # how much of the arm was seen where it is
-    n_frames: int  # from which it was estimated
-    message: str  # in words
+    estimate_minus_used: Array  # (10,), estimate minus used state, if the pose is fixed
+    arm_visibility: SurfaceVisibilityFractions | None  # visibility of the arm at the calibrated state
+    n_frames: int  # number of frames used
+    message: str  # text for the user
 
     @property
     def camera_position(self) -> Array:
@@ -232,11 +232,11 @@ class CameraCalibration:
         The error is the same for all points at one location. `velocity` (N, 3) is in m/s, `stamps` (N,) in s."""
         slopes = np.empty((len(points), 3, CAMERA_STATE_SIZE))
         slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.world_point_jacobian_by_pose_and_depth(points)
-        # a point that is dated too early is where it came to be later
+        # a point dated too early is at a later position of the motion
         slopes[:, :, CLOCK_OFFSET_INDEX] = velocity
         slopes[:, :, CLOCK_DRIFT_INDEX] = velocity * (stamps - self.camera_state.clock_reference_stamp)[:, None]
         variance = np.einsum("nij,jk,nik->ni", slopes, self.state_covariance, slopes)
-        # a shape that is held by the gripper and seen elsewhere gives way in any direction
+        # a shape held by the gripper, with deviating camera points, can be wrong in any direction
         beside = slopes @ self.estimate_minus_used
         evenly = np.linalg.norm(beside, axis=1, keepdims=True) / math.sqrt(3.0)
         return np.asarray(np.sqrt(variance + np.maximum(np.abs(beside), evenly) ** 2))
@@ -299,7 +299,7 @@ class _Calibrator:
         """Inverse covariance (10, 10) of the prior."""
         own = self.options
         pose = [*[own.rotation_prior_std] * 3, *[own.translation_prior_std] * 3]
-        # a uniform distribution over what is searched; taken as it is where nothing is
+        # uniform distribution over the search range; zero without a search
         offset = max(self.clock.search_half_width / math.sqrt(3.0), 1e-6)
         std = [*pose, own.depth_scale_prior_std, own.depth_offset_prior_std, offset, self.clock.drift_prior_std]
         return np.diag(np.array(std) ** -2)

@@ -45,20 +45,20 @@ CAMERA_STATE_SIZE, MIN_ARM_POINTS_PER_FRAME = 10, 40
 
 # through which the robot's visible surface is sampled
 _START_INTRINSICS = CameraIntrinsics.from_field_of_view(160, 120, math.radians(80.0))
-_SURFACE_SAMPLES = 150  # of it, in every frame
-_GRID_CELL_SIZE = 0.02  # of the field of distances in which starts are tried [m]
+_SURFACE_SAMPLES = 150  # samples of the arm's surface per frame
+_GRID_CELL_SIZE = 0.02  # cell size of the distance field for initial states [m]
 _SIDEWAYS_CELLS, _FORWARD_CELLS, _CELL_STRIDE = 12, 10, 2  # cells to either side of starts tried, and between them
 _CLOCK_STEP = 0.08  # between starts of the clock [s]
 _MAX_START_DISTANCE = 0.06  # how near to the cloud a start must bring the surface [m]
-_HIDDEN_SAMPLE_COST = 0.5  # cost of a sample out of view, of that of one without a point near it
+_HIDDEN_SAMPLE_COST = 0.5  # relative cost of a sample out of view; a sample in view without a near point costs one
 _MIN_START_SEPARATION = 0.08  # starts nearer together are one [m]
-_MIN_INCIDENCE_COSINE = 0.3  # cosine of ray and normal below which a point says little
+_MIN_INCIDENCE_COSINE = 0.3  # cosine of ray and normal below which a point is not used
 _VELOCITY_TIME_STEP = 0.01  # over which velocities are taken [s]
-_MESH_ERROR_PATCH_SIZE = 0.08  # of a link, over which its mesh is alike wrong [m]
+_MESH_ERROR_PATCH_SIZE = 0.08  # size of a link's patch with a common mesh error [m]
 _MAD_TO_STD = 1.4826
 _ROBUST_SCALE_STDS = 2.5  # scale of the robust sum in standard deviations
 _MIN_POINT_STD = 1e-3  # [m]
-_MIN_CURVATURE_FRACTION = 0.2  # of the robust sum, of that of its weights
+_MIN_CURVATURE_FRACTION = 0.2  # lower bound of the robust sum's curvature, relative to that of its weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class CameraState:
     """Estimated camera state: pose, depth scale and offset, clock offset and drift."""
 
     pose: Array  # (4, 4), camera in the world, R and t
-    depth_scale: float = 1.0  # on a measured depth, g
+    depth_scale: float = 1.0  # factor g on a measured depth
     depth_offset: float = 0.0  # added to that, o [m]
     clock_offset: float = 0.0  # stamp minus joint time at the stamp `clock_reference_stamp`, tau0 [s]
     clock_drift: float = 0.0  # growth of that per second, beta
@@ -147,7 +147,7 @@ class ArmSurface:
     """Surface of the robot along its recorded motion."""
 
     robot_surfaces: ArticulatedSurfaces
-    configuration_at: Callable[[float], Array]  # from a time on the joints' clock
+    configuration_at: Callable[[float], Array]  # function of the joints' time
     # from a configuration to where the grippers hold the object, shape (G, 3) [m], and how near points may be its [m]
     grasp_positions_at: Callable[[Array], Array]
     grasp_exclusion_radius: float
@@ -184,7 +184,7 @@ class ArmSurface:
             ahead = points - origin
             distance, normal, part = self.robot_surfaces.intersect_rays(origin, ahead, q)
             square = -np.einsum("ij,ij->i", normal, ahead)
-            with np.errstate(invalid="ignore"):  # of rays that meet nothing
+            with np.errstate(invalid="ignore"):  # rays without an intersection
                 error = (distance - 1.0) * square  # n . (P - (origin + d (P - origin)))
             kept = (square > _MIN_INCIDENCE_COSINE * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
         else:
@@ -233,7 +233,7 @@ class RobustCostDerivatives:
 
     gradient: Array  # (10,)
     hessian: Array  # (10, 10), of Gauss and Newton
-    curvature_ratio: float  # of the sum, as a share of that
+    curvature_ratio: float  # curvature of the robust sum, relative to the Hessian
     # (10, 10): outer products of gradients, summed over frames plus over patches minus over each patch in each frame
     # (counted twice), and at least the last sum (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
@@ -302,7 +302,7 @@ def initial_camera_states(
     for index in np.argsort(total, axis=None):
         delay, cell = np.unravel_index(index, total.shape)
         change = np.zeros(CAMERA_STATE_SIZE)
-        # the cloud has to go where the surface was, and the surface went along the cells
+        # the cloud moves opposite to the surface's displacement by cells
         change[TRANSLATION_SLICE] = -told.pose[:3, :3] @ (_GRID_CELL_SIZE * cells[cell])
         change[CLOCK_OFFSET_INDEX] = delays[delay]
         trial = told.with_state_increment(change)
@@ -319,7 +319,7 @@ def _add_costs(
     total: Array, arm: ArmSurface, told: CameraState, glimpse: CalibrationFrame, delays: Array, cells: IntArray
 ) -> None:
     """Add the costs of the arm's points, `delays` [s] earlier and shifted by cells, to `total` (delays, cells)."""
-    from scipy.ndimage import distance_transform_edt  # slow to import, and only for a camera whose place is sought
+    from scipy.ndimage import distance_transform_edt  # slow to import; only needed to search for the camera's pose
 
     points, part = arm.visible_surface_points(told, glimpse.stamp)
     own = told.world_to_measured_points(points)
@@ -377,7 +377,7 @@ def pooled_surface_visibility_fractions(
         points, _ = arm.visible_surface_points(state, glimpse.stamp)
         own, (places, rays) = state.world_to_measured_points(points), glimpse._trees
         away, _ = places.query(own, distance_upper_bound=within)
-        # as wide as the gaps between points of a cloud that was thinned
+        # as wide as the gaps between points of a thinned cloud
         apart, index = rays.query(own[:, :2] / own[:, 2:], distance_upper_bound=0.015)
         near, known = np.isfinite(away), np.isfinite(apart)
         depth = glimpse.points[np.minimum(index, len(glimpse.points) - 1), 2]

@@ -41,13 +41,13 @@ from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _Left = tuple[BoolArray, BoolArray]
 """Masks of the nodes and points of a frame that are used."""
-_NODE_RADIUS_FRACTION = math.pi / 4  # of a tube's, at which the mean of its visible half lies from its axis
-_END_OFFSET_STDS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
-_MAX_POINT_DISTANCE_SCALES = 3.0  # times the last scale, beyond which a point says nothing of the shape
+_NODE_RADIUS_FRACTION = math.pi / 4  # distance of the mean of a tube's visible half from its axis, over the radius
+_END_OFFSET_STDS = 3.0  # stds of a point beyond which an end differs from the shape
+_MAX_POINT_DISTANCE_SCALES = 3.0  # in last loss scales; points further away carry no information on the shape
 _TOUCHING_DISTANCE = 1e-3  # [m]
-_MIN_STIFFNESS_FRACTION = 1e-2  # of the mean; softer bends are still held this much
+_MIN_STIFFNESS_FRACTION = 1e-2  # lower bound of a bend's stiffness, relative to the mean
 _WEAK_REGULARISATION = 1e-2  # [1/m, 1/rad]; holds what no point tells, such as a straight rope's turn about itself
-_PASS_TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass ends
+_PASS_TOLERANCE = 1e-4  # change of a bend [rad] and relative change of the cost at which a pass ends
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class ShapeFitter:
             failed = self._failed(evidence)
             if not failed:
                 break
-            # a part of the object is not where this has it: something like it stood nearer to where the search began
+            # a part of the object is misplaced: something similar was nearer to the initial guess
             if left[0].any() and left[1].any():
                 other = self._attempt(sight, [self._rested(best.q, failed), *begun], left)
                 if other[1].covered_fraction_of_visible_links(
@@ -348,7 +348,7 @@ class ShapeFitter:
             if abs(offset) > _END_OFFSET_STDS * noise:
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING_DISTANCE
                 off_end[at_end] = offset * shape_evidence.link_axes(corners)[k]
-        # a point is seen where a link that begins or ends there is, of a tube that is where it should be
+        # a point counts as seen if a link that starts or ends there is seen and its tube is not misplaced
         sure = evidence.covered_fraction >= self.options.min_link_coverage
         sure &= ~self._links_of(self._failed(evidence))
         held = {grasp.held_frame for grasp in self.system.grasps}

@@ -33,10 +33,10 @@ from yid_ocp.vision.frames import (
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
 _DEPTH_IMAGE_SUFFIX = ".png"
-_POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"  # of an NPZ file
-_PCD_HEADER_BYTES = 10_000  # [bytes]; where a PCD file says how many points it has
+_POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"  # arrays of an NPZ file
+_PCD_HEADER_BYTES = 10_000  # [bytes]; contain the number of points of a PCD file
 _PCD_POINT_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
-_MAX_FRAME_BYTES = 1 << 28  # of one cloud or image
+_MAX_FRAME_BYTES = 1 << 28  # largest size of one cloud or image
 _COPY_AGAIN_HINT = "copy or record it again"
 
 
@@ -78,7 +78,7 @@ def _read_npz(path: Path) -> _Cloud:
 
 def _read_xyz(path: Path) -> _Cloud:
     try:
-        with warnings.catch_warnings():  # of an empty file, which is said below
+        with warnings.catch_warnings():  # an empty file is reported below
             warnings.simplefilter("ignore", UserWarning)
             rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
     except (OSError, ValueError, UnicodeDecodeError) as error:
@@ -97,7 +97,7 @@ def _read_pcd(path: Path) -> _Cloud:
     if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
         what = f"the cloud is damaged: it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes"
         raise DataError(what, where=str(path), hint=_COPY_AGAIN_HINT)
-    # Open3D says what is wrong on the standard output and returns an empty cloud
+    # Open3D prints errors to standard output and returns an empty cloud
     try:
         with files.limited_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
@@ -144,7 +144,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
     for name, count, columns in elements:
         if name == "vertex":
             return _vertices(path, count, columns, order, body, coloured)
-        if any(not kind for _, kind in columns):  # there is no telling how far they go
+        if any(not kind for _, kind in columns):  # their length is unknown
             raise _damaged(path, f"lists of '{name}' stand before the vertices")
         if order:
             body = body[count * sum(np.dtype(kind).itemsize for _, kind in columns) :]

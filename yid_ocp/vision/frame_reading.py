@@ -77,7 +77,7 @@ def _frames(bag: OpenBag, topic: str) -> tuple[list[BagMessage], Array]:
 
 def _stamp(bag: OpenBag, data: bytes) -> int:
     """Stamp of a message whose first field is a header [ns], without decoding the rest."""
-    order = "<" if not bag.reader.is2 or data[1] == 1 else ">"  # of ROS 2, the head of CDR says which
+    order = "<" if not bag.reader.is2 or data[1] == 1 else ">"  # in ROS 2, the CDR header contains the byte order
     seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
 
@@ -248,7 +248,7 @@ class _Film:
             raise DataError(what, where=str(path), hint=_FILM_HINT)
         try:
             self._rewind()
-        except RuntimeError as error:  # it loads the camera's own library when asked to
+        except RuntimeError as error:  # Open3D loads the camera's own library on demand
             raise DataError(f"{what} here ({error})", where=str(path), hint=_FILM_HINT) from error
         if not self.reader.is_opened():
             allowed = "an Azure Kinect's .mkv"

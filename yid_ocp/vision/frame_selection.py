@@ -122,8 +122,8 @@ class TrackOptions:
 
 _NO_FIT, _END_ELSEWHERE = "the shape does not fit", "an end is not where its gripper is"
 _MISFIT_REASONS = (_NO_FIT, _END_ELSEWHERE)
-_MAX_NOTES = 4  # in a hint
-_MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
+_MAX_NOTES = 4  # notes in a hint
+_MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a normal variable, in stds
 
 
 def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
@@ -197,7 +197,7 @@ def tracked_states_and_points(
     by_sizes = np.array([sizes.point_std_due_to_dimensions(fit.dimension_equations.point_jacobian[of]) for fit in fits])
     std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), options.min_point_std), by_sizes)
     velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
-    # a point is where it was at some time of the exposure, which is uniform over that
+    # a point is measured at a uniformly distributed time within the exposure
     std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure_time / math.sqrt(12.0)))
     flat = position.reshape(-1, 3), velocity.reshape(-1, 3), np.repeat([frames[k].stamp for k in good], len(of))
     shared = calibration.point_std_from_calibration(*flat).reshape(std.shape)
@@ -249,8 +249,8 @@ _MIN_CROSSING_SEPARATION_RADII = (
 )
 _MAX_SHAPE_STATIONS = 400  # places along a shape that are compared
 _FIXED_ROOT_MOTION_RATIO = 2.0  # times
-_SAME_ROOT_FRACTION = 0.1  # of the length between the ends, within which roots are the same
-_HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends, by which one is higher
+_SAME_ROOT_FRACTION = 0.1  # of the length between the ends; closer roots are the same
+_HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends; height difference that makes one end higher
 
 
 def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:

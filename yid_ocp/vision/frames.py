@@ -34,7 +34,7 @@ PointColourArray = NDArray[np.uint8]
 
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Models of distortion, and how many coefficients each may have: k1, k2, p1, p2, k3 (k4, k5, k6), or k1 to k4."""
-_MAX_UNDISTORTION_STEPS = 30  # of the search for a pixel's direction
+_MAX_UNDISTORTION_STEPS = 30  # largest number of Newton steps for a pixel's direction
 _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 
@@ -51,7 +51,7 @@ class CameraIntrinsics:
     fy: float
     cx: float
     cy: float
-    model: str = "plumb_bob"  # of the lens's distortion, one of `_DISTORTION_COEFFICIENT_COUNTS`
+    model: str = "plumb_bob"  # distortion model, one of `_DISTORTION_COEFFICIENT_COUNTS`
     coefficients: tuple[float, ...] = ()  # empty for a lens without distortion
 
     def __post_init__(self) -> None:
@@ -137,7 +137,7 @@ def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[A
             x, y = x + (d * error_x - b * error_y) / turn, y + (a * error_y - c * error_x) / turn
         seen_x, seen_y = lens._distort(x, y)
         off = np.hypot((seen_x - aim_x) * lens.fx, (seen_y - aim_y) * lens.fy)
-        # beyond where a formula turns back, its other solutions are behind the edge or mirrored
+        # beyond the turning point of a distortion formula, other solutions are outside the image or mirrored
         good = (off < _UNDISTORTION_TOLERANCE) & (turn > 0) & (x * aim_x + y * aim_y >= 0)
     return np.where(good, x, np.nan), np.where(good, y, np.nan)
 
@@ -172,7 +172,7 @@ class FrameSequence:
     # from a frame's index to its cloud in the camera's frame, shape (N, 3) [m]; `DataError` where it cannot be read
     load_cloud: Callable[[int], Array]
     intrinsics: CameraIntrinsics | None = None
-    source: str = "sequence"  # where the frames come from, for messages
+    source: str = "sequence"  # origin of the frames, for messages
     # from a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none
     load_colours: Callable[[int], PointColourArray | None] | None = None
 
@@ -220,16 +220,16 @@ def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
 
 
 _MAX_STEREO_BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
-_MAX_EDGE_POINTS = 24  # points about the narrowest place; of more, some are left out
+_MAX_EDGE_POINTS = 24  # largest number of points near a narrow passage
 _NARROWEST_RATIO = 0.8  # times the narrowest place, up to which what is sorted stays enough
-_SORTED_MARGIN = 0.02  # of the picture, as x/z, that is sorted beyond what is asked for
-_DECIDING_FRACTION = 0.5  # of the points in a direction decide
+_SORTED_MARGIN = 0.02  # sorted region of the image beyond the requested one, as x/z
+_DECIDING_FRACTION = 0.5  # fraction of the points in a direction that decides
 _EDGE_STRIP_WIDTH, _EDGE_STRIP_PIECES = (
     0.02,
     20,
 )  # of a picture: width of the strip along a side and the pieces of it, half of them filled
-_MIN_PICTURE_WIDTH = 0.3  # of a picture, as x/z: what is narrower is a cloud that was cut out
-_MIN_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
+_MIN_PICTURE_WIDTH = 0.3  # smallest image width, as x/z; a narrower cloud is a cut-out
+_MIN_DEPTH = 0.05  # smallest depth in front of the camera [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +238,7 @@ class OcclusionMap:
 
     points: Array  # (N, 3), in the world, before anything is left out [m]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world
-    intrinsics: CameraIntrinsics | None = None  # without it the picture ends where points stand along most of a side
+    intrinsics: CameraIntrinsics | None = None  # without it, points along most of a side define the image border
     # (M, 3), points about which will be asked, so that what stands before them is sorted once [m]
     expected_points: Array | None = None
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
@@ -294,7 +294,7 @@ class OcclusionMap:
 
     def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
         """Image points near the given positions: their image coordinates and depths."""
-        # a shadow of the nearest point falls so far beside its place in the picture
+        # distance in the image at which the nearest point can cast a shadow
         shadow, narrow = _MAX_STEREO_BASELINE / float(self._all[1].min(initial=np.inf)), float(wide.min())
         reach = max(float(wide.max()), shadow)
         low, high = asked.min(0) - reach, asked.max(0) + reach

@@ -31,10 +31,10 @@ from yid_ocp.model.system import System, floating_joint_mechanism
 from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
 
 _N_NEIGHBOURS = 10
-_MAX_LINK_SPACINGS = 3.0  # points further apart than so many of their usual distance do not hang together
+_MAX_LINK_SPACINGS = 3.0  # in usual spacings; points further apart are not connected
 _MIN_PART_FRACTION = 0.05  # of the points; smaller parts are not the object
 _MIN_LOOP_RATIO = 3.0  # a cycle this many times longer than around the object is a loop of it
-_MAX_TWIG_DIAMETERS = 1.5  # a branch no longer than so many diameters is roughness
+_MAX_TWIG_DIAMETERS = 1.5  # in diameters; a shorter branch is roughness
 _END_DIRECTION_SLICES = 4.0  # widths of slices over which the direction at an end is taken
 _MAX_POINTS = 2500  # points
 
@@ -159,7 +159,7 @@ def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
     tree = np.column_stack([forest.row, forest.col]).astype(np.int64)
     one, other = edges.T
     along = np.asarray(dijkstra(_graph(nodes, tree), directed=False))[one, other]
-    across = np.linalg.norm(nodes[one] - nodes[other], axis=1)  # of an edge of the tree as long as the way along it
+    across = np.linalg.norm(nodes[one] - nodes[other], axis=1)  # straight distance; `along`: through the tree
     return tree, (0.5 * (nodes[one] + nodes[other]))[along > np.maximum(loop, 1.001 * across)]
 
 
@@ -190,10 +190,10 @@ def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[f
     return length, way
 
 
-_FREE_ROOT_PREFIX = "found_root"  # of the joints that `system_with_free_root` adds
-_MAX_ENDS = 7  # of a course; more are clutter, and there are too many ways
-_TRIED_MATCH_RATIO = 1.3  # a way whose distances are off by so many times the best one's is tried as well
-_WHOLE_OBJECT_TOLERANCE = 0.08  # of the object, by which a course may be off that shows all of it
+_FREE_ROOT_PREFIX = "found_root"  # prefix of the joints added by `system_with_free_root`
+_MAX_ENDS = 7  # of a centerline; more ends are clutter and give too many assignments
+_TRIED_MATCH_RATIO = 1.3  # assignments with distance errors up to this multiple of the best one are tried
+_WHOLE_OBJECT_TOLERANCE = 0.08  # relative length error of a centerline that shows the whole object
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +202,7 @@ class ObservedObjectEnd:
 
     link_end_index: int  # among the links' starts and ends, in this order link by link
     direction: Array  # (3,), unit vector along the object
-    position: Array  # (3,), the corner lies in the plane through this place across it [m]
+    position: Array  # (3,), point of the plane across the object that contains the end [m]
     position_std: float
 
 

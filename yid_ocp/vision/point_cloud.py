@@ -26,7 +26,7 @@ _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
 _SPACING_SAMPLE_POINTS = 3000  # points, at least, that tell how far neighbours usually are
-_MAD_TO_STD = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
+_MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,13 +26,13 @@ from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, tube_link_projections
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
-_BACKGROUND_NOISE_STDS = 3.0  # of a point, within which it is the background's
+_BACKGROUND_NOISE_STDS = 3.0  # stds of a point within which it belongs to the background
 _MIN_STILL_FRAME_FRACTION = (
     0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
 )
-_SAME_THING_DISTANCE = 1.0  # of a thing's size, within which it is the same thing in another frame
-_MAX_STILL_WANDER = 0.3  # of its size, by which a still thing's middle wanders at most
-_MAX_FOLLOWING_WANDER = 0.5  # of how far it wanders in the world, below which it moves with a link
+_SAME_THING_DISTANCE = 1.0  # of a cluster's size; closer clusters in other frames are the same object
+_MAX_STILL_WANDER = 0.3  # of its size; largest motion of the centre of a static object
+_MAX_FOLLOWING_WANDER = 0.5  # of its motion in the world, below which an object moves with a link
 _MIN_REPORTED_FRAMES = 2  # frames in which a thing is worth a word
 _MAD_TO_STD = 1.4826
 
@@ -85,10 +85,10 @@ class ForeignObject:
 
     centre: Array  # (3,), in the world, in the median frame [m]
     size: Array  # (3,) [m]
-    frames: int  # in which it was seen
+    frames: int  # number of frames with this object
     moving: bool
-    link: str  # of the robot, with which it moves; empty for none
-    text: str  # where it is and what helps
+    link: str  # robot link that carries it; empty for none
+    text: str  # location and advice
 
 
 def group_foreign_clusters(
@@ -117,7 +117,7 @@ def group_foreign_clusters(
     for group in groups:
         places, extents = np.array([thing.centre for _, thing in group]), [thing.extent for _, thing in group]
         centre, size = np.median(places, axis=0), np.median(extents, axis=0)
-        # as arm and object hide parts of a still thing, the middle of the rest wanders within it
+        # arm and object hide parts of a static object, so the centre of the visible part moves within it
         still = np.maximum(2 * _BACKGROUND_NOISE_STDS * noise, _MAX_STILL_WANDER * np.max(extents, axis=0))
         moving = bool((np.ptp(places, axis=0) > still).any())
         poses = [links(t) for t, _ in group]
@@ -166,9 +166,9 @@ def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
 TubeDimensionKind = Literal["length", "radius"]
 _DIMENSION_KINDS: tuple[TubeDimensionKind, ...] = ("length", "radius")
 _LOG_DIMENSION_PRIOR_STD = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
-_DOUBTED_STDS = 3.0  # from the model's value, beyond which that is doubted
-_CLEAR_STDS = 2.0  # from there, within which a first look finds nothing to doubt
-_MAX_KNOWN_LOG_STD = 0.1  # standard deviation of a logarithm, above which nothing can be said of a size
+_DOUBTED_STDS = 3.0  # deviation from the model's value beyond which the value is contradicted
+_CLEAR_STDS = 2.0  # deviation within which a first estimate finds no contradiction
+_MAX_KNOWN_LOG_STD = 0.1  # std of a logarithm above which a dimension is not determined
 _MAX_ITERATIONS, _STEP_TOLERANCE, _MAX_STEP = 8, 0.004, 0.15
 _MIN_FRAMES = 3
 _OUTLIER_END_STDS = 3.0  # robust standard deviations from the other frames' ends, at which a frame's end is a wrong one
@@ -182,8 +182,8 @@ class TubeDimensionEstimates:
     model_values: Array  # (2 s,), the model's values [m]
     log_ratio: Array  # (2 s,), logarithm of the value that fits over the model's
     covariance: Array  # (2 s, 2 s), of `log_ratio`
-    estimated_dimension_mask: tuple[bool, ...]  # which of them the fit uses in place of the model's
-    n_frames: int  # that were asked; 0 where nothing could be said
+    estimated_dimension_mask: tuple[bool, ...]  # dimensions that the fit uses in place of the model's
+    n_frames: int  # number of frames used; 0 if nothing was estimated
 
     @property
     def dimension_log_ratio_std(self) -> Array:
@@ -314,4 +314,4 @@ class SequenceCalibration:
 
     camera_calibration: CameraCalibration  # the camera's pose, how it scales depth, and its clock
     dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them
-    background: BackgroundPoints  # what stands there in all frames
+    background: BackgroundPoints  # static points in all frames

@@ -23,16 +23,16 @@ from yid_ocp.vision.initial_shapes import ObservedObjectEnd
 from yid_ocp.vision.point_cloud import weighted_median
 
 _HIDDEN_SIDE_COSINE = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
-_MIN_LINK_STATIONS = 6  # per link at least, where it is asked whether points are near
-_ON_SURFACE_STDS = 3.0  # from the surface, within which a point lies on it
-_MAD_TO_STD = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
+_MIN_LINK_STATIONS = 6  # fewest stations per link at which coverage is tested
+_ON_SURFACE_STDS = 3.0  # distance from the surface within which a point lies on it
+_MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
 _MAX_LINK_SPACINGS = 3.0  # times the usual distance of neighbours, within which two points hang together
 _MIN_THING_POINTS = 12  # points of a thing
-_FOREIGN_SURFACE_FRACTION = 0.5  # of a piece of surface about a point that must be foreign for it to go on there
-_MAX_THINGS = 8  # of a frame, that are remembered
-_FILLED_SLICE_FRACTION = 0.3  # of the usual number of points, with which a slice of a tube counts as filled
-_SURROUNDING_RADII = 3.0  # radii about a node, in which it is asked how wide the surface is there
-_MAX_SHORT_FRACTION = 0.5  # of its length, by which a tube may be too short and its end still be found
+_FOREIGN_SURFACE_FRACTION = 0.5  # foreign fraction of the surface around a point, at which a thing continues there
+_MAX_THINGS = 8  # largest number of foreign clusters kept per frame
+_FILLED_SLICE_FRACTION = 0.3  # of the usual number of points, at which a slice of a tube counts as covered
+_SURROUNDING_RADII = 3.0  # radius around a node in which the width of the surface is measured
+_MAX_SHORT_FRACTION = 0.5  # of a tube's length; largest shortening at which its end is still found
 _RIM_RADIUS_FRACTION = 0.85  # of the radius to either side, within which a tube's depth is compared
 
 
@@ -56,7 +56,7 @@ def tube_link_projections(
     [m]."""
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
-    # (p - a).d and |p - a|^2 for all points and links at once, by products of matrices
+    # (p - a).d and |p - a|^2 for all points and links, by matrix products
     ahead = points @ edge.T - np.einsum("ij,ij->i", start, edge)
     t = np.clip(ahead / square, 0.0, 1.0)
     own = np.einsum("ij,ij->i", points, points)[:, None] + np.einsum("ij,ij->i", start, start)
@@ -99,12 +99,12 @@ class ShapeFitQuality:
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
-    # (K,), share of each link's length on which there are own points, and on which the camera sees that there are none
+    # (K,), fractions of each link's length with own points, and visibly without points
     covered_fraction: Array
     visibly_empty_fraction: Array
-    # (E,), how much further along each free tube's end lies than the shape has it, NaN where that cannot be seen [m]
+    # (E,), offset of each free tube's end beyond the fitted shape, NaN if unseen [m]
     end_offsets: Array
-    foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
+    foreign_clusters: tuple[ForeignCluster, ...]  # foreign clusters near the shape, the largest first
 
     def covered_fraction_of_visible_links(self, lengths: Array) -> float:
         """Fraction of the visible length of links (`lengths` (K,) [m]) with own points; 0 if none is visible."""
@@ -116,11 +116,11 @@ class ShapeFitQuality:
 class ShapeFitQualityAndPointClasses(ShapeFitQuality):
     """Fit quality of a shape, with the frame's own, contested and foreign points."""
 
-    # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
+    # (N,), own points of the shape; points on it that can be foreign; foreign points
     is_own: BoolArray
     is_contested: BoolArray
     is_foreign: BoolArray
-    excess_variance: Array  # (K,), variance across each link beyond that of its tube [m^2]
+    excess_variance: Array  # (K,), variance across each link in excess of its tube [m^2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +131,8 @@ class ProcessedFrameCloud:
     point_weights: Array  # (N,)
     skeleton_nodes: Array  # (K, 3), of their skeleton [m]
     camera_position: Array  # (3,) [m]
-    occlusion_map: OcclusionMap | None = None  # everything that the camera saw; without it no place counts as hidden
-    is_filtered_out: Callable[[Array], BoolArray] | None = None  # which places (S, 3) lie where filters leave no points
+    occlusion_map: OcclusionMap | None = None  # of all measured points; None: no position counts as hidden
+    is_filtered_out: Callable[[Array], BoolArray] | None = None  # positions (S, 3) removed by filters
     end_anchors: Sequence[ObservedObjectEnd] = ()  # ends of the object that were seen
 
     @cached_property
@@ -167,7 +167,7 @@ def fit_quality_and_point_classes(
         if close.any()
         else near / _ON_SURFACE_STDS
     )
-    # where points lie in between others is not known better than from one to the next
+    # positions are not known better than the spacing of the points
     noise = max(noise, spacing / math.sqrt(12.0))
     gate = min(_ON_SURFACE_STDS * noise, near)
     on_shape = size < gate
@@ -186,7 +186,7 @@ def fit_quality_and_point_classes(
         touching = cKDTree(seen.points[contact])
         contested = (on_shape | beyond) & (touching.query(seen.points)[0] < 2 * (tubes.radius[link] + gate))
         for i, k in enumerate(tubes.free_end_links):
-            # whose the points at the end are is not known, so neither is where it is
+            # points at the end are contested, so its position is unknown
             end = tubes.link_ends[k, 1] + ends[i] * link_axes(tubes.link_ends)[k]
             if np.isfinite(ends[i]) and touching.query(end)[0] < 2 * (tubes.radius[k] + gate):
                 ends[i] = np.nan
@@ -377,12 +377,12 @@ class FrameShapeFit(ShapeFitQuality):
     """Fitted shape of one frame with its uncertainty and quality."""
 
     q: Array  # (n,), configuration, twists at rest
-    point_positions: Array  # (np, 3), the system's points there [m]
+    point_positions: Array  # (np, 3), positions of the system's points [m]
     point_std: Array  # (np, 3), standard deviation of each coordinate by the curvature of the cost [m]
-    is_point_seen: BoolArray  # (np,), whether a gripper holds it, or there are points enough about it
+    is_point_seen: BoolArray  # (np,), whether a gripper holds the point or enough points are near it
     grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
-    contested_fraction: float  # of the points on the shape: may belong to a thing which touches it, and are left out
-    dimension_equations: FrameTubeDimensionCost  # what the frame says of lengths and radii
+    contested_fraction: float  # of the points on the shape: contested by a touching foreign object and not used
+    dimension_equations: FrameTubeDimensionCost  # cost of lengths and radii in this frame
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 
     @property

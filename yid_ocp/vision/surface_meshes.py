@@ -45,7 +45,7 @@ UrdfMeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
 _MAX_MESH_BYTES = 1 << 28
-_TUBE_FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
+_TUBE_FACETS = 48  # facets of a tube, whose surface is then within 0.2 % of the radius
 _TOUCHING_DISTANCE = 5e-4  # [m]
 _MIN_PROJECTED_DISTANCE = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
 
@@ -73,9 +73,9 @@ class ObservedScene:
     """Robot and object in a camera's view."""
 
     system: System
-    robot_urdf: str | Path | None = None  # for the robot's meshes (`package:baxter`); None for the object alone
-    parameter_values: Mapping[str, float] | None = None  # lengths and radii among them; nominal where absent
-    extra_meshes: Sequence[ExtraMesh] = ()  # what stands about that is neither
+    robot_urdf: str | Path | None = None  # URDF with the robot's meshes (`package:baxter`); None for the object alone
+    parameter_values: Mapping[str, float] | None = None  # includes lengths and radii; default nominal
+    extra_meshes: Sequence[ExtraMesh] = ()  # meshes other than robot and object
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,7 +436,7 @@ class DepthSensorModel:
     max_depth: float = 3.5
     disparity_std: float = 1 / 16  # standard deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m
     disparity_step: float = 1 / 8  # step of the disparity [pixels]; 1/8 gives 12 mm at 2 m
-    noise_correlation_length: float = 0.7  # over how many pixels neighbouring errors are alike [pixels]
+    noise_correlation_length: float = 0.7  # correlation length of errors of neighbouring pixels [pixels]
     # cosine of ray and normal below which nothing comes back; up to twice as much it comes back sometimes
     min_incidence_cosine: float = 0.12
     min_relative_edge_depth: float = 0.02  # difference of neighbouring pixels that makes an edge, relative to depth
@@ -496,8 +496,8 @@ class CameraTimingModel:
     """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
 
     mean_rate: float = 3.0  # [Hz]
-    dropped_fraction: float = 0.0  # of the frames, which never arrive
-    latency: float = 0.0  # of every stamp after the picture, and the camera's clock ahead, taken together [s]
+    dropped_fraction: float = 0.0  # fraction of frames that never arrive
+    latency: float = 0.0  # stamp minus capture time, camera clock offset included [s]
     latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
 
     def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -517,7 +517,7 @@ class VirtualFramesWithTruth:
 
     sequence: FrameSequence
     capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
-    true_configuration_at: Callable[[float], Array]  # from a time to the configuration then, shape (n,)
+    true_configuration_at: Callable[[float], Array]  # function of time: configuration (n,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -525,9 +525,9 @@ class VirtualCameraSetup:
     """Virtual depth camera: sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
-    sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # an Asus Xtion Pro Live where absent
+    sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # default: an Asus Xtion Pro Live
     timing: CameraTimingModel = field(default_factory=CameraTimingModel)
-    seed: int = 0  # of all that is drawn at random
+    seed: int = 0  # seed of all random draws
 
 
 def render_virtual_frames(

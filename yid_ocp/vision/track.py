@@ -44,7 +44,7 @@ from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, Trac
 
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
-_MAX_SIZED_FRAMES = 8  # frames, at most, that are asked about the object's sizes
+_MAX_SIZED_FRAMES = 8  # largest number of frames used to estimate the object's dimensions
 _DISTANCE_SAMPLE_POINTS = 2000  # points that tell how far away a cloud is
 _MAX_DISTANCE = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME_TOLERANCE = 1e-6  # [s]
@@ -126,7 +126,7 @@ class FrameTracker:
         self.shape_fit_initial_guesses = self.shape_fitter.shape_fit_initial_guesses() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
         self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
-        # of a root that is sought nothing that was recorded is needed
+        # a root to be found needs no recorded joints
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
         tree = system.numeric_mechanism(values)
@@ -206,7 +206,7 @@ class FrameTracker:
             try:
                 points, _ = self._finite(self.sequence, i)
             except DataError:
-                continue  # the second pass says why
+                continue  # the second pass reports the reason
             thinned = point_cloud.voxel_averages(points, options.filters.voxel_size).points
             glimpses.append(CalibrationFrame(float(self.sequence.stamps[i]), thinned))
         rng = np.random.default_rng(options.seed)
@@ -365,7 +365,7 @@ class FrameTracker:
         poses = self.robot_surfaces.part_poses_at_configuration(self._configuration_at_rest(t))
         tree, found = self.system.mechanism, {}
         for joint, pose in zip(self.robot_surfaces.part_joints, poses, strict=True):
-            if joint >= 0:  # a frame beside the joint's moving side has its link's name, as far as the model has it
+            if joint >= 0:  # a frame on the joint's moving side has the name of its link, if the model has it
                 frames = (name for name, frame in tree.frames.items() if frame.joint_index == joint)
                 found[next(frames, tree.joint_names[joint])] = pose
         return found
@@ -402,7 +402,7 @@ class FrameTracker:
         if self.robot_surfaces is not None:
             kept = ~self.robot_surfaces.is_within_surface_distance(cloud.points, q, filters.robot_padding)
         kept[kept] = ~background.is_near_background(cloud.points[kept])
-        # beside the robot's points: among all surfaces, wrong points are few
+        # relative to the robot's points: among all surfaces, outliers are few
         alone = filters.outlier_neighbours, filters.outlier_z_max
         cloud = cloud.select(point_cloud.is_statistical_inlier(cloud, *alone, kept))
         work.filtered = cloud

@@ -27,18 +27,18 @@ _CAMERA_POINT_GROUP = "points_camera"
 class FrameReport:
     """Fitted shape of one frame, or the reason why the frame was dropped."""
 
-    index: int  # of the sequence
+    index: int  # index in the sequence
     name: str
-    stamp: float  # as the camera gave it [s]
-    joint_time: float  # on the joints' clock [s]
+    stamp: float  # stamp of the camera [s]
+    joint_time: float  # time on the joints' clock [s]
     drop_reason: str  # why it was dropped; empty for a good one
-    n_raw_points: int  # of the cloud
+    n_raw_points: int  # number of points of the cloud
     n_filtered_points: int  # left by the filters
     n_skeleton_nodes: int
-    stamp_delay: float  # of its stamp beyond the common offset, NaN where it cannot be told [s]
+    stamp_delay: float  # delay of the stamp beyond the common offset, NaN if unknown [s]
     cpu_seconds: float  # processor time from the filtered cloud to the fitted points [s]
     shape_fit: FrameShapeFit | None
-    alternative_fit: FrameShapeFit | None = None  # with another end as its root, where that fits as well
+    alternative_fit: FrameShapeFit | None = None  # fit with another end as root, if it is equally good
 
     @property
     def is_good(self) -> bool:
@@ -69,15 +69,15 @@ class TrackResult:
     point_names: tuple[str, ...]  # points written down
     t: Array  # (M,), times of the good frames on the joints' clock [s]
     configurations: Array  # (M, n), configurations, twists at rest
-    position: Array  # (M, np, 3), NaN where a point was not seen well enough, as are the standard deviations [m]
+    position: Array  # (M, np, 3), NaN (as in `std`) if a point was not seen well enough [m]
     std: Array
     shared_std: Array  # the part that all frames have in common, from the camera's pose, depth and clock
     frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
     camera_calibration: CameraCalibration
     dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them
-    foreign_objects: tuple[ForeignObject, ...]  # what stood about the object
-    root_note: str  # how the root was distinguished from other ends; empty where the model places it
-    _place: Callable[[Array], Array]  # from a configuration to the points
+    foreign_objects: tuple[ForeignObject, ...]  # objects near the modelled object
+    root_note: str  # how the root end was chosen; empty if the model defines it
+    _place: Callable[[Array], Array]  # function of the configuration: the points
 
     def configuration_at_time(self, t: float) -> Array:
         """Configuration (n,) at any time, by a cubic spline through the good frames; constant beyond them."""
@@ -186,7 +186,7 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
     axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.set_box_aspect((1, 1, 1))
     away = camera - middle
-    # beside the camera's own view, where depth shows
+    # second view from the side, which shows depth
     axes.view_init(elev=18, azim=float(np.degrees(np.arctan2(away[1], away[0]))) + 35)
     axes.set_title(title, fontsize=10)
     with atomic_write(path) as temporary:

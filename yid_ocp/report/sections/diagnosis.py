@@ -209,7 +209,7 @@ def _recording_figures(
 
 
 def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
-    # promised decrease of r'r: in per cent of its excess over noise, or as it is where there is hardly an excess
+    # predicted decrease of r'r in per cent of its excess over noise, or absolute if there is little excess
     fit = finding.nominal_model
     rows = np.concatenate([series.residual_indices for series in residual_channel_indices(fit.problem)])
     excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
@@ -240,7 +240,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
             f"interval; 100 % closes the gap, less than zero predicts worse. Closed by {said}.",
             f"Right: p{promise}",
         ]
-    # beside each other on a phone there is room for a word
+    # room for one word on a narrow screen
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return title, sentences, [("", figures.candidate_ranking_figure(entries, *axes))]
@@ -337,7 +337,7 @@ def _curves(
                     found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, pair))
     if not found:
         return None
-    # the same joint in every recording would say the same thing again
+    # the same joint in every recording would repeat the information
     best: dict[str, tuple[str, tuple[TimePlotData, TimePlotData]]] = {}
     for _, recording, pair in sorted(found, key=lambda entry: -entry[0]):
         best.setdefault(pair[0].axis_title, (recording, pair))

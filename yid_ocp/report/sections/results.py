@@ -313,7 +313,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
         sensor, course = samples.sensor, None
         t = grid.start_time + grid.time_step * (samples.node + samples.fraction)
         if sensor.point_names and len(t) < grid.steps / 2:
-            # what a sensor that looks seldom would have seen at every node
+            # readings of a slow sensor at every node
             values = own.problem.predictor.state_values_at_nodes(own.prediction.rollout)
             course = own.problem.model_functions.compiled_sensor_function(sensor)(values, own.theta).output
         names, width = sensor.channel_names, sensor.outputs_per_channel
