@@ -303,7 +303,7 @@ def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
 
 
 def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    from yid_ocp.config.reader import settable_keys_with_prefix  # it takes a second, which no other completion needs
+    from yid_ocp.config.reader import settable_keys_with_prefix  # a slow import that other completions do not need
 
     given = getattr(parsed_args, "config", None) or next(iter(getattr(parsed_args, "configs", None) or ()), None)
     try:
@@ -510,7 +510,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
         return code
     except Exception as error:
         number = interruption.received_signal_number()
-        if number is not None:  # what a library makes of being interrupted is no cause
+        if number is not None:  # a library's error during an interruption is not the cause
             raise interruption.InterruptedBySignal(number) from error
         return _failed(error, as_json)
 

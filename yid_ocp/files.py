@@ -25,8 +25,8 @@ _DataclassType = TypeVar("_DataclassType")
 
 MAX_INPUT_NUMBERS = 50_000_000
 """Largest count of numbers in one input file; as float64 with copies (40 bytes each) they take 2 GB."""
-MAX_TEXT_BYTES = 1 << 26  # of a file that is read as one text
-_MEMORY_OF_READING = 7 << 28  # address space that a library may take to read a file [bytes]
+MAX_TEXT_BYTES = 1 << 26  # largest size of a file that is read as one text
+_MEMORY_OF_READING = 7 << 28  # address space for a library that reads a file [bytes]
 
 
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:

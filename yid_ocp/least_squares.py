@@ -14,7 +14,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e8
-_MAX_STEP = 0.5  # by which a component moves at most in one step
+_MAX_STEP = 0.5  # largest change of a component in one step
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,10 @@ _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
 # Longest exposure of one sample: a slow camera knows the time of a frame better than its period [s].
 _MAX_EXPOSURE_TIME = 0.04
 _N_TIME_BLOCKS = 10  # blocks of time whose errors count as independent of each other
-_MAX_DRIFT = 0.05  # part by which clocks that were meant to agree may run apart
-_DRIFT_SEARCH_STEP = 0.2  # how far clocks run apart between two drifts that are tried first [s]
-_N_RELINEARIZATIONS = 3  # so many times a fit is repeated at the times that the last one found
-_MIN_EXPLAINED_FRACTION = 0.5  # part of what a fit leaves beyond noise that a drift has to explain
+_MAX_DRIFT = 0.05  # largest relative drift of clocks that should agree
+_DRIFT_SEARCH_STEP = 0.2  # difference of the total drift between two trials [s]
+_N_RELINEARIZATIONS = 3  # repetitions of a fit at the corrected times
+_MIN_EXPLAINED_FRACTION = 0.5  # fraction of the residual beyond noise that a drift must explain
 # Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not be attributed to a clock.
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
 
@@ -58,7 +58,7 @@ class _ClockError:
     delay_std: float
     drift: float
     drift_std: float
-    explained: float  # part of the residual's squares above noise that both explain; NaN where none is
+    explained: float  # explained fraction of the squared residual above noise; NaN without any
 
     @property
     def whole_drift(self) -> float:

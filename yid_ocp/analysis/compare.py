@@ -56,12 +56,12 @@ class MethodComparison:
     """Results of all estimation methods on one problem, with disagreements on identifiable parameters."""
 
     method_results: tuple[_MethodResult, ...]
-    reference_method: str  # of the lowest cost, with which the others are compared
-    has_process_noise: bool  # of the problem, which the methods are compared without
-    # the answer of `solve`: the reference's, checked, or with process noise that of a method that models it
+    reference_method: str  # method of lowest cost, with which the other methods are compared
+    has_process_noise: bool  # whether the problem has process noise; the comparison ignores it
+    # result of `solve`: the checked reference or, with process noise, that of a method that models it
     verdict_solution: Solution
     disagreements: Mapping[str, list[str]]  # a sentence for each identifiable parameter, with the reason
-    # on estimates of unidentifiable parameters, and on what steepest descent left far from a known truth
+    # sentences on unidentifiable parameters, and on errors of steepest descent relative to a known truth
     explanations: tuple[str, ...]
 
     @property
@@ -218,7 +218,7 @@ def _resident() -> float:
     lines = status.read_text(encoding="ascii", errors="replace").splitlines() if status.is_file() else []
     for line in (line for line in lines if line.startswith("VmRSS:")):
         return float(line.split()[1]) / 1024.0
-    import resource  # not on Windows
+    import resource  # not available on Windows
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
@@ -239,7 +239,7 @@ _TRUTH_EXPERIMENT = "single_arm_vision"
 """Experiment whose rounded estimates are the truth of the embedded recordings (the only one without a zero)."""
 
 _TORQUE_BIAS_STD = 0.3  # standard deviation of the constant error of a joint's torque in the ensemble [N m]
-_DESCENT_INITIAL_VALUE, _DESCENT_ITERATIONS = 3.0, 200  # of steepest descent in the ensemble [N m/rad]
+_DESCENT_INITIAL_VALUE, _DESCENT_ITERATIONS = 3.0, 200  # of steepest descent: start [N m/rad], iterations
 _ROUNDING_RTOL = 0.02  # a truth so near a published value, relatively, was made of it by rounding
 _ZERO_BOUND_FRACTION = 0.01  # a bound at zero is reached within this fraction of the largest of an ensemble's values
 

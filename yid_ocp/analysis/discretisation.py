@@ -402,7 +402,7 @@ class AlternatingErrorGrowth:
     recording_name: str
     growth_decades: float  # powers of ten, over the stretch on which it grows most
     max_step_factor: float  # largest growth in one step
-    max_growth_time: float  # of that, from the start of the motion [s]
+    max_growth_time: float  # time of that step from the start of the motion [s]
     time_step: float
 
     @property

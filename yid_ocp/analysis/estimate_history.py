@@ -17,7 +17,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.inference.null_test import chi2_p_value
 
-_MIN_CORRELATION_EIGENVALUE = 1e-12  # what is known better than that follows from rounding
+_MIN_CORRELATION_EIGENVALUE = 1e-12  # smaller eigenvalues result from rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,7 +34,7 @@ class RunEstimates(ReprMixin):
     covariance: Array  # shape (n, n)
     units: Mapping[str, str] = field(default_factory=dict)
     is_fit_adequate: bool = True
-    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by label `kind@location`
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # parameters by label `kind@location`
 
     def _summary(self) -> ReprLineAndTableRows:
         rows = [("parameter", "value", "unit")]
@@ -78,9 +78,9 @@ class _RunOutlierTest:
     chi2: float
     degrees_of_freedom: int
     p_value: float
-    worst_parameter: str  # that differs most
+    worst_parameter: str  # parameter that differs most
     is_fit_adequate: bool
-    is_outlier: bool  # it alone disagrees with the others, which agree without it
+    is_outlier: bool  # the other runs agree with each other, but not with this run
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,7 @@ def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | No
 
 _MEMORY_SUFFIX = ".memory"
 _MAX_REST_SPEED = 0.01  # a recording whose points move more slowly at its start starts at rest [m/s]
-_MIN_MOVING_RECORDINGS = 2  # that start in motion, of which one is left out at a time: fewer cannot agree
+_MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 
 @dataclass(frozen=True)

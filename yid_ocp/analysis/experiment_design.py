@@ -38,10 +38,10 @@ from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
 CAMERA_GROUP, ARM_GROUP = "points_camera", "points_arm"
-_MARKER_AXIS_DISTANCE = 0.03  # of a marker from the axis [m]
-_DEFAULT_CAMERA_STD, _DEFAULT_CAMERA_RATE = 5e-3, 3.0  # of a camera where there was none [m], [Hz]
-_DEFAULT_ARM_POINT_STD = 1e-3  # of points that an arm measures where it measured none [m]
-DEFAULT_TORQUE_STD = 0.1  # of joint torques whose noise nobody stated [N m]
+_MARKER_AXIS_DISTANCE = 0.03  # distance of a marker from the axis [m]
+_DEFAULT_CAMERA_STD, _DEFAULT_CAMERA_RATE = 5e-3, 3.0  # of a hypothetical camera [m], [Hz]
+_DEFAULT_ARM_POINT_STD = 1e-3  # of hypothetical points measured by an arm [m]
+DEFAULT_TORQUE_STD = 0.1  # of joint torques without stated noise [N m]
 _MOTION_SEED = 11  # of alternative motions
 # Offsets of two grippers towards each other and away from the robot: a fully stretched branched tube snaps through [m].
 _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
@@ -65,7 +65,7 @@ class RecordedExperiment:
     x: Array  # unknowns at which the information is evaluated, shape (nx,)
     initial_state_knowledge: InitialStateKnowledge = "assumed"
     grasp_offset_prior_std: float | None = None
-    two_arm_system: System | None = None  # with a second arm and its grasp
+    two_arm_system: System | None = None  # system with a second arm and its grasp
 
     @property
     def parameter_values(self) -> dict[str, float]:
@@ -181,12 +181,12 @@ class CandidateExperimentSensitivities:
     `point_sensitivities_and_joint_sensor_information`).
     """
 
-    problem: EstimationProblem  # with nuisances, and every measurable frame observed at every node
+    problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
     x: Array
     free_parameters: tuple[str, ...]
     position_sensitivities: Mapping[tuple[int, str, str], Array]  # shape (N + 1, 3, nx + q)
-    prior_information: Array  # of nuisances, shape (nx, nx)
-    # by episode: of measured torques or angles, and of the prior of the torque errors, shape (nx + q, nx + q)
+    prior_information: Array  # prior of nuisances, shape (nx, nx)
+    # by episode: information (nx + q, nx + q) of measured torques or angles, and of the prior of torque errors
     joint_information: Mapping[int, Array] = field(default_factory=dict)
     feasibility_notes: tuple[str, ...] = ()  # obstacles on a real robot, such as joint limits
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)

@@ -33,7 +33,7 @@ class FrictionLawFit:
     """
 
     law: str
-    parameters: Mapping[str, ParameterEstimate]  # of the fit to all recordings
+    parameters: Mapping[str, ParameterEstimate]  # estimates of the fit to all recordings
     left_out_errors: Mapping[str, float]
     unit: str
     is_converged: bool
@@ -102,9 +102,9 @@ class _FrictionTorqueCloud:
 
     joint: str
     speed: Array  # shape (M,) [rad/s]
-    load: Array  # motor torque less that from outside, shape (M,) [N m]
-    measured: Array  # against the motion, that the model without friction lacks, shape (M,) [N m]
-    predicted: Array  # that of the fitted law, shape (M,) [N m]
+    load: Array  # motor torque minus external torque, shape (M,) [N m]
+    measured: Array  # torque missing in the model without friction, against the motion, shape (M,) [N m]
+    predicted: Array  # friction of the fitted law, shape (M,) [N m]
 
 
 def friction_torque_clouds(

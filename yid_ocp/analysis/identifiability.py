@@ -55,10 +55,10 @@ _GRASP_OFFSET_PREFIX = f"{_GRASP_OFFSET_KIND}@"
 GRASP_OFFSET_PRIOR_STD = 0.01  # prior of where a grasp sits [m]
 # A column this much smaller than the largest counts as zero when nuisances are eliminated.
 _RANK_RTOL = 1e-10
-_MAX_DIRECTION_MISMATCH = 0.05  # of a direction against that of a plain combination, both of unit length
+_MAX_DIRECTION_MISMATCH = 0.05  # between the unit vectors of a direction and of a simple combination
 _FINITE_CHANGE_FACTOR = 1.3  # factor on the first parameter in the test of a combination at a finite change
 _MAX_LISTED_NAMES = 4  # in a sentence
-_MAX_RELATIVE_DATA_CHANGE = 0.1  # by which a combination may move the data, of what one change alone does
+_MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that by one parameter
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class ParameterIdentifiability:
 
     value: float
     unit: str
-    std: float  # with all other unknowns free; infinite where nothing informs it
+    std: float  # with all other unknowns free; infinite without information
     std_relative: float  # divided by the value, or by its typical size where that is zero
     std_alone: float  # relative standard deviation if all other unknowns were known
     verdict: str
@@ -105,10 +105,10 @@ class IdentifiabilityResult(ReprMixin):
     parameters: Mapping[str, ParameterIdentifiability]
     parameter_names: tuple[str, ...]  # in the order of the matrices
     correlations: Array  # shape (p, p), NaN in rows of parameters that nothing informs
-    fisher_information: Array  # of relative changes, nuisances eliminated, shape (p, p)
+    fisher_information: Array  # for relative changes, nuisances eliminated, shape (p, p)
     directions: tuple[_ParameterDirection, ...]  # least observable first
     nuisance_names: tuple[str, ...]  # further unknowns, estimated together with the parameters
-    chi2_per_dof: float  # at the point; above one, its root scales standard deviations at a fit
+    chi2_per_dof: float  # if above one, its root scales standard deviations at a fit
     profiles: Mapping[str, ParameterProfileLikelihood] = field(default_factory=dict)
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -297,8 +297,8 @@ class _Sensitivities:
     scale: Array
     inflation: float
     by_alone: Array  # whitened, of relative changes with everything else known, shape (nr, p)
-    relative: Array  # the same with nuisances eliminated
-    nuisance: Array  # of all other unknowns in their scales
+    relative: Array  # `by_alone` with nuisances eliminated
+    nuisance: Array  # sensitivities of all other unknowns in their scales
 
     @staticmethod
     def of(

@@ -30,11 +30,11 @@ from yid_ocp.sensors.joints import (
     joint_angle_noise_std,
 )
 
-_ANGLE_LIMIT_MARGIN = 0.1  # beyond a joint's limits, where a robot's own model differs from its URDF [rad or m]
+_ANGLE_LIMIT_MARGIN = 0.1  # beyond a joint's limits, as robots differ from their URDF [rad or m]
 _MAX_SPEED_RATIO = 1.5  # factor by which joints may turn faster than the URDF says that they can
 _SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither noise nor steps of encoders count
-_MOTION_BANDWIDTH_HZ = 5.0  # where motion of a robot's arm ends; what is faster is left out [Hz]
-_MAX_MOTION_SAMPLES = 300  # about so many samples of a motion are looked at
+_MOTION_BANDWIDTH_HZ = 5.0  # bandwidth of an arm's motion; faster components are removed [Hz]
+_MAX_MOTION_SAMPLES = 300  # approximate number of samples used of a motion
 _VISCOUS_FRICTION_FRACTION = 0.04  # usual viscous friction beside a joint's largest effort [per rad/s]
 _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
 
@@ -225,7 +225,7 @@ def check_inertial_effort_excitation(
     if joints is None or motion is None or motion.effort is None or effort.use is False:
         return
     if float(np.max(np.ptp(motion.q, axis=0))) < QUALITY_LIMITS.min_joint_motion:
-        return  # it stands still, which is said already
+        return  # another check reports a standstill
     noise = _noise(joints, arm.joint_names, effort)
     if not np.all(noise > 0):
         return
@@ -296,16 +296,16 @@ _OFFSET_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.0
 _GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
 _WRONG_GAIN_FACTOR = 3.0  # usual size of 1/g, and the factor from which a gain counts as wrong
 _MAX_EXPLAINED_RMS = 1.5  # residual over the model's error, up to which a joint's effort is explained
-_WELL_EXPLAINED_RMS = 0.5  # the same up to which nothing is left to be explained by a lag
-_WRONG_ROBOT_RMS = 3.0  # the same from which on it is not this robot's
-_MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # where numbers end that a fit can be made of
+_WELL_EXPLAINED_RMS = 0.5  # ratio below which no lag is needed as an explanation
+_WRONG_ROBOT_RMS = 3.0  # ratio above which the efforts do not belong to this robot
+_MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # limits of numbers that a fit can use
 _MIN_Z = 5.0  # standard deviations from which on a number counts
 _INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples further apart than half of its inverse count as independent [Hz]
 _MIN_EFFORT = 1e-3  # efforts below this tell nothing [N m]
-_LAG_SEARCH_STEP = 0.1  # in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]
+_LAG_SEARCH_STEP = 0.1  # step of the search for a lag of efforts; a shorter lag is no gross error [s]
 # Fraction of the largest effort that a joint with zero command may seem to require: it swings and has friction.
 _IDLE_COMMAND_FRACTION = 0.2
-_MAX_EFFORT_RATIO = 1.3  # by which an effort may exceed the URDF's limit, which some makers state for continuous use
+_MAX_EFFORT_RATIO = 1.3  # allowed ratio to the URDF's effort limit, which may hold for continuous use only
 
 
 @dataclass(frozen=True)
@@ -332,9 +332,9 @@ class _Fit(NamedTuple):
     std: Array
     offset: Array  # [N m]
     offset_std: Array
-    left: Array  # what is not explained, in sizes of the model's error
+    left: Array  # unexplained part relative to the model's error
     direct: Array  # gain by which an effort's variation follows what is needed, without prior and noise
-    shift: Array  # by how much it is off in the mean, without prior and noise [N m]
+    shift: Array  # mean error without prior and noise [N m]
     cost: float
 
 

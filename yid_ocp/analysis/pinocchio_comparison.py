@@ -28,8 +28,8 @@ from yid_ocp.model.kinematics import (
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 
-_RELATIVE_TOLERANCE = 1e-8  # of the largest entry; placements are rounded to 1e-11 of an exact quarter turn
-_N_RANDOM_CONFIGURATIONS = 3  # at which both are compared, besides the one that is given
+_RELATIVE_TOLERANCE = 1e-8  # relative to the largest entry; placements are rounded to 1e-11
+_N_RANDOM_CONFIGURATIONS = 3  # configurations compared in addition to the given one
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class _PinocchioComparison:
     """Relative differences between a model and Pinocchio's model of the same bodies (over the largest entry)."""
 
     of: str  # the compared model, in words
-    mass: float  # of mass matrices
-    weight: float  # of gravity forces
-    motion: float  # of inverse dynamics
+    mass: float  # difference of mass matrices
+    weight: float  # difference of gravity forces
+    motion: float  # difference of inverse dynamics
 
     @property
     def agrees_within_rounding(self) -> bool:
@@ -88,7 +88,7 @@ def compare_urdf_with_pinocchio(
         for i, name in enumerate(model.names):
             if i and name not in joints:
                 joint, value = model.joints[i], 0.0
-                if joint.nq == 1:  # where nothing is said, at zero or at the bound next to it
+                if joint.nq == 1:  # default: zero or the nearest limit
                     limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
                     value = float(np.clip(0.0, *limits))
                 _place(at, joint, locked.get(name, value))

@@ -29,7 +29,7 @@ from yid_ocp.sensors import SensorOptions
 
 _SensorChoices = Callable[[str], SensorOptions]
 
-_HELD_POINT_TOLERANCE = 0.01  # from where the arm holds a point: what calibration and a tool's measures leave [m]
+_HELD_POINT_TOLERANCE = 0.01  # from the position by the arm: errors of calibration and tool size [m]
 # Fraction of the object's length by which points may differ from a model with unknown stiffness.
 _MAX_OBJECT_ERROR_FRACTION = 0.25
 _MAX_REMAINING_FRACTION = 0.5  # a change explains points where it leaves less than this part of their distance
@@ -130,7 +130,7 @@ def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
         yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
     errors = {turn: _rms(seen[..., list(turn[0])] * np.array(turn[1]) - place) for turn in list(turns)[1:]}
-    # of several equally good ones the last
+    # the last of several equally good ones
     order, signs = min(reversed(errors), key=lambda turn: errors[turn])
     axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
     mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0

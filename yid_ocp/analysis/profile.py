@@ -34,16 +34,16 @@ _Found = TypeVar("_Found")
 
 _CHI2_QUANTILE_999 = 10.827566170662733  # of one degree of freedom
 _SMALL_VALUE_FRACTION = 0.3  # a value below this part of its typical size is small
-_MAX_LOG_DISTANCE = math.log(1e3)  # up to which a positive unknown is followed before its interval counts as open
+_MAX_LOG_DISTANCE = math.log(1e3)  # range of a positive unknown beyond which its interval is open
 _LOG_PRIOR_STD = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
 _REFIT_CHI2_ATOL = 1e-3  # chi2 that a refit may leave on the table
 _TARGET_HEIGHT = math.sqrt(CHI2_95_TWO_SIDED)  # root of delta chi2 at the ends of an interval
-_ROOT_RTOL = 0.01  # of the root of delta chi2 against the target
+_ROOT_RTOL = 0.01  # relative tolerance on the root of delta chi2
 _MAX_REFIT_ITERATIONS, _MAX_REJECTED_STEPS, _MAX_PROFILE_POINTS = 30, 8, 12
-_MAX_AUTOMATIC_INTERVALS, _MAX_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
-_OPTIMUM_ITERATIONS = 20  # iterations that bring all unknowns, nuisances among them, to their best fit
-_CLIFF_HEIGHT_RATIO = 10.0  # height that is no parabola's, of the target
-_CLIFF_WIDTH_RTOL = 1e-3  # distance of a cliff's two sides, of that from the fit
+_MAX_AUTOMATIC_INTERVALS, _MAX_UNKNOWNS = 12, 300  # larger problems need an explicit request
+_OPTIMUM_ITERATIONS = 20  # iterations that bring all unknowns to their best fit
+_CLIFF_HEIGHT_RATIO = 10.0  # height over target that indicates a discontinuity
+_CLIFF_WIDTH_RTOL = 1e-3  # distance of a discontinuity's two sides over its distance from the fit
 _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 
@@ -53,11 +53,11 @@ class ParameterProfileLikelihood:
 
     name: str
     value: float
-    lower: float | None  # end of the 95 % interval; None where it is open, as `upper`
+    lower: float | None  # lower end of the 95 % interval; None if open
     upper: float | None
-    values: Array  # points at which the others were refitted, in order, shape (k,)
-    delta_chi2: Array  # chi2 above the best, over max(1, chi2 per dof), shape (k,)
-    notes: tuple[str, ...] = ()  # why an end is open if not for lack of information; a better fit met
+    values: Array  # values at which the other unknowns were refitted, ascending, shape (k,)
+    delta_chi2: Array  # (chi2 - best chi2) / max(1, chi2 per dof), shape (k,)
+    notes: tuple[str, ...] = ()  # other reasons for an open end; a better fit found
 
     @property
     def interval(self) -> ConfidenceInterval:
@@ -212,7 +212,7 @@ class _Walk:
             trial = sign * min(sign * (s + sign * step), sign * (limit if barrier is None else barrier))
             if abs(trial - s) < 1e-9 * max(1.0, abs(s)):
                 if barrier is None:
-                    return None  # it stands at its bound
+                    return None  # the unknown is at its bound
                 break
             point = self._refit(inside, trial)
             if point is None:
@@ -257,7 +257,7 @@ class _Walk:
         """Regula falsi (Illinois) on the root of delta chi2, which is nearly linear; bisection at a discontinuity."""
         a, b, target = inside, outside, _TARGET_HEIGHT
         heights = [self._height(a) - target, self._height(b) - target]
-        share = 1.0  # of the older side's height that counts, halved each time that side is kept
+        share = 1.0  # weight of the older side's height, halved each time it is kept
         for attempt in range(2 * _MAX_PROFILE_POINTS + 1):
             at = [float(point.x[self.index]) for point in (a, b)]
             cliff = max(heights) > _CLIFF_HEIGHT_RATIO * target

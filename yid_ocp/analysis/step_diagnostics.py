@@ -128,7 +128,7 @@ class ParameterDetectability:
     rows: tuple[str, ...]  # names of rows that contain the parameter in any state
     observable_rows: tuple[str, ...] | None  # of `rows`, those with a first-order sensor response; None: no sensors
     most_sensitive_sensor: str  # empty where no sensor responds
-    directly_dependent_sensors: tuple[str, ...]  # whose readings contain the parameter
+    directly_dependent_sensors: tuple[str, ...]  # sensors whose readings contain the parameter
     max_change_from_rest: float | None  # largest of a reading for one unit of the parameter [standard deviations]
     seconds: float  # time within which that change is reached
     change_along_recordings: float | None = None  # root sum of squares over all readings, likewise
@@ -234,7 +234,7 @@ def _answers(
     return largest
 
 
-_ZERO_RTOL = 1e-14  # of the largest entry: rounding
+_ZERO_RTOL = 1e-14  # entries below this fraction of the largest one are rounding
 
 
 class NamedIndexRange(NamedTuple):
@@ -249,10 +249,10 @@ class NamedIndexRange(NamedTuple):
 class SparsityPattern:
     """Structural nonzeros of a matrix with named blocks, rows and columns."""
 
-    name: str  # for files; the title is for people
+    name: str  # used in file names; `title` is for display
     title: str
     nonzero_mask: BoolArray  # shape (r, c)
-    row_blocks: tuple[NamedIndexRange, ...]  # in order and without gaps, as those of columns
+    row_blocks: tuple[NamedIndexRange, ...]  # in order and without gaps, like `column_blocks`
     column_blocks: tuple[NamedIndexRange, ...]
     row_labels: tuple[str, ...]
     column_labels: tuple[str, ...]
@@ -378,14 +378,14 @@ class _NlpStage(NamedTuple):
     """Sparsity of one stage of the NLP, equal for all stages. The initial state depends on all free parameters."""
 
     constraint_mask: BoolArray  # one step's constraints by (theta_free, x_k, x_{k+1}, lam_k)
-    hessian_mask: BoolArray  # of these constraints times their multipliers
-    gauss_newton_mask: BoolArray  # of the priors and of one reading of every sensor, by (theta_free, x_k)
+    hessian_mask: BoolArray  # Hessian of these constraints times their multipliers
+    gauss_newton_mask: BoolArray  # Hessian of priors and one reading of every sensor by (theta_free, x_k)
     constraint_blocks: Sequence[_Block]
     state_blocks: Sequence[_Block]
     multiplier_labels: tuple[str, ...]
     free: tuple[str, ...]
-    fixed_start_rows: Sequence[int]  # of the first node's state, that the start fixes
-    estimated_start_rows: Sequence[int]  # that have a prior about it
+    fixed_start_rows: Sequence[int]  # rows of the first node's state that are fixed
+    estimated_start_rows: Sequence[int]  # rows that are estimated with a prior
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:

@@ -77,7 +77,7 @@ class _FormulaText:
     shared_subexpressions: tuple[tuple[str, str], ...]  # name and expression, which may use those before it
     expression_texts: tuple[str, ...]
     n_operations: int  # each shared one counted once
-    variable_indices: tuple[int, ...]  # of the variables that occur
+    variable_indices: tuple[int, ...]  # indices of the variables that occur
 
 
 def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:

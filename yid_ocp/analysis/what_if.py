@@ -32,7 +32,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.solvers.base import Solution
 
 _FASTER_CAMERA_RATES = (10.0, 30.0)  # rates of the camera to try [Hz]
-_MIN_INFORMATION_EIGENVALUE = 1e-16  # of information on relative changes: standard deviations up to 1e8
+_MIN_INFORMATION_EIGENVALUE = 1e-16  # for relative changes; allows standard deviations up to 1e8
 _MAX_CHANGE_SET_SIZE = 3
 
 

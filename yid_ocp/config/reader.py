@@ -33,7 +33,7 @@ EMBEDDED_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
 EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
-_ALIAS_COST = 40  # in entries: the reader compares each mapping that an alias is merged into with all others
+_ALIAS_COST = 40  # in entries: merging an alias compares its mapping with all others
 _ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
 
 
@@ -90,7 +90,7 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
 
 def _loaded(text: str, origin: str) -> Any:
     """Data of a YAML text that is not too deep and has no custom types."""
-    sizes: dict[str, int] = {}  # of what aliases stand for
+    sizes: dict[str, int] = {}  # sizes of anchored content
     begun: list[tuple[str | None, int]] = []  # anchors of the collections that are open, and counts before them
     count = 0
     try:

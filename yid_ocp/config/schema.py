@@ -19,9 +19,9 @@ from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 class SectionVariants:
     """Alternative settings classes of a configuration section, and the key that selects one."""
 
-    classes: Mapping[str, type]  # by the word that chooses one; a single one under the empty word
-    selector_key: str = ""  # holds the word, empty where there is no choice
-    default_variant: str = ""  # the word where the key is absent, empty where it must be given
+    classes: Mapping[str, type]  # by the value of the selector key; a single class under the empty name
+    selector_key: str = ""  # key that selects a class, empty without a choice
+    default_variant: str = ""  # value if the key is absent, empty if it is required
     variant_noun: str = ""
     is_nullable: bool = False
 

@@ -17,10 +17,10 @@ from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors import CHANNEL_KINDS, SensorOptions
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORDER, quantization_step
 
-_MAX_REPEATED_FRACTION = 0.1  # of a channel's samples, which may repeat the previous one
-_MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # next to a rest, in smallest and median changes of a channel
-_MIN_NOISE_FRACTION = 1e-2  # of the stated noise, below which a channel was computed, not measured
-_MAX_SAMPLE_PERIOD = 0.02  # at which arm motion counts as slow [s]
+_MAX_REPEATED_FRACTION = 0.1  # fraction of samples that may repeat the previous one
+_MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # change next to a rest over smallest and median change
+_MIN_NOISE_FRACTION = 1e-2  # fraction of the stated noise below which a channel was computed
+_MAX_SAMPLE_PERIOD = 0.02  # longest period at which arm motion counts as slow [s]
 
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
@@ -179,7 +179,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
             continue
         columns = values.reshape(len(t), -1).T
         if np.mean(np.diff(columns, axis=1) == 0) > _MAX_REPEATED_FRACTION:
-            continue  # it is cut off, coarse or stuck, and says too little of its noise
+            continue  # a saturated, coarse or stuck channel does not show its noise
         strides = [2**k for k in range(12) if 2**k * step <= _MAX_SAMPLE_PERIOD]
         sizes = [white_noise_std(t[::k], column[::k]) for k in strides for column in columns]
         seen = max([*sizes, *(quantization_step(column) / math.sqrt(12) for column in columns)])
@@ -207,7 +207,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
     """Find joints with saturated effort, which repeatedly equals its extreme value exactly."""
     if recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command":
-        return  # what a controller asks for ends at its own bound
+        return  # commands end at the controller's own limit
     for group, channel, t, values in _channels(recording, "effort"):
         for sign in (1.0, -1.0):
             levels, counts = np.unique(sign * values, return_counts=True)
@@ -294,12 +294,12 @@ QUALITY_LIMITS = _QualityLimits()
 class Issue:
     """One data quality issue of a recording: cause, severity, evidence and advice."""
 
-    cause: str  # what is wrong, in one word of `ISSUE_CAUSE_DESCRIPTIONS`
-    what: str  # the same in one sentence, with numbers
+    cause: str  # key of `ISSUE_CAUSE_DESCRIPTIONS`
+    what: str  # sentence on the cause, with numbers
     # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
     weight: Severity
     evidence_ratio: float  # observed value over the detection limit, 1 to `MAX_EVIDENCE_RATIO`
-    advice: str  # what to do
+    advice: str  # recommended action
     # location; empty means all
     recording: str
     group: str = ""
@@ -307,7 +307,7 @@ class Issue:
     # time interval on the group's clock [s]; None means the whole recording
     begin: float | None = None
     end: float | None = None
-    setting: str = ""  # line of configuration that repairs or describes it, where there is one
+    setting: str = ""  # line of configuration that repairs or describes it, if any
 
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSE_DESCRIPTIONS:

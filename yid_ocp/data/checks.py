@@ -27,14 +27,14 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import count_with_noun
 
 _CLOCK_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
-_MIN_UNIX_TIME = 1e8  # from which on a time stamp is taken as seconds since 1970 instead of since power-on [s]
-_MAX_SAMPLE_GAP = 0.1  # between samples that is interpolated; arm motion has a bandwidth of 5 Hz [s]
+_MIN_UNIX_TIME = 1e8  # larger time stamps are seconds since 1970, smaller since power-on [s]
+_MAX_SAMPLE_GAP = 0.1  # longest interpolated gap; arm motion has a bandwidth of 5 Hz [s]
 _MAX_MISSING_PERIODS = 5  # sample periods that may always be missing
-_MIN_PART_DURATION = 0.5  # of a part of a recording that is kept [s]
-_MAX_ROTATION_AT_REST = 0.01  # of any joint in the first 0.2 s of a part that starts at rest [rad]
-_MAX_CLOCK_JUMP_PERIODS = 5  # a gap that the joints cross in fewer at their speed is a jump of the clock
-_MIN_JUMP_ROTATION = 0.05  # at joint speed over a gap, for a clock jump to be detected [rad]
-_INTERVAL_GRID = math.sqrt(2.0) * 1e-6  # at which intervals are compared; no usual one lies on its edges [s]
+_MIN_PART_DURATION = 0.5  # shortest part of a recording that is kept [s]
+_MAX_ROTATION_AT_REST = 0.01  # largest rotation in the first 0.2 s of a part that starts at rest [rad]
+_MAX_CLOCK_JUMP_PERIODS = 5  # a gap that joints cross in fewer periods at their speed is a clock jump
+_MIN_JUMP_ROTATION = 0.05  # rotation at joint speed over a gap required to detect a clock jump [rad]
+_INTERVAL_GRID = math.sqrt(2.0) * 1e-6  # grid for the comparison of intervals; usual ones are not on its edges [s]
 _HASH_BASE = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -188,7 +188,7 @@ def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
         return
     count = np.rint(steps / base)
     even = float(np.mean(np.abs(steps / base - count) < 0.1 * count))
-    small = count[count < 50]  # what is longer is a gap
+    small = count[count < 50]  # longer ones are gaps
     missing = float(np.sum(small - 1) / np.sum(small))
     if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
         what = f"{100 * missing:.2g} % of the samples of a clock of {1 / base:.4g} Hz are missing"

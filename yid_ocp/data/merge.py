@@ -17,13 +17,13 @@ from yid_ocp.data.readers.base import mean_sample_rate, merge_on_fastest_clock
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 
-_MIN_SHARED_FRACTION = 0.5  # of the shorter recording; two clocks that overlap by less are taken as unrelated
-_MIN_EXPLAINED = 0.9  # of the points' motion by the joints, from which on it says how two clocks lie
-_MAX_LEFT_RATIO = 0.7  # of what is left unexplained with and without a lag, below which the lag is said
+_MIN_SHARED_FRACTION = 0.5  # overlap over the shorter recording; clocks with less are unrelated
+_MIN_EXPLAINED = 0.9  # explained fraction of point motion required to align two clocks
+_MAX_LEFT_RATIO = 0.7  # ratio of residuals with and without a lag, below which it is reported
 _MIN_SAID_LAG = 0.02  # [s]
-_LAG_SEARCH = 0.3  # of a sensor on a shared clock, and around what speeds say [s]
+_LAG_SEARCH = 0.3  # range of lags for a shared clock, and around the lag of speeds [s]
 _MIN_TURN, _MIN_TRAVEL, _MIN_SAMPLES, _MIN_SEEN_FRACTION = 0.05, 0.005, 20, 0.5  # [rad], [m]
-_LARGEST_START = 1e6  # from which on times are counted from the first sample [s]
+_LARGEST_START = 1e6  # larger times are counted from the first sample [s]
 
 
 class _MotionLag(NamedTuple):

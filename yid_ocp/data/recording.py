@@ -39,8 +39,8 @@ _CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # what te
 
 _LARGEST = {"1": 1.0, "rad": 50.0, "rad/s": 1e6, "N m": 1e9}
 """Limits that no joint exceeds: eight turns (angles in degrees nearly always exceed them), or beyond any machine."""
-_LARGEST_SPREAD = 1e9  # its square is a number still
-_LARGEST_DISTANCE = 50.0  # beyond any motion capture volume, whereas an object in millimetres is always larger
+_LARGEST_SPREAD = 1e9  # its square is finite
+_LARGEST_DISTANCE = 50.0  # beyond any motion capture volume [m]; objects in millimetres exceed it
 _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its end is seldom exactly the number asked for
 
 

@@ -18,10 +18,10 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD, PositionServo
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 
-_PLAY_TORQUE = 0.2  # at which three quarters of the backlash are taken up [N m]
-_DEFAULT_EFFORT_LIMIT = 10.0  # of a joint that has none [N m or N]
-_MIN_LIMIT_FRACTION = 0.1  # smallest torque limit that is searched, over the joint's effort limit
-_MIN_LIMIT_CURRENT = 0.1  # smallest current limit that is searched [A]
+_PLAY_TORQUE = 0.2  # torque at which tanh reaches three quarters [N m]
+_DEFAULT_EFFORT_LIMIT = 10.0  # for a joint without an effort limit [N m or N]
+_MIN_LIMIT_FRACTION = 0.1  # smallest torque limit of the search, over the joint's effort limit
+_MIN_LIMIT_CURRENT = 0.1  # smallest current limit of the search [A]
 
 
 def _recorded_joints(system: System) -> tuple[str, ...]:

@@ -25,8 +25,8 @@ ORDERED_EXCITATION_DESCRIPTIONS = (
     "how long it is",
 )
 """What a motion must vary to excite an effect of the library, in the order in which messages list it."""
-_BAXTER_EFFORT_LIMIT = 50.0  # on which the ranges of arm effects are based; they scale with the limit [N m]
-_SAME_POINT_DISTANCE = 1e-6  # nearer points of arms, in all configurations, count as one [m]
+_BAXTER_EFFORT_LIMIT = 50.0  # reference of the ranges of arm effects, which scale with the limit [N m]
+_SAME_POINT_DISTANCE = 1e-6  # points of arms nearer than this in all configurations count as one [m]
 _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -36,12 +36,12 @@ class ParameterDefinition:
 
     name: str
     unit: str
-    neutral_value: float  # where the effect is absent; for a shape parameter a value to start a search from
+    neutral_value: float  # value without effect; for a shape parameter the start of a search
     lower: float  # physical bounds
     upper: float
     prior_range: tuple[float, float]  # range (low, high) that an engineer would expect
     description: str
-    is_shape_parameter: bool = False  # no influence while the others are neutral (a relaxation time, a yield angle)
+    is_shape_parameter: bool = False  # without influence while amplitudes are neutral (a relaxation time)
     # `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or for a factor that
     # is infinite where its sign changes; p in value = reported value^-p
     reported_reciprocal: str = ""

@@ -17,15 +17,15 @@ from yid_ocp.model.mechanism import Inertia, merge_bodies, symbolic_rotation_fro
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.model.system import ForceWithDerivativeFactors, MidpointState, StepTerms, System
 
-_MAX_PAYLOAD_DISTANCE = 0.5  # of a payload's mass from its frame [m]
-_MAX_COM_SHIFT = 0.05  # of a link's centre of mass without added mass [m]
-_MAX_REMOVED_MASS_FRACTION = 0.9  # of a link's mass, by a negative payload
-_POINT_INERTIA_DISTANCE = 2.0  # beyond which a payload's own inertia is no longer that of a point [m]
-_POINT_INERTIA_MIN_MASS = 1e-2  # below which a payload has no inertia of its own [kg]
-_UNLIMITED_MOMENT_FRACTION = 0.95  # of a payload's moments that acts, above which the limit of its place is negligible
+_MAX_PAYLOAD_DISTANCE = 0.5  # distance of a payload's centre from its frame [m]
+_MAX_COM_SHIFT = 0.05  # shift of a link's centre of mass without added mass [m]
+_MAX_REMOVED_MASS_FRACTION = 0.9  # fraction of a link's mass that a negative payload may remove
+_POINT_INERTIA_DISTANCE = 2.0  # beyond it a payload does not have the inertia of a point [m]
+_POINT_INERTIA_MIN_MASS = 1e-2  # lighter payloads have no inertia of their own [kg]
+_UNLIMITED_MOMENT_FRACTION = 0.95  # ratio of limited to given moments above which the limit is negligible
 _MIN_LINK_EXTENT = 1e-3  # root mean square [m]
 _AIR_DENSITY = 1.2  # [kg/m^3]
-_ABS_SMOOTHING_SPEED = 1e-3  # below which |v_n| in the drag is smoothed [m/s]
+_ABS_SMOOTHING_SPEED = 1e-3  # smoothing range of |v_n| in the drag [m/s]
 
 
 class _CarriedBody(NamedTuple):

@@ -15,10 +15,10 @@ from yid_ocp.model.system import Effect, MidpointState, StepTerms, System
 
 SIGN_SMOOTHING_SPEED = 0.02
 """v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
-_LOAD_SIGN_SMOOTHING_SPEED = 0.005  # of friction that grows with the load and holds what that would move [rad/s]
-_SMOOTHING_TORQUE = 1e-3  # below which |torque| is smoothed [N m]
-_ABS_SMOOTHING_ANGLE = 1e-7  # turned in a step, below which |d| in Dahl's law is smoothed [rad]
-_SERIES_MAX_ANGLE_RATIO = 1e-2  # of step angle to yield angle, below which the exponential loses digits to a series
+_LOAD_SIGN_SMOOTHING_SPEED = 0.005  # for load-dependent friction, which must hold its load at rest [rad/s]
+_SMOOTHING_TORQUE = 1e-3  # smoothing range of |torque| [N m]
+_ABS_SMOOTHING_ANGLE = 1e-7  # smoothing range of |d| in Dahl's law, angle per step [rad]
+_SERIES_MAX_ANGLE_RATIO = 1e-2  # step angle over yield angle; below it a series replaces the exponential
 
 FrictionLawName = Literal["viscous", "coulomb", "stribeck", "presliding", "load", "load_stribeck"]
 EFFECT_KINDS_BY_FRICTION_LAW: Mapping[FrictionLawName, tuple[str, ...]] = {
@@ -123,7 +123,7 @@ class _JointLoadFriction(_JointFriction):
         """Torque through the gear [N m]."""
         system, index = state.system, state.system.mechanism.joint_index(self.location)
         outside = system.weight_and_grasp_force_on_coordinate(state, index)
-        if self.location not in system.driven:  # its motor is taken to balance what pulls from outside
+        if self.location not in system.driven:  # its motor is assumed to balance the external torque
             return -2 * outside
         return system.input_force(state.u, state.q, state.v)[index] - outside
 

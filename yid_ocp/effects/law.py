@@ -33,7 +33,7 @@ LawDependence = Literal["angle", "speed", "angle+speed", "load", "command", "tim
 LAW_QUANTITY_UNITS: Mapping[str, str] = {"angle": "rad", "speed": "rad/s", "load": "N m", "command": "N m", "time": "s"}
 """Unit of each quantity on which a law may depend, for revolute joints."""
 _TABLE_COLUMNS = ("quantity", "unit", "at", "torque", "std")
-_SPACING_RTOL = 1e-3  # by which knots that are read may be apart unevenly
+_SPACING_RTOL = 1e-3  # relative tolerance on equal spacing of knots in a file
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Law(EffectBase):
     a sum of two splines. Beyond the knots f is constant. A law of the command is zero while the motor is off.
     """
 
-    knots: Mapping[str, Array] | None = None  # of every quantity
+    knots: Mapping[str, Array] | None = None  # knots of every quantity
 
     equation = "F = f(x)"
     required_excitation = "how far it bends"

@@ -12,9 +12,9 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elast
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
-_ABS_SMOOTHING_SPEED = 1e-3  # below which |v| in Dahl's law is smoothed [rad/s]
-_REFERENCE_ANGLE = 0.5  # taken for the largest angle in the data, on which the range of k3 depends, until told [rad]
-_MIN_LARGEST_ANGLE = 0.02  # taken for a smaller one [rad]
+_ABS_SMOOTHING_SPEED = 1e-3  # smoothing range of |v| in Dahl's law [rad/s]
+_REFERENCE_ANGLE = 0.5  # largest angle assumed for the range of k3 without data [rad]
+_MIN_LARGEST_ANGLE = 0.02  # minimum of that angle [rad]
 
 
 def _bending_stiffness(system: System, segment: str) -> float:

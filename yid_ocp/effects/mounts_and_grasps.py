@@ -13,7 +13,7 @@ from yid_ocp.model.flexible import AXIS_UNIT_VECTORS
 from yid_ocp.model.mechanism import Joint, Placement
 from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System
 
-_SPRING_RELAXATION_TIME = 5e-3  # of mount and junction springs: too short to damp any visible motion [s]
+_SPRING_RELAXATION_TIME = 5e-3  # for mount and junction springs: too short to damp visible motion [s]
 
 
 def _root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:

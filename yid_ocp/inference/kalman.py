@@ -126,7 +126,7 @@ class KalmanSteps:
     row_start: Sequence[int]
     moves: Array  # state rows of k steps' transitions and, beside them, noise of the states, (k, ns, ns + m + noises)
     noises: int
-    decay: Array  # of the parameters, shape (k, nx - ns)
+    decay: Array  # decay of the parameters, shape (k, nx - ns)
     observation: Array  # shape (r, nx)
     whitening: Array  # shape (sum of squared row counts,)
     projected_covariance: Array  # shape (r, nx)

@@ -63,8 +63,8 @@ class ResidualDerivativesAtNodes:
     """
 
     node: IntArray  # first of each row's nodes, shape (r,)
-    by_state: Array  # by the state of that node and of the next ones, shape (2 or 4, r, nx)
-    by_effort: Array  # by the efforts of prescribed joints there, of four nodes then constraint forces, (2 or 4, r, ne)
+    by_state: Array  # derivatives by the states of this and the next nodes, shape (2 or 4, r, nx)
+    by_effort: Array  # by efforts of prescribed joints (and constraint forces if 4), (2 or 4, r, ne)
 
     @staticmethod
     def from_nominal_trajectory(

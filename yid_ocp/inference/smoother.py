@@ -66,17 +66,17 @@ class SmoothedUnknownsResult:
     """Result of the weak-constraint smoother: smoothed unknowns and the evidence for each group."""
 
     smoothed_unknowns: tuple[SmoothedUnknowns, ...]
-    group_variance: dict[SmoothedUnknownGroup, float]  # at the largest evidence [squared reference]
-    log_evidence_drop: dict[SmoothedUnknownGroup, float]  # when the group is left out
-    detectable_std: dict[SmoothedUnknownGroup, float]  # smallest that would be noticed, by the model alone [reference]
-    chi2_before: float  # r'r, after the free parameters' refit, without and with the unknowns
+    group_variance: dict[SmoothedUnknownGroup, float]  # variance at the largest evidence [squared reference]
+    log_evidence_drop: dict[SmoothedUnknownGroup, float]  # fall of the log evidence without the group
+    detectable_std: dict[SmoothedUnknownGroup, float]  # smallest detectable size by the model alone [reference]
+    chi2_before: float  # r'r after a refit of the free parameters, without (`after`: with) the unknowns
     chi2_after: float
-    dof_before: float  # measurements less what the parameters, and the unknowns, take of the noise
+    dof_before: float  # measurements minus the degrees of freedom of parameters (and unknowns)
     dof_after: float
-    # of unknown forces and offsets alone ("plant"), biases alone ("sensor") and both, above that of neither ("none", 0)
+    # log evidence of forces and offsets ("plant"), biases ("sensor") and "both", relative to neither ("none", 0)
     log_evidence: dict[str, float]
-    min_log_bayes_factor: float = DEFAULT_SMOOTHER_THRESHOLDS.min_log_bayes_factor  # rise that is more than chance
-    # groups that would do nearly as well in the place of each group at work
+    min_log_bayes_factor: float = DEFAULT_SMOOTHER_THRESHOLDS.min_log_bayes_factor  # smallest significant rise
+    # groups that could replace each selected group almost as well
     alternative_groups: Mapping[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]] = field(default_factory=dict)
 
     @property
@@ -112,16 +112,16 @@ class _Filtered(NamedTuple):
     """Filter of one recording at given variances, with its updates if they were kept."""
 
     model: LinearResidualModel
-    begin: Array  # by the first disturbances: state and unknowns of the first interval, shape (ns + nd, nd)
+    begin: Array  # first state and unknowns by the first disturbances, shape (ns + nd, nd)
     products: Array  # V' S^-1 V, shape (1 + ntheta, 1 + ntheta)
-    log_determinant: float  # infinite where variances are so large that rounding shows: they are never the best
+    log_determinant: float  # infinite if large variances make the filter ill-conditioned
     updates: Sequence[_Update]
 
 
 class _Smoothed(NamedTuple):
     """Disturbance smoother over one recording, for disturbances of unit variance before scaling."""
 
-    score: Array  # of the disturbances, shape (J, nd, 1 + ntheta)
+    score: Array  # scores of the disturbances, shape (J, nd, 1 + ntheta)
     information: Array  # variances of the disturbances, shape (J, nd)
     mean: Array  # smoothed unknowns, shape (J, nd, 1 + ntheta)
     covariance: Array  # their variances, shape (J, nd)
@@ -429,8 +429,8 @@ def _alternatives(
     return drop, found
 
 
-_MIN_NAMED_SHARE = 0.1  # share of the gap from which a place is named
-_MAX_NAMED_LOCATIONS = 3  # places that are named at most
+_MIN_NAMED_SHARE = 0.1  # smallest share of the gap of a named location
+_MAX_NAMED_LOCATIONS = 3  # largest number of named locations
 
 
 @dataclass(frozen=True)
@@ -438,10 +438,10 @@ class GapLocation:
     """A location in the model or sensors: share of the gap, observability, and time windows of the gap."""
 
     location: str
-    gap_share: float  # of the gap that can be located; all shares add up to one
-    is_observable: bool  # whether the data would show a gap there
-    time_windows: tuple[tuple[float, float], ...]  # when it is there, in any recording [s]
-    indistinguishable_from: tuple[str, ...] = ()  # places that the data cannot tell from this one
+    gap_share: float  # share of the locatable gap; all shares sum to one
+    is_observable: bool  # whether the data would reveal a gap at this location
+    time_windows: tuple[tuple[float, float], ...]  # times of the gap in any recording [s]
+    indistinguishable_from: tuple[str, ...] = ()  # locations that the data cannot distinguish from this one
 
 
 def main_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:

@@ -46,10 +46,10 @@ from yid_ocp.sensors.mounted import MountedSensor
 
 _UnknownKind = Literal["force", "push", "offset", "bias"]
 
-_CORRELATION_TIME = 0.5  # of the unknowns [s]
+_CORRELATION_TIME = 0.5  # memory of the unknowns [s]
 _MIN_INTERVAL = 0.1  # shortest time over which unknowns are constant [s]
-_MAX_INTERVAL_COUNT = 150  # of a long recording, beyond which intervals become longer
-_FORCE_POINT = "75%"  # by arc length, where a segment is pushed: near what acts on its tip and what acts all along it
+_MAX_INTERVAL_COUNT = 150  # largest number of intervals; longer recordings have longer intervals
+_FORCE_POINT = "75%"  # point of the push by arc length: a compromise of tip and distributed loads
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class SmoothedUnknownGroup:
 
     location: str
     kind: _UnknownKind
-    # a bias of an effort sensor would be the same, as for a force at a prescribed joint whose effort is measured
+    # equivalent to a bias of an effort sensor, as a force at a prescribed joint with measured effort
     is_confounded_with_bias: bool = False
 
 
@@ -135,7 +135,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
     for k, samples in enumerate(course.episode.measurements):
         sensor = samples.sensor
         if sensor.effort_joints:
-            continue  # at a prescribed joint a bias and a force are the same
+            continue  # at a prescribed joint, bias and force are equivalent
         for column, name in enumerate(sensor.output_names):
             if not np.any(samples.positive_weight_mask[:, column]):
                 continue
@@ -236,7 +236,7 @@ class _IntervalModel:
     unknown_jacobian: Array  # shape (r, nd)
     state_transition: Array  # shape (ns, ns)
     unknown_input_matrix: Array  # shape (ns, nd)
-    unreachable_products: Array  # of what no state or unknown can reach, shape (1 + ntheta, 1 + ntheta)
+    unreachable_products: Array  # products of residual parts that no state or unknown affects, (1 + ntheta, 1 + ntheta)
     sample_count: int  # before rows were compressed
 
 
@@ -250,9 +250,9 @@ class LinearResidualModel:
     unknown_names: tuple[str, ...]  # coordinate, grasp or channel of each unknown
     unknown_groups: tuple[SmoothedUnknownGroup, ...]
     reference_std: Array  # shape (nd,): the matrices are by unknowns in this unit
-    initial_state_jacobian: Array  # of the first state by the first interval's unknowns, shape (ns, nd)
-    initial_state_std: Array  # of the first state's remaining error, shape (ns,)
-    interval_correlation: float  # of an unknown with itself one interval later
+    initial_state_jacobian: Array  # first state by the unknowns of the first interval, shape (ns, nd)
+    initial_state_std: Array  # remaining error of the first state, shape (ns,)
+    interval_correlation: float  # correlation of an unknown with its value one interval later
     torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
 
     def smoothed_unknown_prior_variances(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
@@ -388,7 +388,7 @@ def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span:
     if errors is None:
         return known
     held = course.problem.step.time_step * len(errors.sample_of_step) / len(np.unique(errors.sample_of_step))
-    # by its spectral density at low frequencies, which an unknown force of memory `decay` must have as well
+    # equal spectral density at low frequencies as an unknown force of memory `decay`
     white = errors.torque_std**2 * (held / span) * (1 - decay) / (1 + decay)
     for i, name in enumerate(unknowns.names[: len(unknowns.forced)]):
         if name in driven:

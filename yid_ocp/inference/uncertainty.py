@@ -49,8 +49,8 @@ class GoodnessOfFit:
 
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
-    explains: bool  # by the null test of a diagnosis (`residuals_exceed_noise`)
-    believed: bool = True  # no grave quality issue of the data (`ProblemOptions.data_issues`)
+    explains: bool  # result of the null test (`residuals_exceed_noise`)
+    believed: bool = True  # no serious data issue (`ProblemOptions.data_issues`)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class ParameterEstimate:
     """
 
     value: float
-    std: float  # infinite where the data do not inform the parameter
+    std: float  # infinite without information on the parameter
     unit: str
     initial: float
     lower: float

@@ -54,20 +54,20 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
 
-_MIN_TORQUE_GAIN = 0.1  # acting over recorded torque at which errors of one are converted into those of the other
-_MIN_START_SLOPE = 1e-12  # derivatives of an initial state up to here are rounding
+_MIN_TORQUE_GAIN = 0.1  # smallest derivative of applied by recorded torque for conversions of errors
+_MIN_START_SLOPE = 1e-12  # smaller derivatives of an initial state are rounding
 _MAX_ROLLOUTS = 6  # each about the torque offset estimated from the one before
-_TORQUE_BIAS_TOLERANCE = 0.05  # change of the torque offset, in stated standard deviations, below which these end
+_TORQUE_BIAS_TOLERANCE = 0.05  # change of the offset in stated standard deviations that ends them
 
 
 class _FilterPart(NamedTuple):
     """Consecutive steps of a frozen filter of (d, w, b)."""
 
-    first: int  # of them
-    rows: IntArray  # of the residual, in the order of the steps
+    first: int  # index of the first step
+    rows: IntArray  # residual rows, in the order of the steps
     step_of_row: IntArray
     kalman: KalmanSteps
-    by_torque: Array  # slopes of the rows by a known torque of their step, shape (r, nu)
+    by_torque: Array  # derivatives of the rows by a known torque of their step, shape (r, nu)
 
     def fresh_noise(self, noise: Array) -> Array:
         """Known noise (N, nu) that begins after each step, and zeros for the offsets, shape (k, 2 nu)."""
@@ -82,7 +82,7 @@ class _SmoothedInputErrors(NamedTuple):
 
     torque_bias: Array  # b, shape (nu,) [N m]
     torque_noise: Array  # w, shape (N, nu) [N m]
-    state_error: Array  # beside encoders: rollout less truth, shape (N + 1, nx)
+    state_error: Array  # with encoder measurements: rollout minus truth, shape (N + 1, nx)
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,10 @@ class WhiteningFilter:
     """Kalman filter that whitens the residual of a recording, linearized along one rollout."""
 
     filter_steps: tuple[_FilterPart, ...]  # up to the last node
-    input_error_model: InputErrorModel  # with the values of b and w about which it is linearised
-    initial_covariance: Array  # of (d, w, b) before all measurements, shape (na, na)
-    state_mask: BoolArray  # states that d is made up of, shape (nx,)
-    torque_bias_std: Array  # of b after all measurements, shape (nu,) [N m]
+    input_error_model: InputErrorModel  # includes the values of b and w at the linearisation
+    initial_covariance: Array  # covariance of (d, w, b) before all measurements, shape (na, na)
+    state_mask: BoolArray  # states contained in d, shape (nx,)
+    torque_bias_std: Array  # standard deviation of b after all measurements, shape (nu,) [N m]
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.

@@ -95,7 +95,7 @@ class DiscreteEquations:
     internal_residual: ca.SX  # midpoint equations of the internal coordinates, (nz, 1)
     internal_residual_at_rest: ca.SX
     constraint_residual: ca.SX  # phi(q_{k+1}) - C lam / h, (m, 1)
-    # where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) has 1 minus it
+    # factor on phi(q_{k+1}) in `constraint_residual` if a grasp relaxes: g = 1 + T/h; phi(q_k) has 1 - g
     constraint_relaxation_gain: ca.SX | None
     p1: ca.SX
     rigid_body_terms: MultibodyLagrangianDerivatives

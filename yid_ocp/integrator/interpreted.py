@@ -189,7 +189,7 @@ class InterpretedKernel:
             last, fixed = slice(wanted.count - loads[0].shape[1], None), self._fixed - at["q1"][0]
             change[: self._rows, last] += loads[0]
             change[self._p1, last] += loads[1]
-            # in the balance they stand beside the momentum
+            # in the balance they add to the momentum
             change[self._effort, last] += slopes[self._effort, at["p0"][fixed]] @ loads[0][fixed]
         try:
             solution = np.linalg.solve(slopes[np.ix_(self._residual, self._unknown)], change[self._residual])

@@ -25,12 +25,12 @@ from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 class Equilibrium:
     """A static equilibrium with its state, holding torque, constraint reactions and derivatives."""
 
-    state: Array  # (q, p, z), (nx,); p is half a step's pull of the constraints, so that the next step stays at rest
+    state: Array  # (q, p, z), (nx,); p is half a step's constraint impulse, so that the next step stays at rest
     holding_torque: Array  # motor torque that holds the configuration [N m], or servo command [rad or m], (nu,)
     constraint_reactions: Array  # (m,) [N or N m]
     state_by_theta: Array  # derivative with respect to the named parameters, (nx, len(names))
-    state_by_known_coordinates: Array  # driven, then prescribed, (nx, nk)
-    state_by_torque: Array  # as measured, (nx, nu)
+    state_by_known_coordinates: Array  # derivative by driven, then prescribed coordinates, (nx, nk)
+    state_by_torque: Array  # derivative by the measured torque, (nx, nu)
     is_converged: bool
     max_imbalance: float  # largest remaining imbalance [N m] or constraint violation [m]
     message: str
@@ -47,11 +47,11 @@ _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
 _NEWTON_ITERATION_LIMIT = 100
-_NEAR_GUESS = 0.1  # farther from a guess [rad or m] an equilibrium may be another one
-_REST_TOLERANCE = 1e-10  # imbalance [N m] and constraint violation [m] up to which all is at rest
-_ENERGY_ITERATION_LIMIT = 300  # of the search for the lowest energy
-_MIN_RECIPROCAL_CONDITION = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
-_MAX_HOLD_DEFLECTION = 0.02  # of a holding spring, by more than which the posture does not fit the grasp [rad]
+_NEAR_GUESS = 0.1  # beyond this distance from a guess [rad or m], it may be another equilibrium
+_REST_TOLERANCE = 1e-10  # allowed imbalance [N m] and constraint violation [m]
+_ENERGY_ITERATION_LIMIT = 300  # iterations of the search for the lowest energy
+_MIN_RECIPROCAL_CONDITION = 1e-14  # smaller reciprocal condition numbers count as singular
+_MAX_HOLD_DEFLECTION = 0.02  # larger deflections of a holding spring mean a posture unfit for the grasp [rad]
 
 
 class EquilibriumSolver:
@@ -335,7 +335,7 @@ class _Hold:
     given: Array
     held: Array
     stiffness: float
-    by_hand: Array  # stiffness of what holds joints whose motor is off, (nu,) [N m/rad]
+    by_hand: Array  # stiffness of the springs at joints whose motor is off, (nu,) [N m/rad]
 
     def give(self, q: Any, system: System) -> Any:
         """Distance of the driven joints from their targets."""

@@ -20,9 +20,9 @@ from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.integrator.step_model import NEWTON_ITERATION_LIMIT, TrackingFeedback
 from yid_ocp.parallel import CasadiLockedCache
 
-_Wanted = Sequence[tuple[int, int]]  # a column of derivatives, and which of the parameters it is by
-_NEWTON_ITERATIONS = 5  # for a law of an internal coordinate that is nonlinear in its next value
-_ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the same in the LQR [rad], [rad/s], [N m]
+_Wanted = Sequence[tuple[int, int]]  # index of a derivative column, and index of its parameter
+_NEWTON_ITERATIONS = 5  # for an implicit nonlinear equation of an internal coordinate
+_ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors of equal weight in the LQR [rad], [rad/s], [N m]
 
 
 def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:

@@ -73,7 +73,7 @@ class MultibodyLagrangianDerivatives:
     lagrangian_by_v: ca.SX  # shape (n, 1)
     kinetic_energy: ca.SX  # [J]
     potential_energy: ca.SX  # [J]
-    S: ca.SX  # these four of shape (6, n)
+    S: ca.SX  # S, D, F and B have the shape (6, n)
     D: ca.SX
     F: ca.SX
     B: ca.SX
@@ -148,7 +148,7 @@ class _Moved:
     first: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
     second: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3, 3)))
     momentum: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(6)))
-    heavy: ca.SX = field(default_factory=lambda: ca.SX(0))  # this and the next as gravity pulls at them
+    heavy: ca.SX = field(default_factory=lambda: ca.SX(0))  # `mass` and `first` as effective weights
     heavy_first: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
 
     def add(self, other: _Moved) -> None:

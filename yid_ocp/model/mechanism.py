@@ -112,8 +112,8 @@ class Frame:
 class ArcLengthChain:
     """A chain of straight links with points located by arc-length fraction."""
 
-    tip_frames: tuple[str, ...]  # at the far end of every link, which is its translation, base to tip
-    length_fractions: tuple[float, ...]  # part of the nominal arc length that each link has; they sum to one
+    tip_frames: tuple[str, ...]  # frame at the end of every link (at the link's translation), base to tip
+    length_fractions: tuple[float, ...]  # fraction of the nominal arc length of each link; the sum is one
 
     def _locate(self, length_fraction: float) -> tuple[str, float]:
         """Tip frame of the link at a fraction of the arc length (0 to 1), and the fraction of that link."""

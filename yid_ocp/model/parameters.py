@@ -25,7 +25,7 @@ class Parameter:
     lower: float = -math.inf
     upper: float = math.inf
     description: str = ""
-    symbol: ca.SX = field(default_factory=ca.SX, compare=False, repr=False)  # its scalar in expressions
+    symbol: ca.SX = field(default_factory=ca.SX, compare=False, repr=False)  # scalar symbol in expressions
 
     def __post_init__(self) -> None:
         if self.symbol.is_empty():

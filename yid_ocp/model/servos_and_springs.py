@@ -16,14 +16,14 @@ from yid_ocp.options import OptionInfo
 
 _CommandInterpolation = Literal["held", "interpolated"]
 TORQUE_SATURATION_EXPONENT = 16  # p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)
-UNLIMITED_EFFORT_THRESHOLD = 2e4  # effort limits from this value on mean that there is none [N m or N]
-_DEFAULT_FULL_TORQUE_ERROR = 0.05  # at which a servo of unknown gain reaches its torque limit [rad or m]
+UNLIMITED_EFFORT_THRESHOLD = 2e4  # larger effort limits mean that there is no limit [N m or N]
+_DEFAULT_FULL_TORQUE_ERROR = 0.05  # error at which a servo of unknown gain reaches its torque limit [rad or m]
 _DEFAULT_GAIN = 50.0  # of a servo without an effort limit [N m/rad or N/m]
 _DEFAULT_DAMPING_TIME = 0.1  # a servo's damping over its gain [s]
 _MAX_COMMAND_DELAY = 0.5  # [s]
 _MAX_DEAD_BAND = 0.2  # [rad or m]
 MOTOR_OFF_COMMAND = 1e6  # input of a servo whose motor is off; from half of it on there is no torque [rad or m]
-_DEAD_BAND_ROUNDING = 1e-4  # over which the ends of a servo's dead band are rounded off [rad or m]
+_DEAD_BAND_ROUNDING = 1e-4  # smoothing range at the ends of a servo's dead band [rad or m]
 SERVO_GAIN_FACTOR_PARAMETER = (
     "servo_gain_factor"  # parameter by which a recording states the proportional gain of a firmware
 )
@@ -41,9 +41,9 @@ class _MotorFrictionData:
     resistance: float  # R [ohm]
     coulomb: float  # [N m]
     viscous: float  # [N m s/rad]
-    load_share: float = 0.0  # friction per torque through the gear; zero, as the next two, where the law has none
+    load_share: float = 0.0  # friction per torque through the gear; zero if the law has no such term
     stribeck: float = 0.0  # friction at low speed [N m]
-    stribeck_speed: float = 0.0  # beyond which that is gone [rad/s]
+    stribeck_speed: float = 0.0  # speed beyond which it vanishes [rad/s]
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class _DcMotorData:
     duty_per_gain: float  # duty per unit of the firmware's proportional gain and per error of the angle [1/rad]
     duty_limit: float  # largest duty [-]
     armature: float  # inertia of rotor and gear at the output shaft [kg m^2]
-    plain: _MotorFrictionData  # with Coulomb and viscous friction
-    load_dependent: _MotorFrictionData | None = None  # with friction that grows with the load, where published
+    plain: _MotorFrictionData  # constants with Coulomb and viscous friction
+    load_dependent: _MotorFrictionData | None = None  # constants with load-dependent friction, if published
 
     def servo_values(self, constants: _MotorFrictionData) -> dict[str, float]:
         """Servo parameters by name, from torque = kt/R (duty V - kt speed) [N m/rad, N m s/rad, N m]."""
@@ -175,7 +175,7 @@ class PositionServo:
     `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero.
     """
 
-    gain: ca.SX  # includes the firmware's where that is known [N m/rad or N/m]
+    gain: ca.SX  # includes the firmware's gain if known [N m/rad or N/m]
     damping: ca.SX  # [N m s/rad or N s/m]
     command_delay: ca.SX  # [s]
     torque_limit_tightness: ca.SX  # [(N m)^-p]

@@ -128,8 +128,8 @@ class NodeState:
     load: ca.SX  # motor torque where driven, predicted effort where prescribed, shape (n, 1) [N m or N]
     lam: ca.SX  # constraint forces lam_k/h, shape (m, 1) [N or N m]
     internal_rows: Mapping[str, int]  # row of each internal coordinate in z, by name
-    camera_pose: Placement | None = None  # in the world, of the camera that measures; None for any other sensor
-    marked_frame: str | None = None  # frame of the mechanism that the channel marks; None for a joint
+    camera_pose: Placement | None = None  # pose of the measuring camera in the world; None for other sensors
+    marked_frame: str | None = None  # frame of the mechanism that the channel measures; None for a joint
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class StepTerms:
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
     generalized_force: ca.SX | None = None  # F(q, v, u, z)
-    dissipative_force: ca.SX | None = None  # its part that only takes energy out, in proportion to velocity
+    dissipative_force: ca.SX | None = None  # part of the force that depends on velocity and dissipates energy
     # equation (= 0) of each internal coordinate at the midpoint, and its replacement in a static equilibrium if it is
     # undefined or cannot hold there
     internal_equations: Mapping[str, ca.SX] = field(default_factory=dict)
@@ -171,10 +171,10 @@ class Effect:
     the inverse of `distorted_reading`.
     """
 
-    kind: str  # under which its class is registered
-    location: str  # name of the place where it acts
+    kind: str  # name under which its class is registered
+    location: str  # name of the location where it acts
     parameters: Parameters  # named `kind@location.parameter`
-    # name to the symbol that `apply_to_system` uses, `kind@location.joint`; without momentum
+    # symbols that `apply_to_system` uses, by name `kind@location.joint`; they have no momentum
     internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def apply_to_system(self, system: System) -> System:

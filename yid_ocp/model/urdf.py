@@ -37,10 +37,10 @@ from yid_ocp.model.mechanism import (
 from yid_ocp.model.mjcf_robot import parsed_mjcf
 from yid_ocp.model.parameters import Parameter, Parameters
 
-_UNLIMITED_VALUE = 1e9  # stands for no limit where URDF asks for a number
-_MIN_MASS = 1e-9  # [kg]; dividing by less would not be finite for long
-_MAX_NUMBER = 1e12  # of m, rad, kg and kg m^2; squares of more would not be finite for long
-_PRINCIPAL_MOMENT_RTOL = 1e-2  # how far, for want of digits in the file, they may miss what they have to be
+_UNLIMITED_VALUE = 1e9  # represents "no limit" where URDF requires a number
+_MIN_MASS = 1e-9  # [kg]; avoids overflow in divisions
+_MAX_NUMBER = 1e12  # in m, rad, kg and kg m^2; avoids overflow of squares
+_PRINCIPAL_MOMENT_RTOL = 1e-2  # tolerance for rounding in the file
 _MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
 _TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 

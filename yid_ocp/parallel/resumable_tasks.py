@@ -33,7 +33,7 @@ from yid_ocp.parallel.threads_and_processes import InlineExecutor, available_pro
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences
 
 _TASK_FORMAT = "yid-task/1"
-_RESULT_FILE_TIMEOUT = 60.0  # until a result file written by another machine is visible, as on network file systems [s]
+_RESULT_FILE_TIMEOUT = 60.0  # time limit for a file of another machine to become visible [s]
 _WORKER_CHECK_INTERVAL = 60.0  # time without a finished task after which it is checked that there are workers [s]
 _CONNECT_TIMEOUT = 15.0  # timeout for the connection to a scheduler [s]
 _MAX_CLIENT_STARTS = 3  # number of attempts to start a client's event loop
@@ -47,7 +47,7 @@ TaskProgressCallback = Callable[[int, int, str], None]
 class Task:
     """Arguments of one call of a task function, and a name for display."""
 
-    name: str  # for display only; it does not decide what is resumed
+    name: str  # for display only, without influence on resuming
     arguments: Mapping[str, Any]  # text, numbers, None, lists and mappings of them, and `Path` for what is read
 
 
@@ -58,8 +58,8 @@ class TaskResult:
     name: str
     value: Any = None
     error: str = ""
-    seconds: float = 0.0  # of the function
-    was_resumed: bool = False  # whether an earlier run did it
+    seconds: float = 0.0  # run time of the function
+    was_resumed: bool = False  # whether it is the result of an earlier run
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ def _drain(
                 job = running.pop(future)
                 try:
                     text = future.result()
-                except (BrokenExecutor, CancelledError):  # so says Dask where its scheduler went away
+                except (BrokenExecutor, CancelledError):  # raised by Dask if its scheduler is lost
                     lost.append(job)
                     continue
                 except Exception as error:  # the executor gave the task up

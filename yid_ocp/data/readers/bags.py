@@ -58,7 +58,7 @@ class _BagTopic(NamedTuple):
     n_messages: int
 
 
-_MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
+_MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML metadata, whose parser is slow
 
 
 class OpenBag:
@@ -87,7 +87,7 @@ class OpenBag:
     def read_errors_as_data_errors(self) -> Iterator[None]:
         """Turn every error during reading of the bag into a `DataError` (context manager)."""
         try:
-            with limited_memory():  # what is packed may say nothing, or lie, about its size
+            with limited_memory():  # compressed data may state no size or a wrong one
                 yield
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
             what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(self.path)
@@ -132,7 +132,7 @@ class _Contents:
     states: Sequence[BagMessage]
     places: Sequence[BagMessage]
     mounted: Sequence[BagMessage]  # readings of wrist sensors and IMUs
-    topic_of_fields: str  # of messages that are read by the fields which a user named; empty for none
+    topic_of_fields: str  # topic of the fields that the user named; empty without any
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class BagOptions(base.SelectionAndUnitOptions):
     fields: Mapping[str, str] | None = None
     # distance from a pose's origin of the additional points NAME_x, NAME_y and NAME_z on its axes [m]
     pose_axis_point_distance: float | None = None
-    point_sensor_name: str = "unknown"  # what saw the points
+    point_sensor_name: str = "unknown"  # sensor of the points
     description: str = ""  # what was recorded
 
 

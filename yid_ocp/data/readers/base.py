@@ -31,8 +31,8 @@ class TopicOrColumnSummary:
     kind: str
     n_samples: int  # messages or values
     mean_rate: float  # mean rate [Hz]; NaN where it has none
-    imported_as: str = ""  # what the import makes of the source; empty if it is left out
-    note: str = ""  # why the source is left out, or what to check
+    imported_as: str = ""  # imported name of the source; empty if it is omitted
+    note: str = ""  # reason for the omission, or advice
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
     return units, tuple(notes)
 
 
-_MAX_INTERPOLATED_PERIODS = 5.0  # of a source, in the longest gap that is interpolated
+_MAX_INTERPOLATED_PERIODS = 5.0  # longest interpolated gap in periods of its source
 
 
 def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:

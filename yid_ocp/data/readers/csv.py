@@ -39,9 +39,9 @@ _MOUNTED = [
 ]
 _COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
 """Components of vectors measured by sensors on a link, such as `force_x`."""
-_MOST_BAD = 0.5  # of a table's lines; beyond it the table is not understood at all
+_MOST_BAD = 0.5  # fraction of bad lines above which the table is refused
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
-_LINE_COST = 16  # in cells: what a line takes beside them
+_LINE_COST = 16  # overhead of a line, in cells
 _LISTED = 5  # numbers of bad lines in a note
 
 
@@ -55,11 +55,11 @@ class CsvOptions(base.SelectionAndUnitOptions):
 
     columns: Mapping[str, str] | None = None
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
-    skip_bad_lines: bool = False  # leave out lines that are no rows of numbers, and count them in `notes`
+    skip_bad_lines: bool = False  # omit lines that are not rows of numbers, and count them in `notes`
     delimiter: str = ""  # one character between cells; found in the first line where empty
     clock: ClockKind = "recorded"  # whether the times were measured
-    point_sensor_name: str = "unknown"  # what saw the points
-    frame: str = "world"  # their frame of reference
+    point_sensor_name: str = "unknown"  # sensor of the points
+    frame: str = "world"  # reference frame of the points
     description: str = ""  # what was recorded
 
 
@@ -175,7 +175,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     lines = _rows(path, delimiter)
     names = [cell.strip() for cell in next(lines, (1, []))[1]]
     head = next(lines, None)
-    if len(names) < 2 or head is None:  # as reading it would say
+    if len(names) < 2 or head is None:  # the error of reading such a file
         _read_table(path, CsvOptions(delimiter=delimiter))
     n_lines, numbers, blank = 0, array("d"), bytearray()
     first_lines = [head] if head else []
@@ -200,7 +200,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     meanings, said = column_meanings(names, _COMPONENTS)
     if "header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
         meanings[0] = ("t", "")
-    meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # of two alike, the first
+    meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # the first of two equal ones
     unknown = {name: base.SKIPPED_COLUMN_MEANING for name, meaning in zip(names, meanings, strict=True) if not meaning}
     if "header" in options and meanings[0]:
         unknown = {names[0]: "t", **unknown}

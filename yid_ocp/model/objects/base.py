@@ -24,7 +24,7 @@ from yid_ocp.registry import Registry
 START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
 _Vector3 = tuple[float, float, float]
 _STANDARD_GRAVITY = 9.81
-_DAMPING_TIME = 0.02  # damping over rigidity, where the search for it starts [s]
+_DAMPING_TIME = 0.02  # initial ratio of damping to rigidity [s]
 SIZE_DESCRIPTIONS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
 _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
@@ -128,9 +128,9 @@ class InitCommandObject:
     """An object from the command line of `init`, with initial values of its free parameters."""
 
     settings: ObjectKind  # without its mount
-    start_values: Mapping[str, tuple[float, str]]  # where the search for each free parameter starts, with a comment
+    start_values: Mapping[str, tuple[float, str]]  # initial value of each free parameter, with a comment
     parameters_comment: str = "`yid-ocp inspect` lists all that there are"
-    # whether it stands where the settings say, and arms hold its ends; or else a frame of the robot carries its root
+    # whether its root is fixed in the world and arms hold its ends; otherwise a robot frame carries its root
     stands_in_world: bool = False
 
 
@@ -144,7 +144,7 @@ class InitCommandObjectFactory:
 
     default_links: int  # per segment
     build: Callable[[Mapping[str, Any], int], InitCommandObject]
-    # names beside length, mass and radius that `--number NAME=VALUE` takes, with their meanings
+    # further names that `--number NAME=VALUE` accepts, with their meanings
     further_numbers: Mapping[str, str] = field(default_factory=dict)
     has_branches: bool = False
 

@@ -57,7 +57,7 @@ START_SPEED_PARAMETER_NAME = "start.speed"
 class CableBranchOptions:
     """Nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
 
-    bend_rigidity: float = 1.5e-3  # in a configuration this and the next two are set under `parameters`
+    bend_rigidity: float = 1.5e-3  # a configuration sets this and the next two under `parameters`
     twist_rigidity: float = 1.0e-3
     bend_damping: float = 5e-5
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
