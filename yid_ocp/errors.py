@@ -105,7 +105,7 @@ def nearest_name_hint(name: str, known: Iterable[str]) -> str:
 
 
 def unknown_name_error_arguments(name: str, known: Iterable[str]) -> dict[str, str]:
-    """Arguments `allowed` and `hint` for an error about an unknown name. Long lists of names are shortened."""
+    """Arguments `allowed` and `hint` of an error for an unknown name: `known` names (shortened) and the nearest one."""
     names = [str(entry) for entry in known]
     return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}
 

@@ -143,7 +143,7 @@ def write_strict_json(path: Path, data: Any) -> None:
 
 
 def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Path:
-    """Make a folder with its missing parents. Raises `OutputError` if that fails."""
+    """Make a folder with its missing parents. Raises `OutputError`, which calls the folder `what`, if that fails."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -203,7 +203,7 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 
 def named_attributes(value: Any, names: str) -> dict[str, Any]:
-    """Return the attributes in the blank-separated list `names`, by name. `key=name` stores one under `key`."""
+    """Return attributes of `value` listed in `names` (blank-separated), by name. `key=name` stores one under `key`."""
     pairs = [name.partition("=") for name in names.split()]
     return {key: getattr(value, name or key) for key, _, name in pairs}
 

@@ -78,11 +78,7 @@ def _offset_tolerance(joints: JointGroup, group: PointGroup) -> float:
 def _clock_error(
     t: Array, residual: Array, speed: Array, others: Array, size: Array, span: tuple[float, float]
 ) -> _ClockError | None:
-    """A clock's offset and drift by least squares from a residual (R,), expected minus seen in units of noise.
-
-    `speed` (R, 2) are the derivatives by offset and accumulated drift, `others` (R, k) those by other unknowns, whose
-    usual sizes are `size`. None if the motion is not informative.
-    """
+    """Offset and drift from a residual (R,) by least squares, with derivatives `speed` by the clock and `others`."""
     length, data = max(span[1] - span[0], 1e-9), len(t)
     if not np.all(np.sum(speed**2, axis=0) > 0) or data < 3 * _N_TIME_BLOCKS:
         return None
@@ -120,10 +116,11 @@ def check_robot_held_point_clock(
     std: float,
     path: PositionsAtTimes,
 ) -> Iterator[Issue]:
-    """Yield issues about clock offset or drift of points whose positions follow from the joint angles.
+    """Yield issues about clock offset or drift of points in `group` whose positions follow from the joint angles.
 
-    The points are seen at `seen` (N, np, 3) [m] at the times `t` (N,). `by_angle` (N, np, 3, k) is the derivative of
-    their positions with respect to the angles. `std` is their noise [m], zero if unknown.
+    The points are seen at `seen` (N, np, 3) [m] at the times `t` (N,); `path` returns their positions from the angles.
+    `by_angle` (N, np, 3, k) is the derivative of these positions with respect to the angles. `std` is the noise of the
+    points [m], zero if unknown.
     """
     span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))

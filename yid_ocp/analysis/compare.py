@@ -78,13 +78,14 @@ def compare_methods(
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     time_budget: float = math.inf,
 ) -> MethodComparison:
-    """Run several methods from the same initial values and compare their estimates.
+    """Run several methods (`solvers`) from the same initial values and compare their estimates.
 
     Steepest descent minimises the published cost (points in metres, no noise levels, no weak prior). The other methods
     minimise the problem's cost without process noise, which not every method supports. If the problem has process
     noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run of a method that
-    supports it. `truth` are known parameter values. `callback` receives the method's name and every `Iterate`. Each
-    method may use an equal part of the remaining `time_budget` [s], after which it is stopped.
+    supports it. `truth` are known parameter values. `callback` receives the method's name and every `Iterate`. `limits`
+    are the criteria by which a residual exceeds noise. Each method may use an equal part of the remaining `time_budget`
+    [s].
     """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
     deadline = time.perf_counter() + time_budget

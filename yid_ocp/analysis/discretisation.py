@@ -130,9 +130,10 @@ def _gauss_newton_step_in_finer_model(
 def refitted_residual_at_finer_step(
     fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> Array | None:
-    """Whitened residual at a finer time step, one Gauss-Newton step from the coarse fit x (nx,), or None if it fails.
+    """Whitened residual of `fine` one Gauss-Newton step from the coarse fit x (nx,), or None if the step fails.
 
-    `at_x` is the coarse evaluation with Jacobian. With process noise, the weights are the coarse ones.
+    `fine` is the problem with a shorter time step, and `at_x` the coarse evaluation with Jacobian. With process noise,
+    the weights are the coarse ones.
     """
     made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
     return None if isinstance(made, str) else made[1]
@@ -209,9 +210,9 @@ def measure_discretisation_shifts(
 ) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
     """Measure how estimates shift if every link is divided in two, and if the time step is halved.
 
-    Returns the shifts of every shared free parameter, empty if nothing was tried, and notes on shifts that could not be
-    computed. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. For other points, set
-    `model_difference_only`.
+    `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. For
+    other points, set `model_difference_only`. Returns the shifts of every shared free parameter, empty if nothing was
+    tried, and notes on shifts that could not be computed.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
@@ -260,7 +261,7 @@ def inflate_estimates_by_discretisation(
     found: Mapping[str, EstimateShiftByLinksAndTimeStep],
     sizes: Mapping[str, float],
 ) -> dict[str, ParameterEstimate]:
-    """Include the discretisation shift of estimates in their standard deviations, intervals and verdicts.
+    """Include the discretisation shifts `found` of estimates in their standard deviations, intervals and verdicts.
 
     A verdict can only get worse. `sizes` are typical sizes, as in `inference.uncertainty.parameter_verdict`.
     """
@@ -312,7 +313,8 @@ def step_map_natural_frequencies(
     """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
 
     The driven and prescribed coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts
-    at `guess` (n,). The midpoint rule lowers a frequency f to atan(pi f h)/(pi h). The force split affects only growth.
+    at `guess` (n,). The rules are as in `compile_step`. The midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
+    The force split affects only growth.
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
@@ -424,11 +426,7 @@ class AlternatingErrorGrowth:
 def _error_growth_along(
     step: Step, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, name: str, looks: int
 ) -> AlternatingErrorGrowth:
-    """Growth of alternating errors along a rollout, up to its first failed step or singular derivatives.
-
-    The eigenvalues of A_k - B_k K_k (A_k includes the constraints) are computed at some nodes. The logarithm of the
-    largest alternating magnitude is interpolated between them.
-    """
+    """Growth of alternating errors along a rollout, from eigenvalues at some nodes, up to its first failed step."""
     failed = np.flatnonzero(~np.isfinite(rollout.state).all(axis=1))
     steps = (int(failed[0]) if len(failed) else len(rollout.state)) - 1
     at, magnitudes = [], []

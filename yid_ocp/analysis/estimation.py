@@ -157,11 +157,7 @@ def _checked_solution_and_issues(
 def _checked_solution_and_step_stability(
     start: EstimationProblem, problem: EstimationProblem, solution: Solution
 ) -> tuple[Solution, dict[str, Any]]:
-    """The solution, marked as not converged if the step is unstable, and stability data for result.json.
-
-    Stability is tested along the recorded motions at the initial values and at the estimate. A search may start where
-    the step is unstable; if it ends there, it has fitted numerical errors.
-    """
+    """The solution, marked as not converged if the step is unstable, and stability data for result.json."""
     growth = discretisation.largest_alternating_error_growth
     begin, end = growth(start, start.initial_unknowns), growth(problem, solution.x)
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
@@ -270,7 +266,7 @@ _START_FRAMES = 2  # frames from which the baselines of a cable start, as its ow
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
-    """Unit of a channel, or of the first member of a group; empty if unknown."""
+    """Unit of a channel, or of the first member of a group, in `units` by channel; empty if unknown."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
@@ -292,11 +288,7 @@ def prediction_errors_and_units(
 def _prediction_error_entry(
     problem: EstimationProblem, episode: Episode, outcome: EpisodePrediction | str
 ) -> dict[str, Any]:
-    """Prediction errors of one recording: RMSE per channel for the model and for every baseline.
-
-    A group of several points has an additional entry: the root mean square distance over its points and frames, without
-    the frames that determined the initial state. `outcome` is a prediction, or the reason for its absence.
-    """
+    """RMSE of one recording per channel and point group (without frames that fixed the start) and per baseline."""
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
     options = problem.options
     fixed = (
@@ -319,11 +311,7 @@ def _prediction_error_entry(
 def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
 ) -> tuple[list[tuple[Episode, EpisodePrediction | str]], dict[str, dict[str, float]]]:
-    """Predictions of held-out recordings, and the errors that noise causes in them, by recording and channel.
-
-    The expected error combines sensor noise and the effect of some random draws of the stated torque errors on the
-    motion.
-    """
+    """Predictions of held-out recordings, and the errors that sensor and torque noise cause, by channel."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
     pairs: list[tuple[Episode, EpisodePrediction | str]] = []
     expected: dict[str, dict[str, float]] = {}
@@ -386,7 +374,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
 def channels_worse_than_naive_guess(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Find channels that a baseline without a model predicts clearly better than the model."""
+    """Find channels that a baseline predicts clearly better than the model, from `prediction_errors_and_units`."""
     worse = []
     for entry in entries:
         for channel in entry["rmse"]:
@@ -398,10 +386,7 @@ def channels_worse_than_naive_guess(
 
 
 def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
-    """Issues for sensors that a baseline without a model predicts better than the model, over all their channels.
-
-    A single channel may be worse without an issue; see `channels_worse_than_naive_guess`.
-    """
+    """Issues for sensors that a baseline without a model predicts better than the model, over all their channels."""
     found = []
     for entry in entries:
         groups: dict[str, list[str]] = {}

@@ -119,7 +119,7 @@ def _used_point_groups(problem: EstimationProblem, episode: Episode) -> list[Poi
 
 
 def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
-    """Evenly spaced sample times from zero to the end of a recording [s], at `rate` [Hz]."""
+    """Sample times at `rate` [Hz] from zero to the end of the recording on the time grid `grid`, [s]."""
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
@@ -236,7 +236,7 @@ class CandidateExperimentSensitivityBuilder:
         self._layouts: dict[frozenset[str], CandidateExperimentSensitivities | str] = {}
 
     def build_sensitivities(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
-        """Compute the sensitivities for a set of mechanical changes, or return a message if that is not possible."""
+        """Compute the sensitivities for the mechanical changes `mechanics`, or return a message if that fails."""
         if mechanics not in self._layouts:
             if mechanics:
                 words = " and ".join(MECHANICAL_CHANGE_DESCRIPTIONS[name] for name in sorted(mechanics))

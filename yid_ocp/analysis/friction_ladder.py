@@ -55,7 +55,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 def cross_validate_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
-    """Fit a friction law to all recordings, and refit it without each kind of motion to get prediction errors."""
+    """Fit a friction law to all recordings, and refit it without each of the `kinds` of motion to get errors."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
@@ -87,7 +87,7 @@ def mean_and_std_error_over_motion_kinds(
 
 
 def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
-    """Choose the first friction law whose error is within one standard error of the smallest error.
+    """Choose the first of `fits` whose mean error over `kinds` is within one standard error of the smallest error.
 
     Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
     """

@@ -280,7 +280,7 @@ def with_nuisance_unknowns(
 
 
 def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Transfer values of `x` by name to another problem's unknown vector. Other entries keep their initial values."""
+    """Transfer values of `x` by name to the unknown vector of `other`. Its other entries keep their initial values."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])
 
@@ -343,10 +343,7 @@ def _orthogonal_part(columns: Array, explained: Array) -> Array:
 
 
 def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, ...]:
-    """Parameters and combinations without information, then informed directions; least observable first.
-
-    `std` are relative standard deviations of the parameters, which include misfit correlated in time.
-    """
+    """Parameters and combinations without information, then informed directions; least observable first."""
     relative, count = view.relative, len(view.names)
     hidden = view.alone * MAX_WEAK_RELATIVE_STD < 1.0
     found = [

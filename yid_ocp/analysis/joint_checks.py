@@ -217,8 +217,8 @@ def check_inertial_effort_excitation(
     """Yield an issue if efforts due to speed and acceleration do not exceed the noise of measured efforts.
 
     Static configurations determine weight and stiffness. Damping, friction and inertia require the efforts of motion,
-    here estimated by inverse dynamics and friction of a typical size. `arm.has_all_angles_recorded(recording)` must
-    hold.
+    here estimated by inverse dynamics and friction of a typical size. `effort` are the options of the effort sensor.
+    `arm.has_all_angles_recorded(recording)` must hold.
     """
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)

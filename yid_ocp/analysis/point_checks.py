@@ -58,7 +58,7 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
 
 
 def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
-    """Yield issues about points whose positions disagree with the forward kinematics of the recorded angles."""
+    """Yield issues about points that disagree with forward kinematics; `choice` returns a group's sensor options."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
         return
@@ -212,11 +212,7 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
 
 
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
-    """Distances from a frame to every joint's origin along the unknown part of its chain, by joint.
-
-    The first joint is the root, whose origin is fixed in the world or on the arm. None for a fixed, known or sliding
-    frame.
-    """
+    """Distances from a frame to joint origins along the unknown part of its chain, root first; None without any."""
     mechanism, known = system.mechanism, set() if arm is None else set(arm.joint_configuration_indices)
     entry = mechanism.frame(frame)
     chain = [i for i in mechanism.ancestor_joint_indices(entry.joint_index) if i not in known]
@@ -272,7 +268,7 @@ def check_point_distances(
 
 
 def check_object_points_against_rollout(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
-    """Yield issues about points far from the rollout at initial parameters, relative to the object's `size` [m]."""
+    """Yield issues about points far from the rollout `result` at initial parameters, relative to `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
         if not names or not size > 0:

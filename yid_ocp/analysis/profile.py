@@ -73,9 +73,9 @@ def compute_profile_likelihood_interval(
     The profile is followed by continuation: from the previous value, the other unknowns are predicted along the tangent
     and corrected by Gauss-Newton. Positive unknowns are represented by their logarithm. The weak prior is left out of
     chi2. An end is open if the level is not reached before the unknown's bound, or within a factor of 1000 (Venzon and
-    Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496). `x` (nx,) is the best fit, and `evaluation` the
-    evaluation at `x` with Jacobian. `std` is the unknown's standard deviation; it sets the first step and may be
-    infinite.
+    Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496). `index` selects the unknown, `x` (nx,) is the best
+    fit, and `evaluation` the evaluation at `x` with Jacobian. `std` is the unknown's standard deviation; it sets the
+    first step and may be infinite.
     """
     walk = _Walk(problem, x, index, evaluation)
     size = min(std / abs(x[index]), 0.5) if walk.logarithmic else min(std, 10 * float(problem.unknown_scales[index]))

@@ -146,7 +146,8 @@ def parameter_detectabilities(
 
     One unit is added to one row of one step that starts at `state`. The later steps are linear, x' = (A - B_u K) x,
     where K is the first gain of the tracking filter. The row is observed to first order if a reading changes within
-    `_RESPONSE_STEPS` steps. `episode` provides the sensors and the tracking filter; without it only rows are listed.
+    `_RESPONSE_STEPS` steps. `symbols` are the named equations and `stages` their linearisation at `state`. `episode`
+    provides the sensors and the tracking filter; without it only rows are listed.
     """
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
@@ -346,10 +347,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
 
 
 def _inverse_sparsity(mask: BoolArray) -> BoolArray:
-    """Structural nonzeros of a matrix's inverse: paths in its graph after permutation to a zero-free diagonal.
-
-    Without such a permutation (a perfect matching), all entries count as nonzero.
-    """
+    """Structural nonzeros of a matrix's inverse: paths in its graph after permutation to a zero-free diagonal."""
     count = len(mask)
     matched = maximum_bipartite_matching(scipy.sparse.csr_matrix(mask), perm_type="row")
     if count == 0 or np.any(matched < 0):

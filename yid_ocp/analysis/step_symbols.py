@@ -81,7 +81,7 @@ class _FormulaText:
 
 
 def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
-    """Count the operations that evaluate all expressions. Shared subexpressions count once."""
+    """Count the operations that evaluate all expressions of `variables`. Shared subexpressions count once."""
     function = _function(expressions, variables)
     skipped = (*_LEAF_OPERATIONS, ca.OP_OUTPUT, ca.OP_PARAMETER)
     return sum(function.instruction_id(i) not in skipped for i in range(function.n_instructions()))

@@ -37,7 +37,7 @@ def point_sensitivities_and_joint_sensor_information(
     finest: Mapping[str, float],
     encoders: EstimationProblem | None = None,
 ) -> tuple[dict[tuple[str, str], Array], Array]:
-    """Sensitivities of an episode's points at every node, and Fisher information of its joint measurements.
+    """Sensitivities of the points of episode `i` at every node, and Fisher information of its joint measurements.
 
     In `problem` every point is seen at every node with unit standard deviation. `evaluation` is the evaluation at x
     (nx,). `finest` is the smallest standard deviation of each group [m]. `encoders` is the problem with encoders of
@@ -110,11 +110,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
 
 
 def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorModel, slopes: Array) -> Array:
-    """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors.
-
-    If the tracking filter follows encoders that are also measurements, its share of their noise is treated as
-    independent, which is a small error compared with that of torques.
-    """
+    """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors."""
     motion = _Motion(course, errors)
     rng = np.random.default_rng(0)
     shape, most = slopes.shape[:2], min(_MAX_RANDOM_SAMPLES, motion.size, slopes.shape[0] * slopes.shape[1])

@@ -152,7 +152,7 @@ def what_if(
 def evaluate_experiment_change_sets(
     setting: RecordedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
-    """Predict the result of each set of named changes. `inflation` multiplies the stated variances."""
+    """Predict the result of each of `sets` of named changes. `inflation` multiplies the stated variances."""
     outcomes = _Outcomes(setting, inflation)
     known = {change.name: change for change in outcomes.possible}
     return outcomes.of_all([[known[name] for name in names] for names in sets])

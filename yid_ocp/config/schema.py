@@ -26,7 +26,7 @@ class SectionVariants:
     is_nullable: bool = False
 
     def selected_variant_name(self, raw: Any) -> Any:
-        """Value of the selector key in an unchecked section, or `default_variant` without the key."""
+        """Value of the selector key in the unchecked section `raw`, or `default_variant` without the key."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
@@ -47,7 +47,7 @@ class SectionVariants:
         return SectionVariants({"": self.classes[name]})
 
     def unknown_variant_error(self, word: object, where: str) -> ConfigError:
-        """Return the error for a missing or unknown value of the selector key."""
+        """Return the error for the missing or unknown value `word` of the selector key."""
         if not word:
             what = f"the key '{self.selector_key}' is missing"
             return ConfigError(what, where=where, allowed=", ".join(self.classes))
@@ -56,7 +56,7 @@ class SectionVariants:
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
-    """Alternative settings classes that a type annotation allows; None if it allows no settings class."""
+    """Alternative settings classes that the type annotation `hint` allows; None if it allows no settings class."""
     bare, markers = options.split_annotated(hint)
     nullable = type(None) in get_args(bare)
     among = next((marker for marker in markers if isinstance(marker, options.RegistryChoice)), None)
@@ -71,7 +71,7 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
 
 
 def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
-    """Return the error for an unknown key, with the nearest allowed key and the sections that have this key."""
+    """Return the error for an unknown key in `within`, with the nearest `known` key and sections that have the key."""
     said = unknown_name_error_arguments(name, known)
     homes = list(dict.fromkeys(_sections_with_key(RunSettings, name)))
     hints = [said["hint"]] if said["hint"] else []
@@ -178,6 +178,6 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
 
 
 def option_info_from_annotation(hint: Any) -> options.OptionInfo:
-    """Return the `OptionInfo` (meaning and unit) in a type annotation, or an empty one."""
+    """Return the `OptionInfo` (meaning and unit) in the type annotation `hint`, or an empty one."""
     markers = reversed(options.split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())

@@ -95,7 +95,7 @@ def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
 
 
 def white_noise_std(t: Array, values: Array) -> float:
-    """Robust standard deviation of a channel's white noise; zero if the clock is uneven or the channel rests long."""
+    """Robust standard deviation of a channel's white noise; zero if the clock `t` is uneven or it rests long."""
     if len(t) < NOISE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
@@ -163,9 +163,9 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
 def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
     """Find channels with noise far below the stated noise. Channels of equal stated noise are pooled.
 
-    Noise stated in the settings is not checked, because it may represent model error. As noise need not be white, the
-    largest estimate from all samples, every second sample, and so on up to `_MAX_SAMPLE_PERIOD` counts; quantization
-    counts as well. Channels without noise are skipped because they were computed, as commands are.
+    Noise stated in the settings (`choice`) is not checked, because it may represent model error. As noise need not be
+    white, the largest estimate from all samples, every second sample, and so on up to `_MAX_SAMPLE_PERIOD` counts;
+    quantization counts as well. Channels without noise are skipped because they were computed, as commands are.
     """
     found: dict[str, list[tuple[str, float, float]]] = {}
     commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
@@ -229,7 +229,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
 def typical_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
-    """Distance between the two points of every edge [m]: mean over frames, median over recordings.
+    """Distance between the two points of each of `edges` [m]: mean over frames, median over recordings.
 
     If `frames` is given, only the first `frames` frames of each recording count. Raises `DataError` without a
     recording, or if an edge is never seen.

@@ -323,7 +323,7 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
 
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
-    """Return an issue of the second recording if it shares samples with the first, else None."""
+    """Return an issue of the recording `other` if it shares samples with the recording `one`, else None."""
     others = {group.name: group for group in other.joint_and_point_groups}
     count = 0
     for group in one.joint_and_point_groups if one.joints is None else (one.joints,):

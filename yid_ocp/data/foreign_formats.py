@@ -44,7 +44,7 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS
 
 
 def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
-    """Interpret every column by its name. Returns the meanings (None if unclear) and the units in the names.
+    """Interpret every column of `header`. Returns the meanings (None if unclear) and the units in the names.
 
     `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
     """
@@ -273,7 +273,7 @@ def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
 
 
 def joint_values_of_fields(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
-    """Read joint values from a decoded message of any type. `paths` maps each channel to the path of an array.
+    """Read joint values from the decoded message `content`. `paths` maps each channel to the path of an array.
 
     Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or if a path does not exist or is not
     numeric.

@@ -117,10 +117,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
 def _motion_lag(
     joints: JointGroup, t: Array, path: Array, period: float, around: float, reach: float = _LAG_SEARCH
 ) -> _MotionLag | None:
-    """Lag within `reach` [s] of `around` at which a linear function of the angles fits positions (M, columns) best.
-
-    None for little data. More terms than linear ones would fit a periodic motion at any lag.
-    """
+    """Lag within `reach` [s] of `around` at which a linear function of the angles fits positions best, if any."""
     moving = joints.position[:, np.ptp(joints.position, axis=0) > _MIN_TURN]
     lags = around + period * np.arange(-round(reach / period), round(reach / period) + 1)
     inside = (t - lags[-1] > joints.t[0]) & (t - lags[0] < joints.t[-1])

@@ -366,7 +366,7 @@ def _sampled(t: Array) -> str:
 
 
 def require_data(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
-    """Raise a `DataError` with the given texts unless a condition holds."""
+    """Raise a `DataError` with the texts `what`, `where`, `allowed` and `hint` unless a condition holds."""
     if not condition:
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 

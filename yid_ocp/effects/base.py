@@ -347,7 +347,7 @@ def elastic_joints_within_segment(system: System, segment: str) -> tuple[Elastic
 def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
-    """Define an arm joint's parameter, neutral at zero. Bound and range are scaled by the effort limit."""
+    """Define an arm joint's parameter, neutral at zero. `upper` and `expected` are scaled by the effort limit."""
     prior, scale = (0.0, expected), effort_limit_over_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 

@@ -195,7 +195,7 @@ _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 
 def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
-    """Support of an export format (`mjcf`, `urdf` or `sdf`) for each effect of a system."""
+    """Support of the export format `form` (`mjcf`, `urdf` or `sdf`) for each effect of a system."""
     value, found = ParameterEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
@@ -213,7 +213,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
 def format_support_by_parameter(
     system: System, effects: Mapping[str, FeatureExportSupport], form: str
 ) -> dict[str, FeatureExportSupport]:
-    """Support of an export format for each parameter. Parameters of an effect have the support of this effect."""
+    """Support of the export format `form` for each parameter. Parameters of an effect have its support in `effects`."""
     found = {}
     for entry in system.parameters:
         owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_depending_on_symbols(system, entry.symbol))

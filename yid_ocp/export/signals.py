@@ -45,7 +45,7 @@ class RosTopicTimeSeries:
 
 
 def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[str]) -> float:
-    """Write ROS time series to one MCAP file with message definitions, sorted by time.
+    """Write the ROS time series `signals` to one MCAP file with message definitions, sorted by time.
 
     Returns a shift [s] of whole seconds that was added to all times, because stamps cannot be negative; it is usually
     zero. Raises `OutputError` if `rosbags` is not installed, there is nothing to write, or the file cannot be written.

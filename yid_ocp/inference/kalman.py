@@ -67,14 +67,14 @@ class KalmanStepMatrices:
     transition: FilterStateTransition
 
     def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
-        """Normalized innovations of measurements (r, c), and the state means after the step (nx, c)."""
+        """Normalized innovations of `measured` (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
         """Smoothed measurement noise (r, c) and the costate before the step (nx, c), from the costate after the step.
 
-        The smoothed state is the filter's prediction + P costate.
+        `white` are the normalized innovations. The smoothed state is the filter's prediction + P costate.
         """
         pulled = self.transition._propagate_costate_back(costate)
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
@@ -94,8 +94,8 @@ def kalman_matrices_and_next_covariance(
 ) -> tuple[KalmanStepMatrices, Array, float]:
     """Compute a filter step's gains, the next state covariance without process noise, and log det S.
 
-    `covariance` is P (nx, nx) before the measurement by H (r, nx); S = I + H P H'. If rounding makes S indefinite, only
-    its diagonal is used, and log det S is returned as infinity.
+    `covariance` is P (nx, nx) before the measurement, `observation` is H (r, nx), and S = I + H P H'. If rounding makes
+    S indefinite, only its diagonal is used, and log det S is returned as infinity.
     """
     cross = observation @ covariance
     whitening, log_determinant = np.zeros((0, 0)), 0.0
@@ -154,8 +154,8 @@ class KalmanSteps:
     ) -> tuple[Array, Array, Array]:
         """Normalized innovations (r, c), state means (nx, c) after all steps, and means before each step (k, nx, c).
 
-        `push` (k, m, c) is added to the parameters during a step's transition. `shift` (k, nx - ns) is added to the
-        parameters of the first column after it.
+        `mean` is the mean before all steps. `push` (k, m, c) is added to the parameters during a step's transition.
+        `shift` (k, nx - ns) is added to the parameters of the first column after it.
         """
         if (library := _library()) is not None:
             return self._compiled_columns(library, measured, mean, shift, push)

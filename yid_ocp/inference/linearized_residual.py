@@ -131,7 +131,7 @@ class ResidualDerivativesAtNodes:
         return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Residual derivatives (r, d) in d directions, from those of node states (K, nx, d) and efforts (K, nc, d).
+        """Residual derivatives (r, d) in d directions, from `by_node` (K, nx, d) of states and `effort` (K, nc, d).
 
         The K nodes begin with node `first`. A residual beyond them uses the last node.
         """
@@ -166,7 +166,7 @@ def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Ev
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
-    """Minimise |J d + r|^2 + mu c |d|^2 over steps d within bounds; c is the largest squared column norm of J."""
+    """Minimise |J d + r|^2 + mu c |d|^2 over lower <= d <= upper; c is the largest squared column norm of J."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
     small = np.zeros((count + 1, count + 1))
@@ -210,7 +210,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def solve_step_within_unknown_sizes(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Solve for the bounded least-squares step (nx,). An unknown moves by at most its value or its typical size."""
+    """Solve for the damped least-squares step (nx,) in which an unknown moves by at most its value or typical size."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)

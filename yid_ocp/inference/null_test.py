@@ -144,7 +144,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
 def residuals_exceed_noise(
     tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
 ) -> bool:
-    """Whether one model's residuals, fitted or held out, exceed noise by a significant and relevant amount."""
+    """Whether one model's residuals exceed noise by a significant and relevant amount, in at least one of `tests`."""
     significant = min_bonferroni_p_value(tests) < limits.significance_level
     return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2_per_dof
 

@@ -364,8 +364,8 @@ def force_log_likelihood_coefficients(
 ) -> tuple[Array, Array]:
     """Coefficients g (J,) and L (J, J) of an unknown's log likelihood g'f - f'L f / 2, where f are its values.
 
-    f is in units of the unknown's reference. Free parameters, states and all other unknowns are integrated out;
-    `variance` gives the variances of their groups [squared reference].
+    `unknown` is the index of the unknown, in whose reference f is expressed. Free parameters, states and all other
+    unknowns are integrated out; `variance` gives the variances of their groups [squared reference].
     """
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))
@@ -478,7 +478,7 @@ def gap_locations_by_smoother_evidence(
 
 
 def smoothed_unknown_significance_mask(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
-    """Mask (J, columns) of the unknowns that are more than `limit` standard deviations from zero."""
+    """Mask (J, columns) of the unknowns of `trace` that are more than `limit` standard deviations from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > limit * std)
 

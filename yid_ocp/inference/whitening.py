@@ -229,7 +229,7 @@ def _filter_steps(
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
-    """Estimate the constant torque error of each driven joint from all measurements of an episode, (nu,) [N m]."""
+    """Constant torque errors (nu,) [N m] of the driven joints, estimated from the prediction `result` of an episode."""
     return whitening.whiten_and_estimate_torque_bias(
         _plain(episode, result)[:, None], result.torque_correction_and_sensitivity
     )[1][:, 0]
@@ -422,9 +422,7 @@ def _relinearized(
     known: Sequence[ProcessNoiseWhitener | None],
     at: Sequence[tuple[Episode, Array, Array, Array]],
 ) -> tuple[tuple[Episode, ...], tuple[WhiteningFilter | None, ...]]:
-    """Episodes and filters linearised at the torque offsets of (episode, theta, offset), for filters linearised at a
-    theta.
-    """
+    """Episodes and filters at the torque offsets of (episode, theta, offset), from filters linearised at a theta."""
     pairs = zip(map(_own_filter, known), at, strict=True)
     made = tuple(own and _settled(predictor, own, *told) for own, told in pairs)
     both = zip(episodes, made, strict=True)

@@ -147,9 +147,7 @@ class CompiledKernel:
         return [found[i] for i in range(len(members))]
 
     def _split(self, group: Sequence[int], members: Sequence[RolloutInputs]) -> list[Sequence[int]]:
-        """Split similar members into batches, independent of the number of threads (results of batches differ by
-        rounding).
-        """
+        """Split similar members into batches, independent of the number of threads (batches differ by rounding)."""
         batches: list[Sequence[int]] = []
         left = list(group)
         fewest = max(_MIN_BATCH_SPEEDUP * (_BATCH_COST + _BATCH_COST_PER_COLUMN * _width(members[left[0]])), 2.0)

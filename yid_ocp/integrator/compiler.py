@@ -212,9 +212,7 @@ def _library_file(source: str, level: str, make: Callable[[], str | None] | None
 
 
 def _kept(folder: Path, key: str) -> Path | None:
-    """Path of the cached library of a key. Damaged libraries (see the hash in their name) and those of others are
-    removed.
-    """
+    """Path of the cached library of a key. Damaged libraries (by their hash) and foreign ones are removed."""
     for path in sorted(folder.glob(f"{key}-*.so")):
         with contextlib.suppress(OSError, DataError):
             info = path.lstat()
@@ -297,10 +295,7 @@ int yid_map(int count, const double **in, double **out) {{
 """
 
     def __call__(self, *inputs: Array) -> list[Array]:
-        """Evaluate the function at all points. Returns dense arrays (count, rows, columns), one per output.
-
-        Inputs have the shape (count, size), or (size,) if shared.
-        """
+        """Values at all points, dense (count, rows, columns) per output; inputs (count, size), or (size,) if shared."""
         count = next((len(x) for i, x in enumerate(inputs) if i not in self.shared_inputs), 1)
         arrays = [np.ascontiguousarray(x, dtype=float) for x in inputs]
         for i, array in enumerate(arrays):

@@ -123,9 +123,7 @@ class DiscreteEquations:
 
     @property
     def impulses_of_force_with_derivatives(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulses of the closed-form force in `momentum_balance` and in `p1`, each (n, 1) [N m s]; None without such a
-        force.
-        """
+        """Impulses of the closed-form force in `momentum_balance` and `p1`, each (n, 1) [N m s]; None without it."""
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares
@@ -247,9 +245,7 @@ class _Symbols:
 def _summed_terms(
     system: System, at: _Symbols, kinematics: Kinematics
 ) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithDerivativeFactors | None]:
-    """Lagrangian, force, internal equations (in motion and at rest) and closed-form force of springs, inputs and
-    effects.
-    """
+    """Lagrangian, force, internal equations (moving, at rest) and closed force of springs, inputs and effects."""
     names = tuple(system.effect_internal_coordinate_symbols)
     rows_of = {name: i for i, name in enumerate(names)}
     state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
@@ -386,9 +382,7 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
 
 @dataclass(frozen=True)
 class EquilibriumEquations:
-    """Symbolic equations of static equilibrium. Torques and springs hold the driven joints; prescribed joints are
-    given.
-    """
+    """Symbolic equations of static equilibrium. Torques and springs hold driven joints; prescribed ones are given."""
 
     # (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
     # held torque, holding spring's stiffness, theta, time step
@@ -398,9 +392,7 @@ class EquilibriumEquations:
 
 
 def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
-    """Build the equations of static equilibrium. They are a step from a configuration to itself with unchanged
-    momentum.
-    """
+    """Build the equations of static equilibrium: a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
     driven = list(system.driven_coordinate_indices)

@@ -196,11 +196,7 @@ class EquilibriumSolver:
         return energy + hold.stiffness / 2 * ca.sumsqr(give) + ca.dot(hold.held, give)
 
     def _lowest_energy(self, theta: Array, hold: _Hold) -> Array | None:
-        """Configuration (n,) of lowest energy within the constraints, where Newton fails (cables between clamps), or
-        None.
-
-        Interior-point method: Waechter and Biegler 2006, doi:10.1007/s10107-004-0559-y.
-        """
+        """Configuration (n,) of lowest energy by an interior-point method (doi:10.1007/s10107-004-0559-y), or None."""
         size, m, given = len(self.free_coordinates), self.step.sizes["m"], hold.given
         if not size or not m:
             return None
@@ -226,9 +222,7 @@ class EquilibriumSolver:
     def _rest_equations(
         self, w: Array, theta: Array, hold: _Hold, h: float, names: tuple[str, ...] = ()
     ) -> tuple[list[Array], list[Array]]:
-        """Equilibrium equations at `w` and the momentum at rest, each with derivatives by (q, z, forces), torques and
-        `names`.
-        """
+        """Equilibrium equations at `w` and the momentum, with derivatives by (q, z, forces), torques and `names`."""
         step, system, free = self.step, self.step.system, len(self.free_coordinates)
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
         q, z, lam = self._configuration(w, hold.given), w[free : free + nz], h * w[free + nz :]
@@ -309,9 +303,7 @@ class EquilibriumSolver:
 
 
 def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
-    """Sum of 1/2 gain (u - q)^2 over all servos [J]. Torque limits and damping do not change which equilibrium is
-    lowest.
-    """
+    """Sum of 1/2 gain (u - q)^2 over all servos [J]; limits and damping do not change the lowest equilibrium."""
     at = zip(system.driven, system.driven_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
     known = ((system.servos[name], part, q[i]) for name, i, part in at)
     return sum((0.5 * servo.gain * servo.error(command, angle) ** 2 for servo, command, angle in known), ca.SX(0))

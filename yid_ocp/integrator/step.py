@@ -38,9 +38,7 @@ _ALL_STEPS = slice(None)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(ReprMixin):
-    """Step map of a system over one time step, made by `compile_step`. `is_compiled` tells whether it runs generated C
-    code.
-    """
+    """Step map of a system over one time step, made by `compile_step`. It `is_compiled` if it runs generated C code."""
 
     model: StepModel
     kernel: CompiledKernel | InterpretedKernel
@@ -85,9 +83,7 @@ class Step(ReprMixin):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Dimensions: n (coordinates), nz (internal), m (constraints), nu (inputs), nc (prescribed), nx (state) and
-        ntheta.
-        """
+        """Dimensions n (coordinates), nz (internal), m (constraints), nu (inputs), nc (prescribed), nx, ntheta."""
         return self.model.sizes
 
     def __call__(
@@ -127,7 +123,8 @@ class Step(ReprMixin):
     ) -> tuple[Array, Array, Array]:
         """Derivatives A (nx, nx), B_u (nx, nu), B_theta (nx, len(names)) of the next state by state, input, parameters.
 
-        They follow from the implicit function theorem. Without `names`, the parameters are all of theta.
+        They follow from the implicit function theorem. Arguments are as in `__call__`; `names` are by default all of
+        theta.
         """
         sizes = self.sizes
         chosen = tuple(self.system.parameters.names if names is None else names)
@@ -257,6 +254,8 @@ def simulate(
         Nominal motor torque of every step [N m]; default: zero.
     path : array_like, shape (N + 1, nc), optional
         Prescribed coordinates at every node [rad or m]; default: their initial values.
+    feedback : TrackingFeedback, optional
+        Correction of the torque by the state.
 
     Returns
     -------
@@ -274,7 +273,7 @@ def simulate(
 
 
 def simulate_rollouts(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several rollouts, given by `checked_rollout_inputs`. Results equal `simulate` except for rounding."""
+    """Simulate several rollouts from `checked_rollout_inputs`. Results equal `simulate` except for rounding."""
     return step.kernel.rollout_batch(members)
 
 

@@ -240,7 +240,7 @@ class StepEquationLinearizations:
 
 
 def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
-    """Allocate a rollout filled with NaN. `count` is the number of directions; None omits the sensitivities."""
+    """Allocate a rollout of `steps` steps filled with NaN; `count` sensitivity directions (None: none)."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
     names = [f"{name}_sensitivity" for name in ("state", "multipliers", "effort")]
@@ -281,7 +281,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 def attach_status_to_rollout(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """Return a rollout with a `RolloutStatus`. `counts` are the Newton iterations and matrix factorisations."""
+    """Return a rollout with a `RolloutStatus`. `error` is the last correction, `counts` iterations, factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
     return replace(rollout, status=RolloutStatus(NewtonStatusCode(code), step, error, *counts, last, inner))

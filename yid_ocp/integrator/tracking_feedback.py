@@ -110,9 +110,7 @@ def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: A
 
 
 def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, theta: Array) -> tuple[Array, Array]:
-    """A_k (N, 2 nu, 2 nu) and B_k (N, 2 nu, nu) of a step from each state to about `guess` (N, nu); NaN if Newton
-    fails.
-    """
+    """A_k (N, 2 nu, 2 nu), B_k (N, 2 nu, nu) of a step from each state to about `guess`; NaN if Newton fails."""
     count, nu = torque.shape
     # the kernel takes consecutive states: each start and its successor; the steps between these pairs are not used
     state, torques = np.repeat(start, 2, axis=0), np.repeat(torque, 2, axis=0)[:-1]
@@ -259,9 +257,7 @@ class EffectMomentumShift:
     def _remembered(
         self, motion: JointMotionWithSensitivities, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
-        """Internal coordinates of joint effects at every node but the last, (N, nk), and derivatives (N, nk, d) or
-        None.
-        """
+        """Internal coordinates (N, nk) of joint effects at all nodes but the last, and derivatives (N, nk, d)."""
         steps = len(motion.torque)
         z, total = np.zeros((steps, len(self._kept))), np.zeros((steps, len(self._kept), width))
         freed, away = {own for _, own in wanted}, theta[self._columns] != self._neutral

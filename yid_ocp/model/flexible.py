@@ -67,8 +67,7 @@ class Segment:
     cross_section_size: tuple[float, float] | None = None
     """Side lengths of a rectangular cross-section along the links' x and y axes [m]."""
     has_link_length_parameters: bool = False
-    """Whether each link has a length parameter (`SEGMENT.length_0`, ...), for markers that move between recordings.
-    Masses do not depend on them."""
+    """Whether each link has a length parameter, for markers that move between recordings; masses do not change."""
     clamped_edge_length: float | None = None
     """Length of a flexible edge that a clamp keeps straight before a root segment [m]. With
     `stiffness_given_as_rigidity`, the first joint includes half of it."""

@@ -190,7 +190,7 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 
 def mass_matrix(rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
-    """Mass matrix (n, n) of the mechanism, in the closed form of `MultibodyLagrangianDerivatives`."""
+    """Mass matrix (n, n) of the mechanism from its Lagrangian derivatives `rigid`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 

@@ -196,7 +196,8 @@ class Effect:
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """Added delay [s] of a channel: recorded minus true time of a sample. `channel` is as in `distorted_reading`.
 
-        For a recorded torque that drives the model, `torque.JOINT`, it is the delay from the record to the action.
+        `camera` marks points of a camera. For `torque.JOINT`, a torque that drives the model, it is the delay of its
+        action.
         """
         return ca.SX(0)
 
@@ -401,7 +402,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Generalized force of motor torques or servo commands u, shape (n, 1) [N m]."""
+        """Generalized force (n, 1) [N m] of motor torques or servo commands u, at coordinates q and velocities v."""
         force = [ca.SX(0)] * self.n_coordinates
         for row, (joint, index) in enumerate(zip(self.driven, self.driven_coordinate_indices, strict=True)):
             servo = self.servos.get(joint)
@@ -409,7 +410,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def weight_and_grasp_force_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
-        """Generalized force [N m or N] at one coordinate from grasps and the weight of all bodies that it moves."""
+        """Generalized force [N m or N] at coordinate `index` from grasps and the weight of all bodies that it moves."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)
         for j, joint in enumerate(tree.joints):

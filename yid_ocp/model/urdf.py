@@ -362,10 +362,7 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
 def _walk(
     robot: Any, root: str, dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
 ) -> tuple[dict[str, tuple[_Carrier, Array, Any]], dict[str, Inertia], dict[str, tuple[_Carrier, Array, str]]]:
-    """Kept joints, bodies by link, and links, each with its carrier (kept joint or None) and pose (4, 4) in its frame.
-
-    Each link also has the name of the link to which it is fixed, empty if there is none.
-    """
+    """Kept joints, bodies by link, and links with carrier (kept joint or None), pose (4, 4) and parent link."""
     links = {link.name: link.inertial for link in robot.links}
     joints: dict[str, tuple[_Carrier, Array, Any]] = {}
     bodies: dict[str, Inertia] = {}

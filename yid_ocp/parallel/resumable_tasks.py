@@ -64,9 +64,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Workers of a run: local processes or those of a Dask scheduler (address or file). Raises `ConfigError` if both
-    are set.
-    """
+    """Workers of a run: local processes or a Dask scheduler (address or file). Raises `ConfigError` for both."""
 
     n_processes: int | None = None
     scheduler_address: str = ""
@@ -144,9 +142,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Return the values of all tasks. Raises `WorkerError` for a failure that this package reports, else
-    `RuntimeError`.
-    """
+    """Return the values of all tasks. Raises `WorkerError` for failures with a known cause, else `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]

@@ -138,7 +138,7 @@ class SelectionAndUnitOptions:
 
 
 def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
-    """Convert a recording to SI units, select joints and points, and validate the result.
+    """Convert the recording `raw` to SI units, select joints and points, and validate the result.
 
     Raises `DataError` for an unknown joint, point, quantity or unit, or a current without torque constants, and the
     errors of `validated_recording`.
@@ -187,7 +187,7 @@ def _check_known(chosen: Iterable[str], known: Sequence[str], noun: str, where: 
 
 
 def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
-    """Raise `DataError` if two data sources are mapped to the same point name."""
+    """Raise `DataError` if `chosen` maps two data sources to the same point name."""
     names = list(chosen.values())
     shared = [source for source, name in chosen.items() if names.count(name) > 1]
     if shared:
@@ -225,7 +225,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
 
 
 def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
-    """Import a module of an optional dependency. Raises `DataError` with an install hint if it is missing."""
+    """Import a module of the package's optional dependencies `extra`. Raises `DataError` (`what`) if it is missing."""
     try:
         return import_module(module)
     except ImportError as error:

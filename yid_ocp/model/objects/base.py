@@ -171,7 +171,7 @@ def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
 
 
 def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
-    """Initial bending rigidity (ratio x weight x length^2) and damping of each segment, with comments."""
+    """Initial bending rigidity (`rigidity_ratio` x weight x length^2) and damping of `segments`, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
