@@ -53,8 +53,8 @@ class _FrameSettings(MountSettings):
     marker_reference_pose: Annotated[
         bool,
         OptionInfo(
-            "whether each recording's dataset `straight` says where the point of this name sits, in place of xyz; "
-            "for markers on an object that stands in the world"
+            "whether the dataset `straight` of each recording gives the position of the point of this name, "
+            "instead of xyz; for markers on an object whose root is fixed in the world"
         ),
     ] = False
 
@@ -64,11 +64,12 @@ class _MeasuredClampSettings:
     """A massless clamp frame whose prescribed motion follows two recorded points."""
 
     origin_point_name: Annotated[str, OptionInfo("point at the clamp's origin")]
-    z_axis_point_name: Annotated[str, OptionInfo("point to which its z axis looks, never along the world's x axis")]
+    z_axis_point_name: Annotated[str, OptionInfo("point on its z axis, which must not be along the world's x axis")]
     roll_convention: Annotated[
         Literal["level", "transported"],
         OptionInfo(
-            "rotation that two points leave free: x axis perpendicular to world y, or no initial rotation about z"
+            "rotation about z, which two points leave free. level: x axis perpendicular to world y; "
+            "transported: level at the start, then no rotation about z"
         ),
     ] = "level"
 
@@ -79,8 +80,8 @@ class GraspSettings:
 
     holder_frame: Annotated[str, OptionInfo("frame of the robot, or a clamp")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
-    kind: Annotated[_GraspKind, OptionInfo("3, 5 or 6 equations")] = "point"
-    rpy: Annotated[_Vector3, OptionInfo("orientation of held in holder, for axis and weld", "rad")] = (0.0, 0.0, 0.0)
+    kind: Annotated[_GraspKind, OptionInfo("point, axis (and z axes) or weld (and orientation)")] = "point"
+    rpy: Annotated[_Vector3, OptionInfo("orientation of held_frame in holder_frame", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,52 +90,52 @@ class _JointSpringSettings:
 
     stiffness: Annotated[float, Ge(0), OptionInfo("stiffness", "N m/rad or N/m")]
     rest_position: Annotated[float, OptionInfo("coordinate at which the spring has no torque", "rad or m")] = 0.0
-    damping: Annotated[float | None, Ge(0), OptionInfo("viscous; model.damping when absent", "N m s/rad or N s/m")] = (
-        None
-    )
+    damping: Annotated[
+        float | None, Ge(0), OptionInfo("viscous damping; default: model.damping", "N m s/rad or N s/m")
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class EffectSettings:
     """An effect beyond the nominal model. Its parameters are named kind@location.quantity."""
 
-    kind: Annotated[str, OptionInfo("kelvin_voigt, joint_coulomb, ..., or law")]
+    kind: Annotated[str, OptionInfo("kind of effect: kelvin_voigt, joint_coulomb, ..., or law")]
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
-    values: Annotated[Mapping[str, float], OptionInfo("quantities that are not neutral")] = field(default_factory=dict)
-    depends_on: Annotated[LawDependence | None, OptionInfo("quantities of a law")] = None
-    table: Annotated[_FilePath | None, OptionInfo("table of a law, as law.csv of a diagnosis")] = None
+    values: Annotated[Mapping[str, float], OptionInfo("parameters that are not neutral")] = field(default_factory=dict)
+    depends_on: Annotated[LawDependence | None, OptionInfo("quantities on which a law depends")] = None
+    table: Annotated[_FilePath | None, OptionInfo("table of a law, in the format of a diagnosis' law.csv")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointActuationSettings:
     """Moving joints of the robot, and how each is driven."""
 
-    joints: Annotated[_Names | None, OptionInfo("in configuration order; all movable ones when absent")] = None
+    joints: Annotated[_Names | None, OptionInfo("moving joints, in order; default: all movable")] = None
     mode: Annotated[
         _ArmMode,
         OptionInfo(
-            "driven by measured effort, prescribed (moved as measured), servo (moved by position servos that follow "
-            "recorded commands) or passive; with a grasp and recorded torques, prescribed arms are states that their "
-            "encoders correct"
+            "driven (by measured efforts), prescribed (by measured angles), servo (by position servos that follow "
+            "recorded commands) or passive; prescribed arms with a grasp and recorded torques become states that "
+            "their encoders correct"
         ),
     ] = "driven"
-    servo: Annotated[PositionServoOptions, OptionInfo("of the mode servo")] = field(
+    servo: Annotated[PositionServoOptions, OptionInfo("position servos of the mode servo")] = field(
         default_factory=PositionServoOptions
     )
-    passive_joints: Annotated[_Names, OptionInfo("joints among them without a drive, in any mode")] = ()
-    locked_joints: Annotated[Mapping[str, float], OptionInfo("value of joints that do not move", "rad or m")] = field(
-        default_factory=dict
+    passive_joints: Annotated[_Names, OptionInfo("moving joints without a drive, in any mode")] = ()
+    locked_joints: Annotated[Mapping[str, float], OptionInfo("position of joints that do not move", "rad or m")] = (
+        field(default_factory=dict)
     )
     exclude_links: Annotated[
-        _Names, OptionInfo("links of the URDF to exclude with all links on them, such as a hand that is not mounted")
+        _Names, OptionInfo("links of the URDF to remove with their subtrees, such as a hand that is not mounted")
     ] = ()
     link_mass_std: Annotated[
         float,
         Ge(0),
         Lt(0.3),
         OptionInfo(
-            "standard deviation of every link's mass and inertia, as a fraction of the URDF's: JOINT.mass_scale is "
-            "estimated beside what is sought; 0: the URDF is exact"
+            "relative standard deviation of every link's mass and inertia in the URDF; above 0, "
+            "JOINT.mass_scale is estimated as well"
         ),
     ] = 0.0
 
@@ -146,17 +147,17 @@ class FrictionLawSettings:
     law: Annotated[
         FrictionLawName,
         OptionInfo(
-            "viscous; coulomb beside it; stribeck (more at low speed) beside both; presliding (Dahl: holds at rest); "
-            "load (grows with the torque through the gear) beside Coulomb; load_stribeck, all of them"
+            "viscous; coulomb (and viscous); stribeck (more at low speed, and coulomb); presliding (Dahl, with "
+            "stiction); load (grows with the torque through the gear, and coulomb); load_stribeck (load and stribeck)"
         ),
     ]
-    joints: Annotated[_Names | None, OptionInfo("joints of the robot that have it; all that move when absent")] = None
+    joints: Annotated[_Names | None, OptionInfo("joints with this friction; default: all that move")] = None
     sign_smoothing_speed: Annotated[
         float | None,
         Gt(0),
         OptionInfo(
-            "below which Coulomb's and Stribeck's law round off the sign of the speed, so that a loaded joint creeps; "
-            "0.02 when absent, less for joints that stand still under a load",
+            "speed below which the sign of Coulomb and Stribeck friction is smoothed, so that a loaded joint "
+            "creeps; default: 0.02, less for joints that stand still under a load",
             "rad/s",
         ),
     ] = None
@@ -175,56 +176,55 @@ class ModelSettings:
     ] = None
     moving_clamps: Annotated[
         Mapping[str, _MeasuredClampSettings],
-        OptionInfo("clamps that move an object without a robot, by name; a cable has its own at both ends"),
+        OptionInfo("clamps that move an object without a robot, by name; a cable has its own clamps at both ends"),
     ] = field(default_factory=dict)
-    arms: Annotated[JointActuationSettings, OptionInfo("the robot's joints")] = JointActuationSettings()
+    arms: Annotated[JointActuationSettings, OptionInfo("joints of the robot and their drive")] = (
+        JointActuationSettings()
+    )
     frames: Annotated[
         Mapping[str, _FrameSettings],
-        OptionInfo("further frames, by name, on robot, object or world: a tool's tip, a marker"),
+        OptionInfo("additional frames on robot, object or world, by name, such as a tool tip or a marker"),
     ] = field(default_factory=dict)
     object: Annotated[
         ObjectKind | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
     ] = None
-    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right, gripper")] = field(
+    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("grasps by name: left, right, gripper")] = field(
         default_factory=dict
     )
-    springs: Annotated[Mapping[str, _JointSpringSettings], OptionInfo("by joint of the robot")] = field(
+    springs: Annotated[Mapping[str, _JointSpringSettings], OptionInfo("springs by joint of the robot")] = field(
         default_factory=dict
     )
     damping: Annotated[
         Annotated[float, Ge(0)] | Mapping[str, Annotated[float, Ge(0)]],
         OptionInfo(
-            "viscous damping of every coordinate; or by joint of the robot (0.05 for those not "
-            "named) and by the name `object`",
+            "viscous damping of every coordinate, or by joint of the robot (default 0.05) and by the name `object`",
             "N m s/rad",
         ),
     ] = 0.05
     friction: Annotated[
-        FrictionLawSettings | None, OptionInfo("ordinary friction of the joints, its amplitudes and damping free")
+        FrictionLawSettings | None, OptionInfo("nominal friction law of the joints, with free amplitudes and damping")
     ] = None
-    gravity: Annotated[_Vector3, OptionInfo("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
-    points: Annotated[_Names | None, OptionInfo("frames that sensors may see, such as T1:40%; the segments' tips")] = (
-        None
-    )
+    gravity: Annotated[_Vector3, OptionInfo("gravity in the world frame", "m/s^2")] = (0.0, 0.0, -9.81)
+    points: Annotated[_Names | None, OptionInfo("frames for sensors, such as T1:40%; default: segment tips")] = None
     extra_meshes: Annotated[
         tuple[ExtraMesh, ...],
-        OptionInfo("what a camera sees and the URDF does not have: a gripper's body, a table; `track` leaves it out"),
+        OptionInfo("bodies that a camera sees and the URDF lacks, such as a table; `track` removes their points"),
     ] = ()
-    effects: Annotated[tuple[EffectSettings, ...], OptionInfo("added to the nominal model, in this order")] = ()
+    effects: Annotated[tuple[EffectSettings, ...], OptionInfo("effects added to the nominal model, in this order")] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingsSettings:
     """Recordings for estimation, held-out prediction and reference."""
 
-    estimate: Annotated[_Recordings, OptionInfo("to estimate on")] = ()
-    held_out: Annotated[_Recordings, OptionInfo("only predicted, never fitted")] = ()
+    estimate: Annotated[_Recordings, OptionInfo("recordings for the estimation")] = ()
+    held_out: Annotated[_Recordings, OptionInfo("recordings that are predicted only")] = ()
     reference_recordings: Annotated[
         _Recordings,
-        OptionInfo("recordings without the diagnosed effect, predicted as a test; those of the baseline when absent"),
+        OptionInfo("recordings made without the diagnosed effect, predicted as a test; default: those of the baseline"),
     ] = ()
     strict: Annotated[
-        bool, OptionInfo("whether any issue of a recording stops the run; --strict on the command line")
+        bool, OptionInfo("whether any issue of a recording stops the run (--strict on the command line)")
     ] = False
 
 
@@ -233,20 +233,17 @@ class ImportSettings:
     """Settings for the conversion of another tool's file by `import`. A command-line flag overrides its key here."""
 
     joint_topics: Annotated[
-        _Names | None, OptionInfo("of a bag: topics of joint states, merged on one clock; all when absent")
+        _Names | None, OptionInfo("bag: topics of joint states, merged on one clock; default: all")
     ] = None
     command_topic: Annotated[
-        str | None, OptionInfo("of a bag: topic of joint states whose positions are commands, not measurements")
+        str | None, OptionInfo("bag: topic of joint states whose positions are commands, not measurements")
     ] = None
-    fields: Annotated[
-        _Texts, OptionInfo("of a bag: joint channel, and /TOPIC.FIELD of an array in messages of any type")
-    ] = None
+    fields: Annotated[_Texts, OptionInfo("bag: /TOPIC.FIELD of an array in any message, by joint channel")] = None
     joints: Annotated[
-        _Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; all when absent")
+        _Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; default: all")
     ] = None
     points: Annotated[
-        _Texts,
-        OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
+        _Texts, OptionInfo("point, such as cable:40%, by its source: topic, TOPIC:FRAME of /tf, marker or column stem")
     ] = None
     pose_axis_point_distance: Annotated[
         float | None,
@@ -255,44 +252,38 @@ class ImportSettings:
         OptionInfo("distance of the points NAME_x, NAME_y, NAME_z along the axes of a pose", "m"),
     ] = None
     columns: Annotated[
-        _Texts, OptionInfo("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip")
+        _Texts, OptionInfo("table: t, CHANNEL:JOINT, AXIS:POINT or skip, by column or pattern such as *_pos")
     ] = None
-    header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2 and so on")] = (
-        None
-    )
-    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether lines that are not numbers are skipped")] = (
-        None
-    )
+    header: Annotated[bool | None, OptionInfo("table: whether the first row has names (else 1, 2, ...)")] = None
+    skip_bad_lines: Annotated[bool | None, OptionInfo("table: whether lines that are not numbers are skipped")] = None
     delimiter: Annotated[
-        str | None, OptionInfo("of a table: one character between cells; found in the first line when absent")
+        str | None, OptionInfo("table: character between cells; default: detected in the first line")
     ] = None
     units: Annotated[
         _Texts,
         OptionInfo(
-            "of t (s, ms, us, ns), position (rad, deg, rev), velocity (rad/s, deg/s, rpm), effort (N m, N mm, A, mA), "
-            "points (m, cm, mm) and so on, where they are not SI"
+            "units that are not SI, by quantity: t (s, ms, us, ns), position (rad, deg, rev), velocity "
+            "(rad/s, deg/s, rpm), effort (N m, N mm, A, mA), points (m, cm, mm) and so on"
         ),
     ] = None
     torque_constants: Annotated[
-        _Numbers, OptionInfo("by joint or pattern, where effort is a motor's current", "N m/A")
+        _Numbers, OptionInfo("torque per current by joint or pattern, if efforts are motor currents", "N m/A")
     ] = None
-    gears: Annotated[
-        _Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent")
-    ] = None
+    gears: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
     clock_offsets: Annotated[
-        _Numbers, OptionInfo("of several files: time added to those of each file, by the stem of its name", "s")
+        _Numbers, OptionInfo("several files: time added to the times of each, by file stem", "s")
     ] = None
-    episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
-    clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
-    point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor of the points")] = None
-    frame: Annotated[str | None, OptionInfo("frame of reference of the points, of a table or C3D file")] = None
+    episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
+    clock: Annotated[ClockKind | None, OptionInfo("table: whether its times were measured")] = None
+    point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None
+    frame: Annotated[str | None, OptionInfo("table or C3D file: reference frame of the points")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterSettings:
     """Initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
 
-    initial: Annotated[float | None, OptionInfo("value, or start of the search", "that of the parameter")] = None
+    initial: Annotated[float | None, OptionInfo("value; initial value if free", "that of the parameter")] = None
     bounds: Annotated[tuple[float, float] | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
     free: Annotated[bool | None, OptionInfo("whether it is estimated")] = None
     prior_std: Annotated[
@@ -307,13 +298,13 @@ class ProblemSettings(ProblemOptions):
 
     time_step: Annotated[
         Annotated[float, Gt(0), Le(0.1)] | Literal["auto"],
-        OptionInfo("of the integrator; auto halves 20 ms until half of it hardly changes the first prediction", "s"),
+        OptionInfo("time step; auto halves 20 ms until half of it hardly changes the initial prediction", "s"),
     ] = 0.01
-    force_split: Annotated[ForceSplit, OptionInfo("rule for forces; left: Caldwell et al. (2014)")] = "symmetric"
-    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node: Caldwell et al.")] = (
-        "midpoint"
-    )
-    use_compiler: Annotated[bool, OptionInfo("whether to compile the step where a C compiler is found")] = True
+    force_split: Annotated[ForceSplit, OptionInfo("split of a step's forces; left: Caldwell et al.")] = "symmetric"
+    constraint_force: Annotated[
+        ConstraintForcePlacement, OptionInfo("where grasp forces act; node: Caldwell et al.")
+    ] = "midpoint"
+    use_compiler: Annotated[bool, OptionInfo("whether to compile the step if there is a C compiler")] = True
 
     @property
     def time_step_or_default(self) -> float:
@@ -333,7 +324,7 @@ class DiagnosisSettings(Thresholds):
         float,
         Gt(0),
         Le(1),
-        OptionInfo("part of all stated std, torques' included, that is noise; the rest represents model error"),
+        OptionInfo("fraction of all stated standard deviations that is noise; the rest represents model error"),
     ] = 1.0
     baseline: Annotated[
         tuple[_FilePath, ...],
@@ -367,9 +358,7 @@ class _CompareSettings:
         Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
     ] = field(default_factory=_compared)
     time_budget: Annotated[
-        float | None,
-        Gt(0),
-        OptionInfo("time for all methods together, without the run of `solve`", "s"),
+        float | None, Gt(0), OptionInfo("total time for all methods, without the run of `solve`", "s")
     ] = 300.0
     reference_paper_experiment_name: Annotated[
         str | None, OptionInfo("experiment of Caldwell et al. (2014) whose result is shown for comparison")
@@ -380,16 +369,16 @@ class _CompareSettings:
 class _VirtualFramesSettings:
     """A MuJoCo experiment with a virtual depth camera, used if there are no recorded frames."""
 
-    seed: Annotated[int, Ge(0), OptionInfo("of motion, noise and camera")] = 0
-    duration: Annotated[float, Gt(0), Le(600), OptionInfo("of the experiment", "s")] = 5.0
+    seed: Annotated[int, Ge(0), OptionInfo("random seed of motion, noise and camera")] = 0
+    duration: Annotated[float, Gt(0), Le(600), OptionInfo("duration of the experiment", "s")] = 5.0
     max_gripper_travel: Annotated[
         float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
     ] = 0.11
     gripper_start_offsets: Annotated[
-        Mapping[str, _Vector3], OptionInfo("by grasp: its start relative to the end of the undeformed object", "m")
+        Mapping[str, _Vector3], OptionInfo("start relative to the end of the undeformed object, by grasp", "m")
     ] = field(default_factory=dict)
-    camera_position: Annotated[_Vector3, OptionInfo("the camera's pose", "m")] = (2.6, 0.0, 0.45)
-    camera_target: Annotated[_Vector3, OptionInfo("where it looks", "m")] = (0.85, 0.0, -0.1)
+    camera_position: Annotated[_Vector3, OptionInfo("position of the camera", "m")] = (2.6, 0.0, 0.45)
+    camera_target: Annotated[_Vector3, OptionInfo("point at which the camera looks", "m")] = (0.85, 0.0, -0.1)
     frame_rate: Annotated[float, Gt(0), Le(60), OptionInfo("mean rate of frames", "Hz")] = 3.0
     dropped_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
     latency: Annotated[float, OptionInfo("stamp minus time of the image", "s")] = 0.0
@@ -410,22 +399,18 @@ class _TrackSettings:
     frame_topic: Annotated[str | None, OptionInfo("topic of the clouds or depth images, if a bag has several")] = None
     camera_pose: Annotated[
         tuple[_Vector4, _Vector4, _Vector4, _Vector4] | None,
-        OptionInfo("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
+        OptionInfo("pose of the camera (x right, y down, z ahead) in the world, by rows; default: the folder's", "m"),
     ] = None
-    length_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("of the clouds, instead of the folder's")] = None
+    length_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("unit of the clouds; default: the folder's")] = None
     background_frames_path: Annotated[
         _FilePath | None,
-        OptionInfo(
-            "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
-        ),
+        OptionInfo("frames of the scene without robot and object from the same camera pose, whose points are removed"),
     ] = None
-    virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("virtual frames in place of recorded ones")] = (
+    virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("virtual frames, used without recorded frames")] = (
         _VirtualFramesSettings()
     )
-    write_virtual_frames: Annotated[
-        bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")
-    ] = False
-    n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("number of frames of which every stage is drawn")] = 2
+    write_virtual_frames: Annotated[bool, OptionInfo("whether virtual frames are written to the run folder")] = False
+    n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("number of frames with drawings of every stage")] = 2
     options: Annotated[TrackOptions, OptionInfo("filters, skeleton, fit, clock and acceptance of frames")] = field(
         default_factory=TrackOptions
     )
@@ -437,10 +422,7 @@ class _PlanSettings(PlanOptions):
 
     parameter_run: Annotated[
         _FilePath | None,
-        OptionInfo(
-            "run folder of `solve` with parameters and covariance, for information of `diagnose` as well; the initial "
-            "values when absent"
-        ),
+        OptionInfo("run folder of `solve` (or `diagnose`) with parameters and covariance; default: the initial values"),
     ] = None
 
 
@@ -448,13 +430,13 @@ class _PlanSettings(PlanOptions):
 class OutputSettings:
     """Settings of run folders, the report and the discretisation check."""
 
-    runs_folder: Annotated[_FilePath | None, OptionInfo("folder of run folders; `runs` in the working folder")] = None
+    runs_folder: Annotated[_FilePath | None, OptionInfo("folder of run folders; default: `runs`")] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
     checked_discretisations: Annotated[
         Literal["none", "time_step", "both"] | None,
         OptionInfo(
-            "what `solve` refines to test the estimates: nothing, the time step, or both step and links; when absent "
-            "both for an object of segments and the time step for any other"
+            "what `solve` refines to test the estimates: nothing, the time step, or time step and links; "
+            "default: both for an object of segments, the time step for others"
         ),
     ] = None
 
@@ -465,30 +447,30 @@ class RunSettings:
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
     plugins: Annotated[
-        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are run")
+        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are executed")
     ] = ()
-    model: Annotated[ModelSettings, OptionInfo("the kind of synthetic world")] = ModelSettings()
-    recordings: Annotated[RecordingsSettings, OptionInfo("the data")] = RecordingsSettings()
+    model: Annotated[ModelSettings, OptionInfo("the mechanical model")] = ModelSettings()
+    recordings: Annotated[RecordingsSettings, OptionInfo("recordings for estimation and test")] = RecordingsSettings()
     import_: Annotated[ImportSettings, OptionInfo("conversion of other tools' files to recordings")] = ImportSettings()
     sensors: Annotated[
         Mapping[str, SensorOptions],
-        OptionInfo("by group of the recordings: points, joints.effort, motors.current, wrist.force"),
+        OptionInfo("options by group of the recordings: points, joints.effort, motors.current, wrist.force"),
     ] = field(default_factory=dict)
-    parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
+    parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("parameters by name or pattern")] = field(
         default_factory=dict
     )
-    problem: Annotated[ProblemSettings, OptionInfo("residual of the estimation problem")] = ProblemSettings()
-    solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("how the cost is lowered")] = field(
-        default_factory=GaussNewton
+    problem: Annotated[ProblemSettings, OptionInfo("the estimation problem")] = ProblemSettings()
+    solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("method that minimises the cost")] = (
+        field(default_factory=GaussNewton)
     )
-    compare: Annotated[_CompareSettings, OptionInfo("which methods are compared")] = _CompareSettings()
-    diagnosis: Annotated[DiagnosisSettings, OptionInfo("how a gap is diagnosed")] = DiagnosisSettings()
-    track: Annotated[_TrackSettings, OptionInfo("tracking of a camera's frames")] = _TrackSettings()
-    plan: Annotated[_PlanSettings, OptionInfo("which motion is planned")] = _PlanSettings()
-    virtual_arm: Annotated[VirtualArmOptions, OptionInfo("what the virtual arms of `blind` are like")] = field(
+    compare: Annotated[_CompareSettings, OptionInfo("methods that `compare` runs")] = _CompareSettings()
+    diagnosis: Annotated[DiagnosisSettings, OptionInfo("candidates and thresholds of `diagnose`")] = DiagnosisSettings()
+    track: Annotated[_TrackSettings, OptionInfo("tracking of points in a camera's frames")] = _TrackSettings()
+    plan: Annotated[_PlanSettings, OptionInfo("the motion that `plan` computes")] = _PlanSettings()
+    virtual_arm: Annotated[VirtualArmOptions, OptionInfo("properties of the virtual arms of `blind`")] = field(
         default_factory=VirtualArmOptions
     )
-    output: Annotated[OutputSettings, OptionInfo("where results go")] = OutputSettings()
+    output: Annotated[OutputSettings, OptionInfo("run folders and reports")] = OutputSettings()
     name: str = "run"  # stem of the configuration file
     config_file: str = field(default="", compare=False)  # its path, empty for none
     # file and line of every key, for error messages

@@ -57,15 +57,15 @@ class SmootherThresholds:
     """Prior sizes of unknowns, and the log evidence that a group requires (5 means odds of 150 to 1)."""
 
     min_log_bayes_factor: Annotated[
-        float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
+        float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")
     ] = 5.0
-    max_unknown_groups: Annotated[int, Ge(1), OptionInfo("groups of unknowns taken in at most")] = 4
-    detectable_chi2: Annotated[float, Gt(0), OptionInfo("rise of r'r by which unknowns would be noticed")] = 10.0
-    force_prior_std: Annotated[float, Gt(0), OptionInfo("unknown force over the load that its place carries")] = 0.1
+    max_unknown_groups: Annotated[int, Ge(1), OptionInfo("largest number of selected groups of unknowns")] = 4
+    detectable_chi2: Annotated[float, Gt(0), OptionInfo("rise of r'r at which unknowns are detectable")] = 10.0
+    force_prior_std: Annotated[float, Gt(0), OptionInfo("unknown force relative to the load at its location")] = 0.1
     grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
-    bias_prior_std: Annotated[float, Gt(0), OptionInfo("unknown bias over the noise of its sensor")] = 3.0
+    bias_prior_std: Annotated[float, Gt(0), OptionInfo("unknown bias relative to the noise of its sensor")] = 3.0
     location_tie: Annotated[
-        float, Gt(0), Le(1), OptionInfo("part of a place's evidence at which another is named beside it")
+        float, Gt(0), Le(1), OptionInfo("share of a location's evidence at which an alternative is named")
     ] = 0.9
 
 

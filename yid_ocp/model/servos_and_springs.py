@@ -107,13 +107,13 @@ class MotorOptions:
     kind: Annotated[
         _MotorKind,
         OptionInfo(
-            "ideal: torque = clip(gain error - damping speed); dc: torque = clip(gain error) - damping speed, where "
-            "the clip is that of the duty and the damping is the motor's counter-voltage; gain is per unit of the "
-            "firmware's gain where recordings state it (`proportional_gain`)"
+            "ideal: torque = clip(gain error - damping speed); dc: torque = clip(gain error) - damping speed, with "
+            "the limit of the duty cycle and the back-EMF as damping; the gain is per unit of the firmware's gain if "
+            "recordings state it (`proportional_gain`)"
         ),
     ] = "ideal"
     preset: Annotated[
-        _MotorPreset | None, OptionInfo("motor whose published figures are starting values and priors; of kind dc")
+        _MotorPreset | None, OptionInfo("dc motor whose published data are initial values and priors")
     ] = None
 
     def __post_init__(self) -> None:
@@ -137,19 +137,19 @@ class PositionServoOptions:
 
     command_interpolation: Annotated[
         _CommandInterpolation,
-        OptionInfo("what a servo follows between two commands: the last one held, or straight lines"),
+        OptionInfo("input between two commands: the last command is held, or interpolation is linear"),
     ] = "held"
     has_gravity_compensation: Annotated[
-        bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
+        bool, OptionInfo("whether the controller compensates the robot's weight, so that the servos need not")
     ] = False
-    motor: Annotated[MotorOptions, OptionInfo("of every servo")] = MotorOptions()
+    motor: Annotated[MotorOptions, OptionInfo("motor of every servo")] = MotorOptions()
     extra_controller_terms: Annotated[
         tuple[_FirmwareTerm, ...],
         OptionInfo(
-            "further terms of the firmware, parameters that begin at zero: integral (JOINT.servo_integral: the error's "
-            "time integral in errors, from the start of the recording on), derivative (JOINT.servo_derivative: torque "
-            "against the rate within the limit of a dc motor's duty), dead_band (JOINT.servo_dead_band: errors up to "
-            "it are ignored)"
+            "further terms of the firmware, with parameters that start at zero: integral (JOINT.servo_integral: time "
+            "integral of the error from the start of the recording), derivative (JOINT.servo_derivative: torque "
+            "against the speed within the duty limit of a dc motor), dead_band (JOINT.servo_dead_band: smaller errors "
+            "are ignored)"
         ),
     ] = ()
 

@@ -33,9 +33,9 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 class MountSettings:
     """Mount of an object: the parent frame and the pose of the object's root in it."""
 
-    parent_frame: Annotated[str | None, OptionInfo("frame or clamp that carries it; the world when absent")] = None
-    xyz: Annotated[_Vector3, OptionInfo("position in that frame", "m")] = (0.0, 0.0, 0.0)
-    rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
+    parent_frame: Annotated[str | None, OptionInfo("frame or clamp of the root; default: the world")] = None
+    xyz: Annotated[_Vector3, OptionInfo("position in the parent frame", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in the parent frame", "rad")] = (0.0, 0.0, 0.0)
 
     @property
     def pose(self) -> Array:
@@ -193,7 +193,7 @@ class ObjectKind:
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
-    kind: Annotated[str, OptionInfo("what the object is")]
+    kind: Annotated[str, OptionInfo("kind of object")]
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Build the object's segments, parents first. Each link is divided into `link_division` links."""
@@ -259,9 +259,9 @@ class MountedObjectKind(ObjectKind):
     """Base class of objects mounted on a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[
-        float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
+        float, Ge(0), Le(1), OptionInfo("factor on the weight of the object, not on its inertia")
     ] = 1.0
-    mount: Annotated[MountSettings | None, OptionInfo("where its root sits; the world's origin when absent")] = None
+    mount: Annotated[MountSettings | None, OptionInfo("pose of the root; default: the world's origin")] = None
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         return flexible_object(self.build_segments(damping, link_division), gravity_fraction=self.gravity_fraction)

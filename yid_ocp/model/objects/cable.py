@@ -61,7 +61,9 @@ class CableBranchOptions:
     twist_rigidity: float = 1.0e-3
     bend_damping: float = 5e-5
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
-    linear_density: Annotated[float, Gt(0), OptionInfo("mass per length; results are per unit of it", "kg/m")] = 0.05
+    linear_density: Annotated[float, Gt(0), OptionInfo("mass per length; results are proportional to it", "kg/m")] = (
+        0.05
+    )
 
 
 @dataclass(frozen=True)
@@ -74,36 +76,34 @@ class CableOptions:
     speed/`start.speed_scale`)^2). Branches without an entry have the `default_branch`. `gravity` is in m/s^2.
     """
 
-    branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by name, parent and children")] = field(
-        default_factory=dict
+    branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by branch, parent and children")] = (
+        field(default_factory=dict)
     )
     default_branch: CableBranchOptions = field(default_factory=CableBranchOptions)
-    radius: Annotated[float, Gt(0), Le(1), OptionInfo("of the solid cylinders that give the links' inertia", "m")] = (
-        0.005
-    )
+    radius: Annotated[float, Gt(0), Le(1), OptionInfo("radius of the cylinders for the links' inertia", "m")] = 0.005
     end_clamp_grasp_kind: Annotated[
         Literal["axis", "weld"],
-        OptionInfo("whether the end clamp leaves the roll free or holds it at the parameter clamp_end.roll"),
+        OptionInfo("axis: the roll at the end clamp is free; weld: it is held at the parameter clamp_end.roll"),
     ] = "axis"
     rests_in_undeformed_shape: Annotated[
-        bool, OptionInfo("whether branches rest in their undeformed shape, or straight")
+        bool, OptionInfo("whether the rest shape of branches is the undeformed shape instead of straight")
     ] = True
     rigid_first_edge: Annotated[
         bool,
-        OptionInfo("whether the first edge is rigid up to its second point, so that half of the next one bends alone"),
+        OptionInfo("whether the first edge is rigid up to its second point, so that only half of the next edge bends"),
     ] = False
     has_edge_lengths_per_recording: Annotated[
-        bool, OptionInfo("whether every recording has edge lengths of its own; every edge then has a length parameter")
+        bool, OptionInfo("whether every recording has its own edge lengths; every edge then has a length parameter")
     ] = True
     shape_memory_fraction: Annotated[
         float | None,
         Ge(0),
         Le(1),
-        OptionInfo("how far the rest shape is that of the recording's start; none when absent"),
+        OptionInfo("fraction of the shape at the start of the recording in the rest shape; default: none"),
     ] = None
     has_rest_angle_parameters: Annotated[
         bool,
-        OptionInfo("whether every bend has a parameter JOINT.rest, its rest angle relative to the undeformed shape's"),
+        OptionInfo("whether every bend has a parameter JOINT.rest, its rest angle relative to the undeformed shape"),
     ] = False
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
@@ -303,13 +303,13 @@ model:
 """,
     }
 
-    kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
+    kind: Annotated[Literal["cable"], OptionInfo("kind of object")] = "cable"
     parent_branch_vertex_names: Annotated[
         tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")
     ]
     vertex_names_by_child_branch: Annotated[
         Mapping[str, tuple[str, ...]],
-        OptionInfo("points of every branch, the first one the parent's at which it leaves"),
+        OptionInfo("points of every child branch; the first one is the point of the parent at which it leaves"),
     ] = field(default_factory=dict)
     undeformed_shape_file: Annotated[
         str,

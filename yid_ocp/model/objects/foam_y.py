@@ -62,8 +62,8 @@ model:
 """,
     }
 
-    kind: Annotated[Literal["foam_y"], OptionInfo("what the object is")] = "foam_y"
-    links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
+    kind: Annotated[Literal["foam_y"], OptionInfo("kind of object")] = "foam_y"
+    links: Annotated[int, Ge(1), Le(64), OptionInfo("number of rigid links of every tube")] = 4
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Build the three tubes of the foam Y. Nominal joint stiffnesses are those for four links with any `links`."""

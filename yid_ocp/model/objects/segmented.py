@@ -30,28 +30,26 @@ class FlexibleSegmentSettings:
     )
     mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]
     radius: Annotated[
-        float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; or give a section", "m")
+        float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; alternative: cross_section_size", "m")
     ] = None
     cross_section_size: Annotated[
         tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
-        OptionInfo("extents of a rectangular cross section along the links' x and y axes", "m"),
+        OptionInfo("side lengths of a rectangular cross section along the links' x and y axes", "m"),
     ] = None
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 4
     link_lengths: Annotated[
-        tuple[Annotated[float, Gt(0)], ...] | None, OptionInfo("unequal links, base to tip", "m")
+        tuple[Annotated[float, Gt(0)], ...] | None, OptionInfo("lengths of unequal links, base to tip", "m")
     ] = None
-    parent: Annotated[str | None, OptionInfo("segment on which it grows; the mount when absent")] = None
+    parent: Annotated[str | None, OptionInfo("segment to which it is attached; default: the mount")] = None
     parent_link_index: Annotated[
-        int | None, Ge(0), OptionInfo("it leaves at the tip of this link of the parent; the last")
+        int | None, Ge(0), OptionInfo("link of the parent to whose tip it is attached; default: the last")
     ] = None
-    rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = _NO_TURN
+    rpy: Annotated[_Vector3, OptionInfo("rest rotation relative to the parent's link or mount", "rad")] = _NO_TURN
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
-    stiffness_given_as_rigidity: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
+    stiffness_given_as_rigidity: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
-    joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
-    has_link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = (
-        False
-    )
+    joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
+    has_link_length_parameters: Annotated[bool, OptionInfo("whether every link has its own length parameter")] = False
 
     def segment(self, name: str, damping: float, link_division: int) -> Segment:
         """Build the named `Segment`. Links are divided into `link_division` links at equal segment stiffness."""
@@ -199,9 +197,9 @@ stiffness_given_as_rigidity: true, clamped_at_base: true}
 """,
     }
 
-    kind: Annotated[Literal["segments"], OptionInfo("what the object is")] = "segments"
-    mount: Annotated[base.MountSettings, OptionInfo("where its root sits")] = field(default_factory=base.MountSettings)
-    segments: Annotated[Mapping[str, FlexibleSegmentSettings], OptionInfo("by name, parents first")] = field(
+    kind: Annotated[Literal["segments"], OptionInfo("kind of object")] = "segments"
+    mount: Annotated[base.MountSettings, OptionInfo("pose of the root")] = field(default_factory=base.MountSettings)
+    segments: Annotated[Mapping[str, FlexibleSegmentSettings], OptionInfo("segments by name, parents first")] = field(
         default_factory=dict
     )
 

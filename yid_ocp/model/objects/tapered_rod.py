@@ -51,13 +51,13 @@ parameters:
 """
     }
 
-    kind: Annotated[Literal["tapered_rod"], OptionInfo("what the object is")] = "tapered_rod"
-    length: Annotated[float, Gt(0), Le(50), OptionInfo("from base to tip", "m")]
-    mass: Annotated[float, Gt(0), OptionInfo("of the whole rod", "kg")]
+    kind: Annotated[Literal["tapered_rod"], OptionInfo("kind of object")] = "tapered_rod"
+    length: Annotated[float, Gt(0), Le(50), OptionInfo("length from base to tip", "m")]
+    mass: Annotated[float, Gt(0), OptionInfo("mass of the whole rod", "kg")]
     base_radius: Annotated[float, Gt(0), Le(5), OptionInfo("radius at the base", "m")]
     tip_radius: Annotated[float, Gt(0), Le(5), OptionInfo("radius at the tip", "m")]
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 8
-    joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
+    joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Build the rod as one segment with the radius of its base. `build` then tapers the links."""
