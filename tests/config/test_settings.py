@@ -17,7 +17,7 @@ from yid_ocp.model.objects.cable import Cable, CableOptions
 from yid_ocp.problem import ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton
 
-STEP_WORDS = "of the integrator; auto halves 20 ms until half of it hardly changes the first prediction"
+STEP_WORDS = "time step; auto halves 20 ms until halving it again hardly changes the prediction"
 
 
 @pytest.fixture(scope="module")

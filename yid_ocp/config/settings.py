@@ -298,7 +298,7 @@ class ProblemSettings(ProblemOptions):
 
     time_step: Annotated[
         Annotated[float, Gt(0), Le(0.1)] | Literal["auto"],
-        OptionInfo("time step; auto halves 20 ms until half of it hardly changes the initial prediction", "s"),
+        OptionInfo("time step; auto halves 20 ms until halving it again hardly changes the prediction", "s"),
     ] = 0.01
     force_split: Annotated[ForceSplit, OptionInfo("split of a step's forces; left: Caldwell et al.")] = "symmetric"
     constraint_force: Annotated[
