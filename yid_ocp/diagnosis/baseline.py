@@ -42,11 +42,11 @@ class _ParameterShift:
     unit: str
     baseline_value: float
     baseline_std: float
-    current_value: float  # by the baseline and the recordings together
+    current_value: float  # estimate from the baseline and the recordings together
     current_std: float
-    z_score: float | None  # standard deviations by which it moved; None where the recordings say nothing of it
-    p_value: float  # of so large a move where nothing changed
-    has_changed: bool  # at the level of the diagnosis, counting how many parameters were looked at
+    z_score: float | None  # shift in standard deviations; None if the recordings do not inform the parameter
+    p_value: float  # p-value of the shift if nothing changed
+    has_changed: bool  # significant at the diagnosis' level, Bonferroni-corrected for the parameters
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class EarlierRunsComparison:
     baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
     is_baseline_explained: bool  # whether the model explained their recordings
     baseline_effects: tuple[str, ...]  # labels of the effects that they had and that the model keeps
-    between_runs_chi2: float  # of the differences between several earlier runs; zero and one for one run
+    between_runs_chi2: float  # chi2 of the differences between earlier runs; zero, with p-value one, for one run
     between_runs_p_value: float
     parameter_shifts: tuple[_ParameterShift, ...]
 
@@ -101,7 +101,7 @@ class EarlierRunsBaseline:
 
     combined_estimates: RunEstimates | None  # all earlier runs together
     baseline_runs: tuple[str, ...]
-    between_runs_chi2: float  # of the differences between them
+    between_runs_chi2: float  # chi2 of the differences between the runs
     between_runs_p_value: float
     reference_recordings: tuple[Recording, ...]
 
@@ -125,7 +125,7 @@ class EarlierRunsBaseline:
         every = zip(baseline.parameter_names, baseline.values, baseline.std, strict=True)
         known_before, shifts = [entry for entry in every if entry[0] in weighted], []
         for name, value, std in known_before:
-            # in units of noise alone a problem's variances are smaller, all by one factor
+            # in units of noise alone, all variances of a problem are smaller by one factor
             now, c0 = fit.values[name], float(std) ** 2
             c = plain[name] * c0 / float(weighted[name])
             counted = max(1.0, fit.std[name] ** 2 / c) if c > 0 and math.isfinite(fit.std[name]) else 1.0
@@ -189,8 +189,8 @@ class _PredictionErrors:
 
     recordings: tuple[str, ...]
     without_diagnosis: _ChannelErrors
-    counterfactual: _ChannelErrors  # with the effects removed (or added)
-    failure_message: str = ""  # why there are none
+    counterfactual: _ChannelErrors  # prediction with the effects removed (or added)
+    failure_message: str = ""  # why there is no prediction
 
     @property
     def rmse_by_unit(self) -> dict[str, tuple[float, float]]:

@@ -36,7 +36,7 @@ from yid_ocp.virtual.injected import (
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
-_DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)  # of the detectable size
+_DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)  # multiples of the detectable size
 BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
     "null": 0.2,
     "single": 0.48,
@@ -57,8 +57,8 @@ class PlannedBlindCase:
 
     number: int
     experiment: str
-    category: str  # of `BLIND_CASE_CATEGORY_SHARES`
-    multiple: float | None  # of the detectable size; None where that has no meaning
+    category: str  # key of `BLIND_CASE_CATEGORY_SHARES`
+    multiple: float | None  # multiple of the detectable size; None if not applicable
     is_brisk: bool = False  # whether it moves with thrice the acceleration
 
 
@@ -88,7 +88,7 @@ def plan_blind_cases(
     # the experiment that is furthest behind its part gets the next case, so that every sort is spread over all
     given = dict.fromkeys(kept, 0)
     cases = []
-    slots.sort(key=lambda slot: slot[0] != "finer_chain")  # what few can do comes first; the rest makes up for it
+    slots.sort(key=lambda slot: slot[0] != "finer_chain")  # rare categories first; later cases balance the shares
     for i, slot in enumerate(slots):
         able = [name for name in kept if slot[0] != "finer_chain" or name in chains]
         name = max(able or kept, key=lambda entry: kept[entry] * (i + 1) - given[entry])
@@ -113,8 +113,8 @@ def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
 MAX_CASE_DRAWS = 64
 """Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""
 _STIFFNESS_SPREAD_FACTOR = 1.5  # factor by which true stiffnesses lie above or below the problem's start, at most
-_PRIOR_DEVIATIONS = (0.6, 1.0)  # of a parameter with a prior from its start, over the prior's standard deviation
-_BRISK_FREQUENCY_FACTOR = 1.41  # beside the second harmonic, which together triple the accelerations
+_PRIOR_DEVIATIONS = (0.6, 1.0)  # deviation of a parameter with a prior from its initial value, in stds of the prior
+_BRISK_FREQUENCY_FACTOR = 1.41  # together with the second harmonic, triples the accelerations
 _OUT_OF_LIBRARY_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "torque_ripple": ("joint", 0.5, 2.0, ""),
     "saturating_drive": ("joint", 0.75, 0.9, "torque"),
@@ -143,9 +143,9 @@ class CaseGroundTruth:
     case: str
     category: str  # null, single, pair, outside, left_out or finer_chain
     injected: tuple[InjectedEffect, ...]
-    multiple: float | None  # of the detectable size, as made; None where that has no meaning
+    multiple: float | None  # actual multiple of the detectable size; None if not applicable
     truth: Mapping[str, float]  # nominal parameters
-    experiment: str = ""  # in which it was made
+    experiment: str = ""  # experiment of the case
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the label to a JSON-compatible dictionary."""
@@ -185,14 +185,14 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
 class SyntheticMeasurementConditions:
     """Settings of an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
 
-    estimation_count: int = 1  # to estimate on; one more is held out
+    estimation_count: int = 1  # number of estimation recordings; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     simulation: SimulationOptions = field(default_factory=SimulationOptions)  # duration of each, and the engine's step
     has_camera: bool = False  # whether a camera sees the object
     # that the engine's solver holds at rest, and what is injected with it; None: smooth forces
     ordinary_friction: Sequence[InjectedEffect] | None = None
     is_brisk: bool = False
-    purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0]  # of `ALLOWED_ENSEMBLE_PURPOSES`
+    purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0]  # one of `ALLOWED_ENSEMBLE_PURPOSES`
 
 
 _Detectable = tuple[EffectBase, Mapping[str, float], Array]
@@ -298,7 +298,7 @@ class BlindCaseGenerator:
         effects = make_candidate_effects(problem.system, clean, self._candidates)
         composed = AllCandidatesProblem.from_problem(problem, effects, [other])
         nominal = fit_nominal_model(problem, composed, limits=self._limits)
-        # weighted by all noise, that of torques too
+        # whitened by all noise, including torque noise
         composed = replace(composed, problem=nominal.problem)
         return linearize_candidates(composed, (), nominal.values, self._limits.shape_grid_size)
 
@@ -481,7 +481,7 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
         for what in ("bend", "twist"):
             name = f"{segment.name}.{what}"
             if name in truth and start[name] > 0:
-                # the finer description says how a stiffness follows the links
+                # the finer system defines how a stiffness scales with the links
                 values[name] = truth[name] * finer_start[name] / start[name]
         for what in ("damping", "twist_damping"):
             name = f"{segment.name}.{what}"

@@ -55,7 +55,7 @@ class BlindCaseScore:
     answer: str
     multiple: float
     gap: bool  # whether a gap was reported
-    kind_first: bool  # the true kind at the true place is the first candidate
+    kind_first: bool  # whether the first candidate has the true kind at the true location
     kind_second: bool  # whether the true kind is among the first two candidates
     location_first: bool
     confusable: tuple[str, ...]  # set that was named as not separable
@@ -64,12 +64,12 @@ class BlindCaseScore:
     right: bool
     closure: float  # fraction of the held-out gap closed by the effects added
     best: float  # the same by a refit of the true effects
-    # relative error of every parameter of the true effect where it was added, and whether its 95 % interval has it
+    # per parameter of an accepted true effect: relative error, and whether the 95 % interval contains the truth
     errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
     seconds: float = math.nan
     experiment: str = ""
     z: Mapping[str, float] = field(default_factory=dict)  # (estimate - truth)/std of the same parameters
-    p_value: float = math.nan  # of the null test on the held-out recordings
+    p_value: float = math.nan  # p-value of the null test on the held-out recordings
 
     @property
     def _named_effect_labels(self) -> tuple[str, ...]:
@@ -370,7 +370,7 @@ def calibrate_thresholds(
     every = zip(labels, marks, answers, strict=True)
     known = ((label, mark, entry["result"].get("statistics"), entry.get("open") or {}) for label, mark, entry in every)
     cases = [(label.category, mark, said, wide) for label, mark, said, wide in known if said is not None]
-    # where thresholds were opened for a clean recording, but for one that cannot be diagnosed so
+    # clean recordings: statistics with permissive thresholds, or the original ones if that diagnosis failed
     clean = [wide if "p_value" in wide else said for category, _, said, wide in cases if category == "null"]
     single = [(mark, said) for category, mark, said, _ in cases if category == "single"]
     outside = [said for category, _, said, _ in cases if category in _OUT_OF_LIBRARY_CATEGORIES]
@@ -381,7 +381,7 @@ def calibrate_thresholds(
         if rule.of == "clean":
             sample = [rule.statistic(said, limits, "") for said in clean]
         value, attained = _conformal_quantile(sample, rule.side, coverage)
-        # what chance brings more of is what small values tell of
+        # for a lower bound from clean cases, small values indicate an effect
         sign = -1.0 if rule.of == "clean" and rule.side == "least" else 1.0
         sizes = sorted({m.multiple for m, _ in scored})
         beyond = {size: [sign * x > sign * value for m, x in scored if m.multiple == size] for size in sizes}
@@ -428,7 +428,7 @@ def _rounded(value: float, up: bool) -> float:
 # -- judged again -----------------------------------------------------------------------------------------------------
 
 _EVIDENCE_FORMAT = "yid-evidence/1"
-_MIN_RECORDED_OVERLAP = 0.5  # part of a signature from which it is kept that two candidates are alike
+_MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of two candidates is recorded
 
 
 def evidence_to_json(finding: DiagnosisResult) -> dict[str, Any]:

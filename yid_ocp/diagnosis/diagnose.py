@@ -144,11 +144,11 @@ class _Examined:
     search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefittedModel
     truncated: tuple[TruncatedHeldOutRecording, ...]
-    whole: EstimationProblem  # with all samples
+    whole: EstimationProblem  # the problem with all samples
     events: EventSet
-    smoothed: SmoothedUnknownsResult | None  # about the fit, on all recordings, where it was asked
+    smoothed: SmoothedUnknownsResult | None  # about the fit, on all recordings, if it was run
     evidence: NominalEvidence
-    stated_and_finer_time_step: tuple[float, float] | None = None  # where the stated one's error was part of the gap
+    stated_and_finer_time_step: tuple[float, float] | None = None  # if the error of the stated step was part of the gap
 
     @property
     def is_search_worthwhile(self) -> bool:
@@ -181,7 +181,7 @@ def _examined(
     if poor and not search.note_skip_past_deadline("the nominal model from other starts"):
         other = _better_nominal_fit(found.search, found.nominal)
         if other is not None:
-            # what the smoother says is about another fit
+            # the smoother's result belongs to another fit
             found = _tested(*_followed(found.search, other, found.truncated), found.whole, found.events, None)
     clock["other_starts"] = time.perf_counter()
     steps = search.problem.problem.step.time_step, found.nominal.problem.step.time_step
@@ -216,7 +216,7 @@ def _diagnosed(
     def locate() -> LocatedGap:
         nonlocal smoothed
         search.progress.begin_stage("locating the gap", 1.0, 8.5)
-        # where nothing happened it was run on all that was fitted already
+        # without events, the smoother already ran on all fitted data
         known = None if search.problem.is_split_in_blocks else seen.smoothed
         smoothed = _smooth_about_model(nominal, limits) if known is None else known
         by_chance = smoothed.dof_before - smoothed.dof_after
@@ -240,7 +240,7 @@ def _diagnosed(
         remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
     law = _law(problem, seen, judged.verdict, final, rest)
     finished("law")
-    # what a better model explains was no event
+    # a disturbance that a better model explains was no event
     events = _happened(seen.whole, final, limits)[0] if accepted else seen.events
     finished("remaining")
     finding = DiagnosisResult(
@@ -382,7 +382,7 @@ def _without_events(
         if again is None:
             break
         search, nominal, before = cleaned, again, events
-        # what the smoother says is of all recordings, events not taken out
+        # the smoother's result includes the events
         events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
         if events.has_same_disturbances(before):
             break
@@ -536,7 +536,7 @@ def fit_nominal_model(
             begun = composed.about_input_errors(found.problem)
     fit = _settled(RefitContext(begun, limits, NULL_PROGRESS, store), start, "")
     if fit is None and start:
-        # a gap may drive parameters so far that the equilibrium which the solver followed is not found again from there
+        # a gap may move parameters so far that the solver's equilibrium is not found again from there
         fit = _settled(RefitContext(composed, limits, NULL_PROGRESS, store), {}, "the nominal model from its start")
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")

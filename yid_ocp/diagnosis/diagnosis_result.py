@@ -76,7 +76,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     """
 
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
-    smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None where there is no gap to locate
+    smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None if there is no gap to locate
     gap_locations: tuple[GapLocation, ...]
     nominal_model: RefittedModel
     remaining_test: NullTestResult  # held-out, with the effects added
@@ -95,11 +95,11 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     located_gap: LocatedGap | None = None
     record: SearchRecord = field(default_factory=SearchRecord)
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
-    untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
-    search_seconds: float = 0.0  # from the start to the end of the search for effects
-    # time steps as given, and as used where the error of the given one was part of the gap [s]
+    untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first; empty if all were done
+    search_seconds: float = 0.0  # duration until the end of the search for effects
+    # stated time step, and the step used if the error of the stated one was part of the gap [s]
     stated_and_finer_time_step: tuple[float, float] | None = None
-    law: GapLaw | None = None  # of the gap, or of what the effects leave, where something unnamed closes it
+    law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprLineAndTableRows:
         effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction

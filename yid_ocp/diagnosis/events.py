@@ -48,14 +48,14 @@ from yid_ocp.sensors.joints import quantization_step
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of that."""
 
-_FORCE_INTERVAL = 0.05  # time over which an unknown force is constant where events are sought [s]
+_FORCE_INTERVAL = 0.05  # interval of constant unknown force in the search for events [s]
 _MAX_SPAN_POINTS = 250  # maximum number of points of a force history processed together
 _MAX_WRONG_SAMPLES = 3  # wrong samples in a row; more of them are a gap or a stuck channel
-_STENCIL_STEPS = (4, 7, 10)  # distances of the samples through which a smooth course is laid beside a wrong one
+_STENCIL_STEPS = (4, 7, 10)  # distances of the samples through which a smooth curve is fitted around a wrong sample
 _NEIGHBOUR_COUNT = 20  # samples on either side with which one is compared
 _MIN_NEIGHBOUR_RATIO = 3.0  # times the largest deviation among its neighbours by which a wrong sample stands out
-_MIN_RECURRENCE_OVERLAP = 0.5  # part of the longer of two windows by which they overlap where they are the same time
-_MAX_RECURRING_FRACTION = 0.5  # part of all forces that recur from which those that do are the motion's own
+_MIN_RECURRENCE_OVERLAP = 0.5  # of the longer of two windows; overlap from which they are the same time
+_MAX_RECURRING_FRACTION = 0.5  # of all forces; fraction of recurring forces from which these belong to the motion
 _WRONG_SAMPLE_Z = 8.0  # standard deviations of noise, and robust ones of its neighbours, by which it does
 
 
@@ -197,7 +197,7 @@ def _allowed(
     episode, result, theta = run
     terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
     joints = episode.recording.joints
-    # a torque is known at no better time than that of a sample
+    # the time of a torque is known to one sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
     error = np.hypot(limits.inverse_dynamics_rtol * terms.rss_torque, late * terms.torque_rate)
     return error, terms.static_friction_limit
@@ -217,7 +217,7 @@ def _read_forces(
         weight = np.where(samples.positive_weight_mask, samples.weight, 0.0) / unit_effort
         value = np.where(samples.positive_weight_mask, predicted - samples.value, 0.0) * unit_effort
         times = times_since_recording_start(episode, samples)
-        # what lies closer together than an interval counts together
+        # values closer together than an interval are averaged
         bins = np.unique(np.floor((times - times[0]) / _FORCE_INTERVAL + 1e-6), return_inverse=True)[1]
         together = np.zeros((int(bins.max()) + 1, len(times)))
         together[bins, np.arange(len(times))] = 1.0
@@ -259,7 +259,7 @@ def _driving_forces(
                 continue
             middle = (model.interval_edges[:-1] + model.interval_edges[1:]) / 2
             error, held = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
-            # the last interval is shorter than the others
+            # the last interval is shorter
             full = slice(0, max(len(middle) - 1, 1))
             for name in sought[model.recording]:
                 index, at = model.unknown_names.index(name), problem.system.mechanism.joint_index(name)
@@ -352,7 +352,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
     if given is not None:
         std = float(expand_to_joint_values(given, joints.names, (joint,), f"sensors.{group}.std")[0])
     if quantity == "effort" and joint in system.prescribed and math.isfinite(options.path_cutoff):
-        # of one sample that much is left: its share of the filter's time
+        # smoothing reduces the noise of one sample by its share of the filter's time
         share = 2 * options.path_cutoff * float(np.median(np.diff(joints.t)))
         std /= min(math.sqrt(share), 1.0)
     return std

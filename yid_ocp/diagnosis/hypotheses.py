@@ -106,7 +106,7 @@ class TruncatedHeldOutRecording:
     """A held-out recording truncated where the nominal model stops following it: name and durations."""
 
     recording: str
-    kept_duration: float  # how much of it is compared [s]; 0 where nothing is
+    kept_duration: float  # compared duration [s]; 0 if nothing is compared
     full_duration: float  # [s]
 
 
@@ -117,11 +117,11 @@ class AllCandidatesProblem:
     Sensors, statics and corrections are compiled once with all derivatives, and recordings are placed on the nodes
     once. The tracking filter is computed at the nominal initial values, the same for every hypothesis."""
 
-    # of the system with all candidates at their neutral values; frees the nominal parameters
+    # system with all candidates at their neutral values, and free nominal parameters
     problem: EstimationProblem
-    candidate_effects: tuple[EffectBase, ...]  # those that are tried: neutral in the nominal model and not left out
+    candidate_effects: tuple[EffectBase, ...]  # candidates to try: neutral in the nominal model and not excluded
     is_split_in_blocks: bool  # whether a single recording is both estimated on and held out, in alternate blocks
-    # functions of the nominal system with the effects of one place alone, for a time step [s]
+    # functions of the nominal system with the effects of one location, by time step [s]
     functions_of_place: CasadiLockedCache[tuple[str, float], ModelFunctions] | None = None
 
     @staticmethod
@@ -161,7 +161,7 @@ class AllCandidatesProblem:
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
         """Problem whitened by sensor and torque noise, with filters linearised at `values`."""
-        # what is frozen is about the torques that are estimated there, for which they must be known beforehand
+        # filters are linearised about the estimated torques, so these must be known first
         x, errors = self.problem.vector(values), (episode.input_errors for episode in self.problem.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
         made = problem_whitened_at(self.problem, x, rounds=1 if known else 2)

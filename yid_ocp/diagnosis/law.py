@@ -37,12 +37,12 @@ from yid_ocp.problem.options import MultivariateGaussianPrior
 _N_KNOTS = 12
 _MAX_PLACES = 3  # places of the gap at which a law is sought
 _MAX_REFITS = 5  # the torque over time included
-_ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # of the curvature, among which the evidence chooses
-_RIDGE_STD_RATIO = 3.0  # standard deviation of a value at a knot, beside its curvature, over the torques there
-_MIN_KNOT_RANGE = 1e-3  # over which knots are spread where hardly anything is visited [unit of the quantity]
-_EVEN_STD_RATIO = 1 / 300  # of a drive's even part, f(x) + f(-x), over the prior's width: it has no favourite direction
-_MIN_VISITED_PART = 0.7  # of the knots' range that a fitted law must visit for its knots to stay
-_MIN_LEFTOVER_CLOSURE = 0.2  # part of the residual gap that a law beside effects must close to be reported
+_ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # curvature weights; the evidence chooses among them
+_RIDGE_STD_RATIO = 3.0  # std of a value at a knot, apart from its curvature, over the torques there
+_MIN_KNOT_RANGE = 1e-3  # smallest range of knots if hardly any range is visited [unit of the quantity]
+_EVEN_STD_RATIO = 1 / 300  # std of a drive's even part, f(x) + f(-x), over the prior's width: drives are nearly odd
+_MIN_VISITED_PART = 0.7  # fraction of the knots' range that a fitted law must visit to keep its knots
+_MIN_LEFTOVER_CLOSURE = 0.2  # fraction of the residual gap that a law must close in addition to effects
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ class GapLaw:
 
     location: str
     tables: tuple[LawTable, ...]  # one for every quantity that it depends on
-    visited_range: Mapping[str, tuple[float, float]]  # of every quantity, in the recordings to estimate on
-    closure: GapClosure  # of the held-out gap that the model without it leaves
+    visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
+    closure: GapClosure  # closure of the held-out gap of the model without the law
     runner_up: tuple[str, str, float] | None  # location, quantities and closure of the next best
     model: RefittedModel
-    has_accepted_effects: bool  # whether it stands beside effects that a diagnosis names
+    has_accepted_effects: bool  # whether the model also has accepted effects
 
     @property
     def depends_on(self) -> str:
@@ -110,8 +110,8 @@ class _Family:
 
     law: Law  # restricted to the quantities
     log_evidence: float
-    values: dict[str, float]  # at the knots, of the linearised fit
-    precision: Array  # of the prior of the values at the knots, in the order of the law's parameters
+    values: dict[str, float]  # values of the linearised fit at the knots
+    precision: Array  # inverse prior covariance of these values, in the order of the law's parameters
 
 
 def find_gap_law(
@@ -136,7 +136,7 @@ def find_gap_law(
     if not places or search.note_skip_past_deadline("a law"):
         return None
     search.progress.begin_stage(f"estimating a law at {' or '.join(places)}", 3.0, 2.5)
-    # a torque over time would predict the blocks between those that it was fitted to
+    # a torque over time would interpolate the held-out blocks
     left_out = ("time",) if search.problem.is_split_in_blocks else ()
     laws = []
     for place in places:
@@ -146,7 +146,7 @@ def find_gap_law(
     if before is None or not found:
         return None
     found.sort(key=lambda entry: entry.loss.chi2_per_sample)
-    # of two quantities where one alone does as well, one is enough
+    # if one quantity predicts as well as two, one is used
     slack = search.thresholds.min_gap_closed * before.held_out_loss.excess_chi2_per_sample
     found = sorted(found, key=lambda entry: not _is_simplest_of_the_best(entry, found, slack))
     best, *others = found
@@ -154,7 +154,7 @@ def find_gap_law(
     if others:
         rival, closed = others[0].law, held_out_gap_closure(before.held_out_loss, others[0].loss, search.thresholds)
         runner_up = (rival.location, "+".join(rival.quantities), closed.fraction)
-    # the model without the law may move far from where the robot was: knots are placed anew where it visits less
+    # the model without the law may move far beyond the recorded range: new knots for the visited range
     if any(_is_much_narrower(best, quantity) for quantity in best.law.quantities):
         finer = _neutral_law(best.fit, best.law.location, best.law.quantities, last.problem.system)
         again, better = _refitted_families(search, problem, last, [finer], events, best.law.quantities)

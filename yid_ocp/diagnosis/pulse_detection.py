@@ -42,8 +42,8 @@ class _TorqueTermSizes:
     # root sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal forces,
     # gravity, springs, friction, effects' forces and the applied or required torque [N m or N]
     rss_torque: Array
-    torque_rate: Array  # of the torque needed [N m/s or N/s]
-    static_friction_limit: Array  # what friction may hold at rest, gone above `_STANDSTILL_SPEED` [N m or N]
+    torque_rate: Array  # rate of the required torque [N m/s or N/s]
+    static_friction_limit: Array  # limit of static friction, zero above `_STANDSTILL_SPEED` [N m or N]
 
 
 class InverseDynamicsModel:
@@ -114,7 +114,7 @@ _MODEL_ERROR_TIME, _SLOW_FORCE_TIME = 0.3, 2.0
 _MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS = (1.0, 2.0, 4.0), (0.0, 0.5, 1.0), (0.25, 1.0)
 """c, w in units of the robust spread of the history, s in units of its root mean square."""
 _MIN_PULSE_POINTS = 2.5  # points that the shortest pulse covers
-_WINDOW_GROWTH = 1.25  # from one length of a window to the next
+_WINDOW_GROWTH = 1.25  # ratio of successive window lengths
 _FLAT_RAMP_FRACTION = 0.5  # part of a flat pulse in which it rises and falls
 _MAX_PROFILES = 12  # pulses and what is like them in one history
 MAX_EVENT_TIME_FRACTION = 1 / 3
@@ -136,7 +136,7 @@ class ForceEstimate:
     information: Array  # shape (M, M): L
     model_error_std: Array  # shape (M,): m, in `unit`
     friction_limit: Array  # shape (M,): h, in `unit`
-    # of the filter through which a force at these points is seen [Hz]; infinite for none
+    # cutoff of the filter applied to the force [Hz]; infinite for none
     filter_cutoff: float = math.inf
 
     @property
@@ -354,7 +354,7 @@ def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, f
     begins = [np.arange(first + spacing, last - spacing - length + 1e-9, spacing) for length in lengths]
     begin = np.concatenate(begins)
     windows = _both_shapes(begin, begin + np.repeat(lengths, [len(b) for b in begins]))
-    # windows of nearly the same length tell the same: those within a factor of two count as one
+    # windows of similar length are not independent: lengths within a factor of two count as one
     tries = math.log2(_WINDOW_GROWTH) * sum((last - first) / length for length in lengths if length <= last - first)
     return windows, tries, _Filter.of(cutoff).of_many(windows, t)
 
@@ -413,7 +413,7 @@ def _stands_out(
     """Whether a pulse is short enough, larger than the rest of the history, and measured."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, own = end - begin, seen(window, t)
-    # at either bound its length is not found but cut off: jumps of friction are shorter, errors of the model longer
+    # a length at either bound is cut off: friction jumps are shorter, model errors longer
     if not 1.02 * _MIN_PULSE_POINTS * history.time_spacing < length < 0.98 * longest:
         return False
     size = abs(float(rest.sizes(own)[0]))
@@ -439,7 +439,7 @@ def _sized(
         at = int(np.argmin(np.sum((taken - seen(window, history.t)) ** 2, axis=0)))
         std, p_value = math.sqrt(max(float(spread[at, at]), 0.0)), math.erfc(math.sqrt(max(rise, 0.0)))
         begin, end, flat = float(window.begin[0]), float(window.end[0]), bool(window.flat[0])
-        # friction can change by twice what it slides with wherever the joint stands still, whatever moves it
+        # at standstill, friction can change by twice its sliding torque
         stuck = np.max(history.friction_limit[(history.t >= begin) & (history.t <= end)], initial=0.0)
         if abs(float(size[at])) > 2 * float(stuck):
             result.append(DetectedForcePulse(begin, end, float(size[at]), flat, std, p_value))

@@ -43,7 +43,7 @@ REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_toleranc
 """A refit starts near its end and must be good to a small part of its std only."""
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # times the prior range that a std may be: beyond it the parameter is not known at all
-_HALF_DONE_FRACTION = 0.2  # of the excess, explained by a refit that leaves more than noise and is tried again
+_HALF_DONE_FRACTION = 0.2  # explained fraction of the excess from which a refit that leaves more than noise is repeated
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -51,10 +51,10 @@ _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effe
 class HeldOutLoss:
     """Whitened squared prediction errors of a model in nb time blocks of the held-out recordings, (nb,)."""
 
-    block_chi2: Array  # sums of whitened squares; infinite where a rollout failed
+    block_chi2: Array  # sums of whitened squares; infinite if a rollout failed
     block_sample_counts: Array
     channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
-    # squares by which the parameters contradict a baseline; other recordings say that, whatever blocks are drawn
+    # chi2 of the deviation from a baseline, which does not depend on the resampled blocks
     baseline_chi2: float = 0.0
 
     @property
@@ -77,9 +77,9 @@ class HeldOutLoss:
 class StoredFit:
     """Stored values and standard deviations of a refit. One evaluation restores a `RefittedModel` from them."""
 
-    values: dict[str, float]  # of every unknown
-    std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing
-    p_values: dict[str, float]  # by effect: that its amplitudes are as far from neutral by chance, with its shapes held
+    values: dict[str, float]  # values of all unknowns
+    std: dict[str, float]  # inflated by the misfit as in `solve`; infinite if not informed by the data
+    p_values: dict[str, float]  # by effect: p-value of its amplitudes, at fixed shape parameters
     solver_message: str  # why the solver ended
 
 
@@ -90,7 +90,7 @@ class RefitStatistics(StoredFit):
     effects: tuple[EffectBase, ...]
     cost: float
     held_out_loss: HeldOutLoss
-    residual_count: int  # of the recordings to estimate on, priors among them
+    residual_count: int  # number of residuals of the estimation recordings, priors included
     has_process_noise: bool  # whether errors of torques drive the motion
 
     @property
@@ -107,7 +107,7 @@ class RefitStatistics(StoredFit):
 class RefittedModel(RefitStatistics):
     """The nominal model with some effects after a refit, as a problem with its evaluation."""
 
-    problem: EstimationProblem  # of the composed system, with the nominal parameters and those of the effects free
+    problem: EstimationProblem  # composed system; free nominal parameters and parameters of the effects
     evaluation: Evaluation
     is_from_store: bool = False
 
@@ -127,16 +127,16 @@ class NominalSolutionAndRefitStore:
     """Solution of the nominal problem and refits of an interrupted run, known before a diagnosis."""
 
     solution: Solution | None = None
-    store: RefitStore | None = None  # told of every further refit
+    store: RefitStore | None = None  # receives every new refit
 
 
 @dataclass(frozen=True)
 class SearchRecord:
     """Record of all results that a search for effects requested, by name. Other rules can reuse it without refits."""
 
-    refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None where there is no fit
-    screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # beside effects that were added
-    pairs: dict[str, tuple[CandidatePair, ...]] = field(default_factory=dict)  # by the effect that is not among them
+    refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
+    screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # by name; next to effects in the model
+    pairs: dict[str, tuple[CandidatePair, ...]] = field(default_factory=dict)  # by the label of the excluded effect
 
 
 class UnrecordedRefitError(LookupError):
@@ -155,7 +155,7 @@ class RefitContext:
     progress: Progress
     store: RefitStore | None = None
     deadline: float = math.inf  # value of `time.perf_counter` after which nothing more is tried [s]
-    skipped: list[str] = field(default_factory=list)  # what was not tried, of all copies of this context
+    skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
     record: SearchRecord = field(default_factory=SearchRecord)  # likewise
     is_finished: bool = False
@@ -186,7 +186,7 @@ class RefitContext:
         problem = self.problem.problem
         turned = replace(self.problem, problem=problem.with_episodes(problem.held_out, problem.episodes))
         turned = turned.whitened_at(fit.values) if problem.has_process_noise else turned
-        # what both sets of recordings have in common, nothing of single recordings' starts
+        # parameters shared by both sets of recordings, without initial states
         names = {*turned.nominal_free_parameters, *(n for effect in fit.effects for n in effect.parameters.names)}
         start = {name: value for name, value in fit.values.items() if name in names}
         return refit_with_effects(turned, fit.effects, start, self.store, name, self.thresholds)
@@ -253,14 +253,14 @@ def refit_with_effects(
         return known
     best = _attempt(problem, effects, start)
     if best is not None and _half_done(problem, effects, start, best.finish, limits):
-        # the nominal fit may have driven its parameters to where this model cannot come back from
+        # the nominal fit may have moved its parameters to a point from which this model does not return
         fresh = {
             key: value
             for key, value in start.items()
             if key.split("[")[0] not in problem.nominal_free_parameters and not key.startswith("start.")
         }
         best = _cheaper(best, _attempt(problem, effects, fresh) if len(fresh) < len(start) else None)
-    # those before it were found from both already
+    # earlier effects were already tried from both starts
     for effect in effects[-1:]:
         moved = effect.alternative_start(start)
         if moved is None or (best is not None and _leaves_noise(best.finish, limits)):
@@ -360,13 +360,13 @@ def _attempt(
         if outcome.status != Status.FAILED:
             break
     found = _seen(problem, effects, outcome)
-    # without effects all weights are frozen anew where it ends
+    # without effects, all filters are fixed anew at the end of the run
     if found is None or not effects:
         return found
     filters = problem.problem.whitening_filters, found.problem.whitening_filters
     if torque_bias_change_in_stds(*filters) < _RELINEARIZE_Z:
         return found
-    # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
+    # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
     outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _relinearizing(found.problem))
     return found if outcome.status == Status.FAILED else _cheaper(found, _seen(problem, effects, outcome))
 
@@ -440,7 +440,7 @@ def refit_with_each_effect(
         return []
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
     noun, head = "effects" if len(tried[0][0]) == 1 else "pairs", ("effects", "held-out chi2/n")
-    # one effect is often enough; where it is not, pairs, more effects and others in their places follow
+    # one effect is often enough; otherwise pairs, more effects and replacements follow
     ahead = 11.0 if noun == "pairs" else {0: 8.0, 1: 14.0}.get(len(base), 9.0)
     search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}", 2 + 0.5 * len(tried), ahead)
     parts = PartsDoneCounter(search.progress, len(tried), join_effect_labels(tried[0][0]))
@@ -460,7 +460,7 @@ def refit_with_each_effect(
     fits: list[RefitStatistics | None] = []
     rest, begun = list(tried), time.perf_counter()
     while rest and not search.note_skip_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
-        # a batch costs less than its refits one by one; within a limit, so many as will end before it, best first
+        # a batch is cheaper than single refits; with a deadline, only as many as fit, best first
         count, now = len(rest), time.perf_counter()
         if search.deadline < math.inf:
             count = int((search.deadline - now) * len(fits) / max(now - begun, 1e-9)) if fits else 1
@@ -497,7 +497,7 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
         squares.append(total[count > 0])
         counts.append(count[count > 0])
     if problem.has_process_noise:
-        # in metres and radians a prediction has its torques as they were recorded, less their offsets
+        # errors in metres and radians are those of predictions from recorded torques minus offsets
         found = problem_whitened_by_sensor_noise(problem).predict_held_out(x)
     channels, contradiction = held_out_channel_errors(found), _contradiction(problem, x)
     return HeldOutLoss(np.concatenate(squares), np.concatenate(counts), channels, contradiction)

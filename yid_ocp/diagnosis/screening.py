@@ -53,7 +53,7 @@ class DetectableAmplitudes:
     """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
 
     effect: EffectBase
-    detectable_amplitudes: dict[str, float]  # in the parameter's unit
+    detectable_amplitudes: dict[str, float]  # amplitudes in the parameter's unit
     is_detectable: bool  # whether one of them lies within the prior range
 
 

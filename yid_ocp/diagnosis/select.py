@@ -41,8 +41,8 @@ class SelectedEffect:
     """An effect added by forward selection: its refitted model, cumulative closure and equivalent effects."""
 
     effect: EffectBase
-    refitted_model: RefitStatistics  # with all effects up to this one
-    cumulative_closure: GapClosure  # of the whole gap by all effects up to this one
+    refitted_model: RefitStatistics  # refit with all effects up to this one
+    cumulative_closure: GapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # effects that the data cannot tell from this one, the chosen one first
 
 
@@ -189,7 +189,7 @@ def _refit_shortlist(
     extra = [s for s in ranked if s.effect.label in names and s not in best]
     extra = sorted(extra, key=lambda s: -s.predicted_chi2_decrease)[: limits.n_refit_per_round]
     surest = sorted(ranked, key=lambda s: (s.p_value, -s.lm_statistic))[: limits.n_refit_lowest_p]
-    # where the gap lay before anything was added asks for no more than the significant afterwards
+    # after the first effect, only significant candidates at the gap's locations are added
     there = [[s for s in (ranked if base else scores) if s.effect.location == place][:1] for place in places]
     chosen = {s.effect.label: s for s in (*best, *extra, *surest, *(s for own in there for s in own))}
     return [((s.effect,), s.predicted_values) for s in chosen.values()]
@@ -253,14 +253,14 @@ def select_effects(
                 search, (), _pairs_to_refit(search, alone, base[0]), nominal.values, "together"
             )
             fits += [fit for fit in pairs if _is_plausible(fit.effects[0], fit, limits)]
-        # of an unlikely size it would mend what those before it do wrong
+        # an effect of implausible size would correct errors of earlier effects
         fits = [fit for fit in fits if not base or _has_plausible_size(fit.effects[-1], fit, limits)]
         near = _near_best_models(fits, limits) if fits else []
         first = first or [*near[:1], *sorted((fit for fit in fits if fit is not near[0]), key=_chi2)]
         better = next((fit for fit in near if _is_needed(current, fit, fit.effects[-1], limits)), None)
         if better is None:
             break
-        # what looks alike and was not tried cannot be told from it yet
+        # untried confusable candidates cannot be excluded yet
         alike = screened.confusability.confusable_with(better.effects[-1].label, limits.signature_overlap)
         untried = [own[0] for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
         before = current
@@ -270,7 +270,7 @@ def select_effects(
         search.progress.begin_stage(f"explained by {join_effect_labels(better.effects)}{said}")
     chosen = _reconsidered(search, chosen, before)
     if len(chosen.fit.effects) == 1:
-        # it may have ended elsewhere than where it was tried first
+        # its last fit may differ from its first one
         first = [chosen.fit, *(fit for fit in first if fit.effects != chosen.fit.effects)]
     return tuple(first), _with_closures(search, nominal, chosen, first)
 
@@ -280,7 +280,7 @@ class _Choice:
     """The effects in the model, refitted together, and the equivalent effects of each."""
 
     fit: RefitStatistics
-    rivals: Mapping[str, tuple[EffectBase, ...]] = field(default_factory=dict)  # by label, the effect itself first
+    rivals: Mapping[str, tuple[EffectBase, ...]] = field(default_factory=dict)  # by label, itself first
 
     def replaced(self, fit: RefitStatistics, near: Sequence[EffectBase], untried: Sequence[EffectBase] = ()) -> _Choice:
         """The choice with other effects; the last has the rivals `near`, and effects that stay keep theirs."""

@@ -63,7 +63,7 @@ class LocatedGap:
     """Location of the nominal model's gap, as found by the smoother."""
 
     locations: tuple[GapLocation, ...]
-    chi2_decrease: float  # by unknown forces, offsets and biases, beyond what chance takes
+    chi2_decrease: float  # decrease by unknown forces, offsets and biases, beyond chance
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class NominalEvidence:
     """Evidence for a gap before the search for effects."""
 
     nominal_model: RefitStatistics
-    nominal_test: NullTestResult  # on the recordings to estimate on
+    nominal_test: NullTestResult  # test on the estimation recordings
     nominal_held_out_test: NullTestResult
     screening: ScreeningResult
     are_offsets_stated: bool  # whether the size of torque offsets or of constant sensor errors is
@@ -102,10 +102,10 @@ class Judgement:
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
     unknown_reason: UnknownVerdictReason
-    single_effect_models: tuple[RefitStatistics, ...]  # of the first round, best first
+    single_effect_models: tuple[RefitStatistics, ...]  # refits of the first round, best first
     selected_effects: tuple[SelectedEffect, ...]
     gap_closure: GapClosure
-    explained_fraction: float  # what the effects explain over what the smoother explains
+    explained_fraction: float  # decrease of r'r by the effects over that by the smoother
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
 
     @property
@@ -186,7 +186,7 @@ def judge(
     from a record. `finished` is called with the name of each stage."""
     limits, nominal = search.thresholds, seen.nominal_model
     has_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
-    # what parameters explain by moving is no gap, unless an effect explains it
+    # a gap closed by shifted parameters counts only if an effect explains it
     moved = seen.has_left_baseline and not has_gap
     located = locate() if enough and (has_gap or moved) else None
     finished("localisation")
@@ -262,7 +262,7 @@ def _compare(
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
         apart, spread = entry.estimate_difference_and_std
-        # what has no standard deviation says nothing against it
+        # an unknown standard deviation is no evidence against transfer
         sure = math.isfinite(spread) and apart > limits.transfer_z_max * spread
         found.append(replace(entry, is_consistent=not sure or apart <= limits.transfer_rtol * size * width[name]))
     return found

@@ -116,7 +116,7 @@ def run_batch(
     for member in members:
         try:
             run = load_config(member.config_file, member.overrides)
-            # what it depends on beside its settings; their content counts, wherever they stand
+            # input files beside the settings; their content counts, not their path
             inputs = [
                 Path(path) for path in sorted({str(path.absolute()) for path in input_files_by_name(run).values()})
             ]

@@ -41,7 +41,7 @@ from yid_ocp.workflow.run_inputs import read_recordings_of_role
 _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
 """Standard deviations of the torques' white noise and constant offsets where an experiment has any [N m]."""
-_SIGN_SMOOTHING_SPEED = 0.005  # of the nominal friction; with 0.02 arms creep by mm before they break loose [rad/s]
+_SIGN_SMOOTHING_SPEED = 0.005  # of the nominal friction; with 0.02, arms creep by mm before they break loose [rad/s]
 _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": {"closure": None}}
 log = logging.getLogger(__name__)
 
@@ -330,10 +330,10 @@ class _ExperimentVariation:
     n_recordings: int = 1
     is_without_object: bool = False
     has_prescribed_arms: bool = False
-    friction: FrictionLawName = "coulomb"  # where the settings vary the law
+    friction: FrictionLawName = "coulomb"  # if the settings vary the law
 
     def simulation_overrides(self, arm: VirtualArmOptions) -> tuple[str, ...]:
-        # what is said of the object and of what sees it means nothing without it
+        # settings of the object and its sensors do not apply without it
         bare = ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
         own = (f"model.arms.link_mass_std={arm.link_mass_deviation}", *(bare if self.is_without_object else ()))
         return own if arm.friction == "none" else (*own, "model.friction=null")
@@ -342,7 +342,7 @@ class _ExperimentVariation:
         own = [text for text in self.simulation_overrides(arm) if text != "model.friction=null"]
         if arm.friction != "none":
             law = self.friction if arm.friction == "varied" else arm.friction
-            # as these joints stand still at the start, and again at every turn
+            # because these joints stand still at the start and at every reversal
             own.append(f"model.friction={{law: {law}, sign_smoothing_speed: {_SIGN_SMOOTHING_SPEED}}}")
             own += ['parameters={"*.v_stribeck": {free: false}}'] if "stribeck" in law else []
         if self.is_without_object:

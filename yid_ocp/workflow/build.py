@@ -34,11 +34,11 @@ from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role, unknown_name_error
 
-_OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
-_DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
-_LINK_MASS_PARAMETER = "mass_scale"  # of a joint: factor on mass and inertia of the link that it moves
+_OBJECT_DAMPING_KEY = "object"  # key of the object's damping, next to the joints' keys
+_DEFAULT_JOINT_DAMPING = 0.05  # damping of joints without an entry [N m s/rad]
+_LINK_MASS_PARAMETER = "mass_scale"  # factor on mass and inertia of the link that a joint moves
 _AXES = "xyz"
-_PRESET_RELATIVE_STD = 0.25  # of published motor constants, which move by 10 to 40 % from one friction law to another
+_PRESET_RELATIVE_STD = 0.25  # std of published motor constants, which differ by 10 to 40 % between friction laws
 _OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -90,7 +90,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             servos=arms.servo if mode == "servo" else None,
         )
     if any(said.marker_reference_pose for said in model.frames.values()) and run.recordings.estimate:
-        # where markers sit when nobody says which recording is meant
+        # marker positions if no recording is specified
         [places] = marker_positions_from_reference_pose(run, system, read_recordings_of_role(run, count=1)).values()
         system = replace(system, parameters=system.parameters.with_nominal_values(places))
     return _completed(run, system, link_division)

@@ -37,8 +37,8 @@ from yid_ocp.workflow.build import build_step, build_system, cable_topology_betw
 from yid_ocp.workflow.run_inputs import read_recordings_of_role, unknown_name_error
 
 log = logging.getLogger(__name__)
-_START_FRAMES = 2  # of a cable's free points, from which every prediction starts
-_MAX_GRASP_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
+_START_FRAMES = 2  # frames of a cable's free points from which predictions start
+_MAX_GRASP_GAP = 0.01  # largest grasp gap due to encoder noise and a slightly wrong object length [m]
 _EFFECTS_BY_CAUSE = {
     "encoder_offset": ("encoder_offset",),
     "effort_gain": ("effort_gain",),
@@ -67,14 +67,14 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     sensors = dict(run.sensors)
     groups = [group for recording in recordings for group in recording.points]
     if build.arms_are_estimated_states(run):
-        # what the encoders say is what counts of the arms, as it does where they are prescribed
+        # encoders determine the arms' motion, as for prescribed arms
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         for name in {group.name for group in groups if is_point_group_measured_by_arm(group)}:
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
     cable = cable_topology_between_clamps(run)
     own = build.marker_positions_from_reference_pose(run, system, recordings)
     for name, factors in servo_gain_factors_by_recording(system, recordings).items():
-        # what the settings say of a gain goes before what a recording states
+        # gains in the settings take precedence over recorded ones
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
     clamps = tuple(
@@ -97,7 +97,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
-        has_uncertain_point_clocks=not clamps,  # which move by points' own clock
+        has_uncertain_point_clocks=not clamps,  # clamps follow the points' own clock
         excess_residual_criteria=run.diagnosis.null_test_residual_limits,
         checked_discretisations=_checked_discretisations(run),
         divided_links_model=_divided_links_model(run, system),

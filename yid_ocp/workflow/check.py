@@ -92,7 +92,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
     found = {"built": compare_system_with_pinocchio(system, theta, posture)}
     path = input_files_by_name(run)[run.model.robot] if run.model.robot is not None else None
     if path is not None and b"<mujoco" not in check_input_file(path).read_bytes():
-        # of a URDF file, which Pinocchio reads: its own numbers, not those that settings or effects put in their place
+        # Pinocchio reads the URDF file itself, without changes by settings or effects
         read, gravity = urdf_reader_options(run), np.array(run.model.gravity, float)
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)

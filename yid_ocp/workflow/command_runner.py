@@ -97,10 +97,10 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 _MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage [s]
 _BAR_WIDTH = 12  # on a terminal [characters]
-_MAX_TABLE_ROWS = 10  # results that are shown beside the bar on a terminal
+_MAX_TABLE_ROWS = 10  # results shown below the bar on a terminal
 _MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it is guessed [s]
-_USUAL_IMPORT_TIME = 1.6  # of a command at the pace in which stages say what they take [s]
-_USUAL_ITERATIONS = 20  # of a search, from its start to its end
+_USUAL_IMPORT_TIME = 1.6  # usual import time of a command, at the pace of the stages' usual times [s]
+_USUAL_ITERATIONS = 20  # usual number of iterations of a search
 
 
 class _RemainingTime:
@@ -120,7 +120,7 @@ class _RemainingTime:
             as_before = self._work * self._spent / self._usual
             self._spent = self._spent / 2 + min(max(now - self._begun, as_before / 4), 4 * as_before)
             self._usual = self._usual / 2 + self._work
-        # only a stage that is a part of what is ahead says that those after it are planned
+        # only a stage that is part of the planned work announces later stages
         if ahead is not None and (work == 0 or not math.isnan(self._ahead)):
             self._ahead = ahead
         else:
@@ -143,13 +143,13 @@ class _RemainingTime:
             expected = spent * (_USUAL_ITERATIONS + 1) / (self.n_iterates + 1)
         if self.n_iterates or spent > expected:
             pace = (self._spent / 2 + max(spent, expected)) / (self._usual / 2 + self._work)
-        # what has lasted longer than expected goes on for as long again as it is beyond that
+        # a stage that exceeds its usual time is expected to take as long again as the excess
         return abs(expected - spent) + self._ahead * pace
 
     def of_parts(self, done: int, total: int) -> str:
         """Text of the remaining time of a stage with this many parts; empty if the command's time is known."""
         now = time.monotonic()
-        # what stood there before this run began took no time
+        # stored results of an earlier run took no time
         known, begun = self._first = self._first or (done, now)
         if not math.isnan(self._ahead) or done <= known or done >= total or now - begun < _MIN_ESTIMATE_TIME:
             return ""

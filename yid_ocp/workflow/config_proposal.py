@@ -27,22 +27,22 @@ from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
 """Usual names of the frame at the end of an arm, most likely first."""
-_MAX_TIME_STEP = 0.01  # of the integrator, where nobody has looked yet [s]
-_SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this say nothing of their noise: the motion is as fast [s]
+_MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
+_SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
 _JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03  # A joint [rad/s] or a point [m/s] slower than this is at rest
-_REST_WINDOW = 0.1  # over which speeds are taken [s]; up to twice that of slow sensors
-_MIN_FRICTION_TRAVEL = 0.02  # A joint that turns less than this says nothing of its own friction [rad]
+_REST_WINDOW = 0.1  # window for speeds [s]; up to twice the sample period of slow sensors
+_MIN_FRICTION_TRAVEL = 0.02  # a joint that turns less than this does not inform its friction [rad]
 _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
-_TORQUE_BIAS_FRACTION = 0.01  # of a joint's effort limit, as the constant error of its torque where none is stated
+_TORQUE_BIAS_FRACTION = 0.01  # default constant torque error, as a fraction of a joint's effort limit
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 _POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays bent [%]
-_MAX_ROUNDED_PERCENT = 0.2  # by which a place on a straight segment is moved to a round one [%]
-_MAX_BEYOND_LENGTH = 0.02  # of the length of an object, by which no point of it can be farther from its holder
-_MAX_LATENESS = 0.25  # of points' clock, within which the holder has to rest for a place to be trusted [s]
-_MAX_STRAIGHT_DEVIATION = 0.01  # of the length, within which the end of a straight segment is so far from its holder
-_STRAIGHTEST_FRACTION = 0.1  # of the samples, where the end is farthest from the holder
+_MAX_ROUNDED_PERCENT = 0.2  # largest rounding of a location on a straight segment [%]
+_MAX_BEYOND_LENGTH = 0.02  # of the object's length; no point can be farther from its holder by more
+_MAX_LATENESS = 0.25  # largest lateness of the points' clock, for which the holder must stand still [s]
+_MAX_STRAIGHT_DEVIATION = 0.01  # of the length; largest deviation of a straight segment's end distance from its length
+_STRAIGHTEST_FRACTION = 0.1  # fraction of the samples with the end farthest from the holder
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
 _LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
 """Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
@@ -98,12 +98,10 @@ class ProposedConfigChoices:
     path_cutoff: float  # [Hz]
     clock_descriptions: Mapping[str, str]
     still_joints: tuple[str, ...]  # hardly turn in any recording
-    motor_preset: str | None  # of its servos, where the robot is known
-    firmware_gain: float | None  # its usual proportional gain, where the motor is known and no recording states one
+    motor_preset: str | None  # motor preset of its servos, if the robot is known
+    firmware_gain: float | None  # usual proportional gain, if the motor is known and no recording states one
     has_object: bool  # false for an arm alone
-    torque_bias_std: Mapping[
-        str, float
-    ]  # a guess by joint [N m]; empty where the recording states it, or has no effort
+    torque_bias_std: Mapping[str, float]  # default by joint [N m]; empty if the recording states it or has no effort
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the proposal to plain data under the keys of `yid-init/1`."""
@@ -308,7 +306,7 @@ def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: fl
 def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
     """Slope of each channel over a window, and its std from the residuals of the line; zeros if unknown."""
     period = float(np.median(np.diff(t))) if len(t) > 1 else math.inf
-    # a slow camera says nothing: what moves within five of its frames may well have rested at the first
+    # the first five frames of a slow camera do not show whether its points started at rest
     window = max(window, min(5 * period, 2 * window))
     rows = (t >= time - 1e-9) & (t <= time + window)
     zeros = np.zeros(values.shape[1])

@@ -51,7 +51,7 @@ from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder, software_a
 
 log = logging.getLogger(__name__)
 _STORE_FORMAT = "yid-refits/1"
-_MAX_SHOWN_UNKNOWNS = 5  # in a picture; the page's maps and trajectories.h5 have all
+_MAX_SHOWN_UNKNOWNS = 5  # in a figure; the page's maps and trajectories.h5 contain all
 
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
@@ -86,7 +86,7 @@ def run_diagnose(
         nominal: Solution | None = None
         try:
             if run.diagnosis.noise_fraction_of_std < 1 and problem.held_out:
-                # in units of noise the solver would take any fit for a bad one and start again elsewhere
+                # in units of noise, the solver would reject any fit and restart
                 logged.begin_stage("solving the nominal model", 5.0, 16.0)
                 nominal = solve(problem, run.solver, callback=logged.report_iterate)
             finding = diagnose(
@@ -214,7 +214,7 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     samples_of_all = [samples for episode in problem.episodes for samples in episode.measurements]
     compared = any(s.sensor.effort_joints or s.noise_correlation is not None for s in samples_of_all)
     if (compared and noisy) or (encoders is not None and encoders.std is not None):
-        levels.add((JOINT_POSITION_GROUP_NAME, "std"))  # the encoders' noise is part of that of efforts
+        levels.add((JOINT_POSITION_GROUP_NAME, "std"))  # encoder noise is part of the effort noise
     for errors in (episode.input_errors for episode in problem.episodes):
         if errors is not None:
             given = {

@@ -228,7 +228,7 @@ def _expressible(
             calibrated.text(form, system)
             return system, said
         except ModelError as error:
-            for label in kept:  # what the table cannot tell: it depends on where the effect sits
+            for label in kept:  # the table cannot know this: it depends on the location of the effect
                 try:
                     calibrated.text(form, calibrated.system([label]))
                 except ModelError as own:

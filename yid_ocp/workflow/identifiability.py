@@ -106,7 +106,7 @@ def run_identifiability(
         if workers is not None:
             told = {
                 "config": folder.path / "config.yaml",
-                # what the results depend on beside it
+                # further inputs of the results
                 "inputs": sorted(
                     {p.absolute() for name, p in input_files_by_name(run).items() if name != "configuration"}
                 ),
@@ -172,7 +172,7 @@ def _identifiability_result(
     parameters = {}
     for name, entry in information.parameters.items():
         unsure = unknown.parameters[name]
-        # knowing less makes nothing better known, whatever the interval took back
+        # less prior knowledge cannot make a parameter better known
         spread = max(entry.std_relative, unsure.std_relative)
         parameters[name] = asdict(entry) | {"std_relative_unknown": spread, "verdict_unknown": unsure.verdict}
     if ranking is not None:

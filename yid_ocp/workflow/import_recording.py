@@ -55,7 +55,7 @@ _FLAGS = {
     "joint_topics": "--joint-topic",
     "clock_offsets": "--clock-offset",
     "fields": "--field",
-}  # of options whose flag is not their name
+}  # options whose flag has another name
 _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
 

@@ -32,7 +32,7 @@ from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
-_SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
+_SHOWN_STEPS = 2  # steps of the NLP in its figure; later steps look the same
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
 _PARAMETER_KEYS = ("value", "unit", "lower", "upper", "description")
 _DEPENDENCE_KEYS = (

@@ -39,8 +39,8 @@ class RunFolder:
     """A run folder while it is written, with its paths, log and hashes of inputs."""
 
     final_path: Path  # its name when complete
-    path: Path  # where it is now
-    resume_folder: Path  # where an interrupted run may leave what the next of its name, or none, can use; not made here
+    path: Path  # present path
+    resume_folder: Path  # where an interrupted run can leave data for the next run of its name; not created here
     _log: TextIO = field(repr=False)
     input_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of every file that the run reads, by name
     _command_line: str = ""
@@ -189,7 +189,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
     parent = targets[0].parent
     for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():  # left by killed runs
         with contextlib.suppress(OSError):
-            if (temporary / _LOCK).exists() and _is_of_a_run(temporary):  # without a lock: complete but for its name
+            if (temporary / _LOCK).exists() and _is_of_a_run(temporary):  # without lock: complete except for its name
                 lock = _locked(temporary)
                 if lock is not None:
                     _clear(temporary, [])
@@ -224,7 +224,7 @@ def _is_of_a_run(temporary: Path) -> bool:
         if not stat.S_ISDIR(info.st_mode) or (hasattr(os, "getuid") and info.st_uid != os.getuid()):
             return False
         return (lock.is_file() and not lock.is_symlink()) or not any(temporary.iterdir())
-    except FileNotFoundError:  # its run ends just now: there is no lock to be had
+    except FileNotFoundError:  # the other run is ending and its lock is gone
         return True
 
 

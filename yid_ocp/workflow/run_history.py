@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 
 ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
-_OLD_FORMATS = ("yid-diagnosis/1",)  # of earlier versions, which had other keys
+_OLD_FORMATS = ("yid-diagnosis/1",)  # formats of earlier versions, with other keys
 _RENAMED_KEYS_HINT = "CHANGELOG.md has the table old -> new under Unreleased"
 _COMPARED_MODEL_SECTIONS = ("robot", "arms", "moving_clamps", "object", "grasp", "springs", "gravity")
 """Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
@@ -54,7 +54,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     format, or if its solve failed."""
     file, result = Path(folder) / "result.json", read_estimation_result(folder)
     try:
-        said = result.get("model", result)  # of a diagnosis, the model that it ended with
+        said = result.get("model", result)  # of a diagnosis, the final model
         known, parameters = said["covariance"], said["parameters"]
         names = tuple(str(name) for name in known["names"])
         values = np.array([float(parameters[name]["value"]) for name in names])

@@ -22,9 +22,9 @@ from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.registry import Registry
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS
 
-_ENTRY_POINT_GROUP = "yid_ocp.effects"  # of modules that register effects or sensors when they are imported
+_ENTRY_POINT_GROUP = "yid_ocp.effects"  # entry points of modules that register effects or sensors on import
 _REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNEL_KINDS)
-_loaded: dict[str, str] = {}  # what this process has run: file or entry point, and the hash or distribution
+_loaded: dict[str, str] = {}  # loaded files and entry points, with hash or distribution
 
 
 def load_plugins(run: RunSettings) -> None:
@@ -35,7 +35,7 @@ def load_plugins(run: RunSettings) -> None:
     for entry in _installed():
         name, of = f"entry point {entry.name}", _distribution(entry)
         if name not in _loaded:
-            imported = entry.module in sys.modules  # by somebody's script, which registered it
+            imported = entry.module in sys.modules  # already imported, and registered, by a script
             with _registering(name, f"{entry.value} of {of}", "update that package, or remove it", None, imported):
                 entry.load()
             _loaded[name] = of

@@ -24,7 +24,7 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _Made = tuple[Recording | str, list[Animation]]
-_DEFAULT_DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
+_DEFAULT_DURATION = 5.0  # default duration of a virtual experiment [s]
 
 
 def run_simulate(

@@ -96,7 +96,7 @@ def _run_track(
             track_result.write_tracked_points_plot(found, folder.path / "track.png")
             tracked = found.recording_with_points(recording)
             write_recording(tracked, folder.path / "recording.h5")
-            # what was tracked may be elsewhere than the object reaches, where the model sets its place
+            # tracked points can be out of the object's reach if the model defines its position
             if settings.options.root_placement == "model":
                 own = recording_quality_issues_with_model(run, system, tracked)
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
@@ -327,7 +327,7 @@ def _frame_tasks(
     joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
         _read_joints(run)
-        _read_frames(run, "frames_path")  # says in words of the settings what is wrong with the files
+        _read_frames(run, "frames_path")  # raises errors about the files with the names of the settings
         frames = Path(said.frames_path)
     else:
         progress.begin_stage("simulating a virtual experiment in MuJoCo")
