@@ -287,11 +287,11 @@ def parameter_verdict(
 ) -> str:
     """Judge a free parameter by its value and standard deviation. Returns the first verdict whose condition holds.
 
-    ================== ================================================================================================
-    not_identifiable the standard deviation is above 400 % of the value not_trusted the model does not explain the data,
-    or the data have serious issues at_bound the value lies at one of its bounds identifiable the standard deviation is
-    up to 10 % of the value weak anything else ==================
-    ================================================================================================
+    - not_identifiable: the standard deviation is above 400 % of the value
+    - not_trusted: the model does not explain the data, or the data have serious issues
+    - at_bound: the value lies at one of its bounds
+    - identifiable: the standard deviation is up to 10 % of the value
+    - weak: all other cases
 
     A value near zero is also judged by `scale`, the parameter's plausible size (zero if unknown). It is identifiable if
     |value| + 2 std is at most a tenth of `scale`, and weak if it is at most `scale`.
