@@ -1,12 +1,12 @@
 """Checks of point clocks for offset and drift relative to the joint clock, also with the residuals of a fit.
 
-A point seen with the stamp t was measured at the time t - late - drift (t - middle). To first order
+A point with the time stamp t was measured at the time t - late - drift (t - middle), where `middle` is the middle of
+the group in time. To first order
 
     expected - seen = speed (late + drift (t - middle)) + other errors of the expected position,
 
 which is linear in the unknowns. The standard deviations account for correlated errors of neighbouring samples (blocks
-of time, Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136). At rest the clock's columns are zero, so only
-motion is informative.
+of time, Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136). Only motion is informative: the speed is a factor.
 """
 
 from __future__ import annotations

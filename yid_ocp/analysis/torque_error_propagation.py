@@ -1,10 +1,10 @@
 """Low-rank propagation of torque and encoder errors to all readings of a motion.
 
 Torques have an error in every recorded sample and a constant one; angles that a tracking filter follows have an error
-in every step. A recording has some thousands of these unknowns, but sensors only observe smooth motions. G is their
-effect on all readings in units of the finest noise. The left singular vectors of G with large singular values represent
-it; they are computed from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2, doi:10.1137/090771806).
-The neglected rest adds less than `_NEGLIGIBLE_STD` squared to the variance of any reading.
+in every step. A recording has some thousands of these unknowns, but sensors only observe smooth motions. The matrix G
+maps them to all readings, in units of the smallest noise. Its left singular vectors with large singular values
+represent it; they are computed from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2,
+doi:10.1137/090771806). The neglected rest adds less than `_NEGLIGIBLE_STD` squared to the variance of any reading.
 """
 
 from __future__ import annotations

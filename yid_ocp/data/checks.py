@@ -1,6 +1,7 @@
 """Checks of a recording without a model: clocks, gaps, motion, channels and duplicated data.
 
-Checks against a model are in `analysis.data_quality`. Limits come from physics or statistics.
+Limits come from physics or statistics. Checks against a model are in `analysis` (`clock_checks`, `joint_checks`,
+`point_checks`).
 """
 
 from __future__ import annotations

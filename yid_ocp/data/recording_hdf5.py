@@ -1,7 +1,7 @@
 """Read and write recordings as HDF5 files (format `yid-recording/1`), with safe access to any HDF5 file.
 
-The HDF5 library ends the process at a full disk and at certain damage of a file, and follows links into other files.
-Such errors cannot be caught. Files are therefore written atomically, and another process reads a file first.
+The HDF5 library follows links into other files, and ends the process if the disk is full or a file is damaged in
+certain ways. Such errors cannot be caught. Files are therefore written atomically and first read by another process.
 """
 
 from __future__ import annotations
