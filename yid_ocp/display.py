@@ -90,7 +90,7 @@ class LoggingProgress(Progress):
 
 
 class PartsDoneCounter:
-    """Thread-safe counter of a stage's `total` parallel parts. It reports every count, the initial one with `first`."""
+    """Thread-safe counter of a stage's `total` parallel parts. It reports every count, zero with the text `first`."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()

@@ -273,7 +273,7 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
 def prediction_errors_and_units(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodePrediction | str]]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
-    """Errors and baselines of held-out, then fitted recordings; units of channels; errors of fitted channels."""
+    """Prediction and baseline errors of all recordings (held-out first), units and fit errors by channel."""
     residuals: Mapping[str, Any] = {}
     pairs = list(held_out)
     if solution.evaluation is not None:

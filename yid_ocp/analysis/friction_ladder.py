@@ -110,10 +110,11 @@ class _FrictionTorqueCloud:
 def friction_torque_clouds(
     problem: EstimationProblem, solution: Solution, friction_parameters: Sequence[str]
 ) -> tuple[_FrictionTorqueCloud, ...]:
-    """Friction torques of driven joints from data. Empty for models with constraints or internal coordinates.
+    """Measured and predicted friction torques of the driven joints that have some of `friction_parameters`.
 
     The measured torque is the residual of the discrete equations along the smoothed measured angles with zero friction.
-    The predicted torque is the change of this residual by the fitted law.
+    The predicted torque is the change of this residual by the fitted law. The result is empty for models with
+    constraints or internal coordinates.
     """
     step, system = problem.step, problem.system
     driven = system.driven

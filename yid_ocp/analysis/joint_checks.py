@@ -256,7 +256,10 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
 def check_joint_excitation(
     recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
-    """Yield issues about joints with free parameters (`asked`, by joint) that hardly move in any recording."""
+    """Yield issues about joints with free parameters (`asked`, by joint) that hardly move in any recording.
+
+    `position` are the options of the position sensor.
+    """
     for joint, parameters in asked.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:

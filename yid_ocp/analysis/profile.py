@@ -149,7 +149,8 @@ def mark_unidentifiable_near_zero_estimate(
 
     An unobserved twist of a branch moves only if its stiffness is near zero, and then it fits the noise. The cost has a
     narrow minimum there, lower than at all large values by what one additional parameter removes from the noise. `x`
-    (nx,) is the best fit, `evaluation` the evaluation at `x`, and `size` the entry of `typical_parameter_magnitudes`.
+    (nx,) is the best fit, `index` selects the unknown, `evaluation` is the evaluation at `x`, and `size` the
+    parameter's entry of `typical_parameter_magnitudes`.
     """
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry

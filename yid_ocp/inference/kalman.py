@@ -154,8 +154,9 @@ class KalmanSteps:
     ) -> tuple[Array, Array, Array]:
         """Normalized innovations (r, c), state means (nx, c) after all steps, and means before each step (k, nx, c).
 
-        `mean` is the mean before all steps. `push` (k, m, c) is added to the parameters during a step's transition.
-        `shift` (k, nx - ns) is added to the parameters of the first column after it.
+        `mean` is the mean before all steps, `measured` (r, c) the measurements. `push` (k, m, c) is added to the
+        parameters during a step's transition. `shift` (k, nx - ns) is added to the parameters of the first column after
+        it.
         """
         if (library := _library()) is not None:
             return self._compiled_columns(library, measured, mean, shift, push)
@@ -169,7 +170,10 @@ class KalmanSteps:
         return white, mean, seen
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
-        """Smoothed measurement noise (r, c), costates (nx, c) before all steps, and costates after each (k, nx, c)."""
+        """Smoothed measurement noise (r, c), costates (nx, c) before all steps, and costates after each (k, nx, c).
+
+        `white` are the normalized innovations, `costate` is the costate after the last step.
+        """
         if (library := _library()) is not None:
             return self._compiled_columns(library, white, costate, None, None)
         noise, seen = np.empty_like(white), np.empty((len(self.moves), *costate.shape))

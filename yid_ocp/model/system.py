@@ -202,7 +202,11 @@ class Effect:
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
-        """Time constant [s] of a first-order lag: `torque.JOINT` to its record, `joints.effort.JOINT` to the truth."""
+        """Time constant [s] of a channel's first-order lag.
+
+        For `torque.JOINT`, the acting torque lags behind the recorded one. For `joints.effort.JOINT`, the recorded
+        effort lags behind the true one.
+        """
         return ca.SX(0)
 
 

@@ -196,7 +196,7 @@ class ObjectKind:
     kind: Annotated[str, OptionInfo("kind of object")]
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the object's segments, parents first. Each link is divided into `link_division` links."""
+        """Build the segments, parents first, with joint damping `damping`. Each link is divided into `link_division`."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
