@@ -196,7 +196,7 @@ class ObjectKind:
     kind: Annotated[str, OptionInfo("kind of object")]
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the segments, parents first, with joint damping `damping`. Each link is divided into `link_division`."""
+        """Build the segments, parents first. `damping` is per joint; each link is split into `link_division` links."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
