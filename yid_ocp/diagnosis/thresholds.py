@@ -24,63 +24,63 @@ class Thresholds(SmootherThresholds):
 
     # is there a gap
     significance_level: Annotated[
-        float, Gt(0), Lt(1), OptionInfo("significance from which a candidate is tried, and a window flagged")
+        float, Gt(0), Lt(1), OptionInfo("significance level at which a candidate is tried and a window is flagged")
     ] = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level
-    min_excess_chi2_per_dof: Annotated[float, Ge(0), OptionInfo("chi2/n - 1 below which a gap is not worth a name")] = (
+    min_excess_chi2_per_dof: Annotated[float, Ge(0), OptionInfo("smallest chi2/n - 1 of a gap")] = (
         DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof
     )
     min_channel_excess_chi2_per_dof: Annotated[
-        float, Ge(0), OptionInfo("the same for the worst channel, if a candidate explains it")
+        float, Ge(0), OptionInfo("smallest chi2/n - 1 of the worst channel, if a candidate explains it")
     ] = 0.02
     gap_significance_level: Annotated[
-        float, Gt(0), Lt(1), OptionInfo("significance from which there is a gap, of all residuals or along a candidate")
+        float, Gt(0), Lt(1), OptionInfo("significance level of a gap, of all residuals or along a candidate")
     ] = 1e-4
     min_samples_per_unknown: Annotated[float, Gt(0), OptionInfo("effective samples needed for every unknown")] = 3.0
     residual_window: Annotated[float, Gt(0), OptionInfo("length of the windows of the residual", "s")] = (
         RESIDUAL_WINDOW_SECONDS
     )
     # which candidates are worth a refit
-    detectable_amplitude_z: Annotated[float, Gt(0), OptionInfo("amplitude over std at which it is detectable")] = (
-        2.576 + 1.282
-    )
-    shape_grid_size: Annotated[int, Ge(1), OptionInfo("values tried of every shape parameter")] = 4
-    n_refit_per_round: Annotated[int, Ge(1), OptionInfo("candidates refitted in a round")] = 6
-    n_refit_lowest_p: Annotated[int, Ge(0), OptionInfo("candidates of the smallest p-values refitted in any case")] = 2
-    n_refit_pairs: Annotated[int, Ge(0), OptionInfo("pairs of candidates refitted where one effect leaves a gap")] = 4
+    detectable_amplitude_z: Annotated[
+        float, Gt(0), OptionInfo("ratio of amplitude to std at which an amplitude is detectable")
+    ] = 2.576 + 1.282
+    shape_grid_size: Annotated[int, Ge(1), OptionInfo("number of values tried per shape parameter")] = 4
+    n_refit_per_round: Annotated[int, Ge(1), OptionInfo("number of candidates refitted per round")] = 6
+    n_refit_lowest_p: Annotated[int, Ge(0), OptionInfo("candidates with the smallest p-values, always refitted")] = 2
+    n_refit_pairs: Annotated[int, Ge(0), OptionInfo("pairs of candidates refitted if one effect leaves a gap")] = 4
     signature_overlap: Annotated[
-        float, Gt(0), Le(1), OptionInfo("part of a signature from which two candidates are alike")
+        float, Gt(0), Le(1), OptionInfo("fraction of a signature from which two candidates are confusable")
     ] = 0.9
-    budget: Annotated[float | None, Gt(0), OptionInfo("time from which on no refit begins", "s")] = None
+    budget: Annotated[float | None, Gt(0), OptionInfo("time after which no further refit starts", "s")] = None
     # which effects are added
-    max_effects: Annotated[int, Ge(1), Le(10), OptionInfo("how many effects may be added")] = 3
+    max_effects: Annotated[int, Ge(1), Le(10), OptionInfo("largest number of added effects")] = 3
     min_z: Annotated[float, Ge(0), OptionInfo("standard deviations from neutral below which no effect is kept")] = 2.0
-    min_gap_closed: Annotated[float, Ge(0), Lt(1), OptionInfo("part of the held-out gap that must be closed")] = 0.05
+    min_gap_closed: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of the held-out gap to be closed")] = 0.05
     prior_range_margin_in_widths: Annotated[
-        float, Ge(0), OptionInfo("widths, or a factor of 1 + this, by which a value may leave its range")
+        float, Ge(0), OptionInfo("excess allowed beyond the range: in widths, or a factor of 1 + this")
     ] = 1.0
     transfer_rtol: Annotated[
-        float, Ge(0), OptionInfo("part of an effect by which it may differ on held-out recordings")
+        float, Ge(0), OptionInfo("relative difference by which an effect may differ on held-out recordings")
     ] = 0.3
-    transfer_z_max: Annotated[float, Gt(0), OptionInfo("standard deviations by which it may differ in any case")] = 4.5
+    transfer_z_max: Annotated[float, Gt(0), OptionInfo("difference that is always allowed [stds]")] = 4.5
     min_explained_fraction: Annotated[
-        float, Ge(0), Le(1), OptionInfo("part of the smoother's explanation that effects reach")
+        float, Ge(0), Le(1), OptionInfo("fraction of the smoother's decrease that effects must reach")
     ] = 0.75
     # where the gap lies
-    location_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero at which the gap is there")] = 3.0
+    location_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero that locate a gap")] = 3.0
     informed_fraction: Annotated[
         float, Ge(0), Lt(1), OptionInfo("1 - posterior/prior variance of an informed value")
     ] = 0.5
 
     # events
     inverse_dynamics_rtol: Annotated[
-        float, Ge(0), Lt(1), OptionInfo("part of every torque by which a good model may be wrong")
+        float, Ge(0), Lt(1), OptionInfo("relative torque error allowed for a good model")
     ] = 0.03
-    max_event_duration: Annotated[float, Gt(0), OptionInfo("length of the longest event", "s")] = 1.0
+    max_event_duration: Annotated[float, Gt(0), OptionInfo("largest duration of an event", "s")] = 1.0
     min_event_chi2_fraction: Annotated[
-        float, Ge(0), Lt(1), OptionInfo("part of the gap that pushes take with them at least")
+        float, Ge(0), Lt(1), OptionInfo("smallest fraction of the gap that force events must remove")
     ] = 0.1
     max_joint_speed: Annotated[
-        float, Gt(0), OptionInfo("speed of a joint from which nothing is judged any more", "rad/s or m/s")
+        float, Gt(0), OptionInfo("speed of a joint above which the rest of a recording is ignored", "rad/s or m/s")
     ] = 20.0
 
     @property

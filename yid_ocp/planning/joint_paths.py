@@ -32,13 +32,11 @@ _PlanGoal = Literal["place", "path", "box", "information"]
 class PlanLimits:
     """Limits of a planned motion on velocity, acceleration, effort and spring angles."""
 
-    velocity_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of the URDF's velocity limits that is used")] = (
-        0.9
-    )
-    max_acceleration: Annotated[float, Gt(0), OptionInfo("of every joint", "rad/s^2 or m/s^2")] = 20.0
-    effort_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of the URDF's effort limits that is used")] = 0.9
+    velocity_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("used fraction of the URDF's velocity limits")] = 0.9
+    max_acceleration: Annotated[float, Gt(0), OptionInfo("limit of every joint", "rad/s^2 or m/s^2")] = 20.0
+    effort_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("used fraction of the URDF's effort limits")] = 0.9
     max_spring_angle: Annotated[
-        float | None, Gt(0), OptionInfo("of every spring of the object; none when absent", "rad")
+        float | None, Gt(0), OptionInfo("largest angle of every spring of the object; default: no limit", "rad")
     ] = None
 
 
@@ -49,69 +47,67 @@ class PlanOptions:
     goal: Annotated[
         _PlanGoal,
         OptionInfo(
-            "bring a point to a place, there along a path, or there with points kept inside a box; or move so that the "
-            "recordings are most informative"
+            "place: bring a point to a target; path: along a path; box: with points kept inside a box; information: "
+            "the most informative recordings"
         ),
     ] = "place"
-    point: Annotated[str | None, OptionInfo("frame that is to arrive: a tip of the object, T3:50%, a gripper")] = None
-    target_position: Annotated[_Vector3 | None, OptionInfo("where to, in the world; or give a shift", "m")] = None
+    point: Annotated[str | None, OptionInfo("frame to move: a tip of the object, T3:50%, a gripper")] = None
+    target_position: Annotated[_Vector3 | None, OptionInfo("position in the world; or give an offset", "m")] = None
     target_offset_from_start: Annotated[
-        _Vector3 | None, OptionInfo("where to, from where the point rests at the start", "m")
+        _Vector3 | None, OptionInfo("target position relative to the point's equilibrium position at the start", "m")
     ] = None
     waypoint_offsets_from_start: Annotated[
-        tuple[_Vector3, ...], OptionInfo("of a path: shifts on the way, passed at equal times", "m")
+        tuple[_Vector3, ...], OptionInfo("waypoints of a path, relative to the start, passed at equal times", "m")
     ] = ()
     box: Annotated[tuple[_Vector3, _Vector3] | None, OptionInfo("lowest and highest corner in the world", "m")] = None
     frames_in_box: Annotated[
-        tuple[str, ...] | None, OptionInfo("frames kept inside the box; all points of the object")
+        tuple[str, ...] | None, OptionInfo("frames kept inside the box; default: all points of the object")
     ] = None
     start_joint_positions: Annotated[
         Mapping[str, float] | None,
         OptionInfo(
-            "joints at the start, at rest; when absent those with which the first recording begins, else those of the "
-            "arms' first grasp of the undeformed object",
+            "joint positions at the start, at standstill; default: those at the start of the first recording, else "
+            "of the arms' first grasp of the undeformed object",
             "rad or m",
         ),
     ] = None
-    duration: Annotated[float, Gt(0), Le(60), OptionInfo("of the arms' motion", "s")] = 1.5
+    duration: Annotated[float, Gt(0), Le(60), OptionInfo("duration of the arms' motion", "s")] = 1.5
     hold_duration: Annotated[
-        float, Gt(0), Le(60), OptionInfo("after it, the arms at rest and the point in its place", "s")
+        float, Gt(0), Le(60), OptionInfo("standstill after the motion, with the point at its target", "s")
     ] = 0.5
     n_spline_coefficients: Annotated[
-        int, Ge(2), Le(40), OptionInfo("unknowns of each joint's spline of degree 5, its end included")
+        int, Ge(2), Le(40), OptionInfo("coefficients of each joint's spline of degree 5, the final position included")
     ] = 7
     minimize_duration: Annotated[
-        bool, OptionInfo("whether the shortest duration is sought with which the goal is reached")
+        bool, OptionInfo("whether to search the shortest duration with which the goal is reached")
     ] = False
     position_tolerance: Annotated[float, Gt(0), OptionInfo("distance that counts as reached", "m")] = 1e-3
-    point_rest_speed_tolerance: Annotated[float, Gt(0), OptionInfo("point's speed that counts as rest", "m/s")] = 0.01
+    point_rest_speed_tolerance: Annotated[float, Gt(0), OptionInfo("point's speed counted as standstill", "m/s")] = 0.01
     effort_weight: Annotated[
-        float, Ge(0), OptionInfo("weight of the mean squared effort in parts of its limit; raise it for calm motions")
+        float, Ge(0), OptionInfo("weight of the mean square effort over its limit; raise it for calm motions")
     ] = 0.0
     minimize_parameter_sensitivity: Annotated[
         bool, OptionInfo("whether the error due to the parameters' uncertainty is minimised as well")
     ] = False
     identify: Annotated[
         tuple[str, ...] | None,
-        OptionInfo("for information: parameters to determine most precisely together; all free ones when absent"),
+        OptionInfo("goal information: parameters to determine most precisely together; default: all free parameters"),
     ] = None
     discriminate: Annotated[
-        tuple[str, ...] | None, OptionInfo("for information: effects, kind@location, to distinguish")
+        tuple[str, ...] | None, OptionInfo("goal information: effects to discriminate, kind@location")
     ] = None
     n_random_starts: Annotated[
         int,
         Ge(1),
         Le(1000),
-        OptionInfo("of information: random motions from which the search begins; the best is kept"),
+        OptionInfo("goal information: number of random initial motions; the best result is kept"),
     ] = 5
-    seed: Annotated[int, Ge(0), OptionInfo("of these motions")] = 0
-    limits: Annotated[PlanLimits, OptionInfo("of joints and springs")] = field(default_factory=PlanLimits)
+    seed: Annotated[int, Ge(0), OptionInfo("random seed of these motions")] = 0
+    limits: Annotated[PlanLimits, OptionInfo("limits of joints and springs")] = field(default_factory=PlanLimits)
     max_iterations: Annotated[
         int,
         Ge(1),
-        OptionInfo(
-            "limit on evaluations of a search, each time the limits are sharpened; of information, on its rounds"
-        ),
+        OptionInfo("limit on evaluations of a search, per refinement of the limits; goal information: limit on rounds"),
     ] = 100
 
 

@@ -97,7 +97,8 @@ class ProblemOptions:
     initial_state: Annotated[
         _InitialStateKind,
         OptionInfo(
-            "at rest at the first posture; that plus a free offset with a prior; fitted to the first measured points"
+            "equilibrium at the first posture; estimated: with a free offset that has a prior; fitted to the first "
+            "points"
         ),
     ] = "equilibrium"
     arm_tracking_feedback: Annotated[
@@ -106,16 +107,18 @@ class ProblemOptions:
     arm_tracking_feedback_gains: Annotated[
         tuple[Annotated[float, Ge(0)], ...],
         Len(1),
-        OptionInfo("of the filter `proportional`, for one arm or for all driven joints", "N m/rad"),
+        OptionInfo("gains of the filter `proportional`, for one arm or for all driven joints", "N m/rad"),
     ] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
-    weighting: Annotated[ResidualWeightingName, OptionInfo("of residuals; paper: Caldwell et al. (2014)")] = "whitened"
+    weighting: Annotated[ResidualWeightingName, OptionInfo("residual weights; paper: Caldwell et al. (2014)")] = (
+        "whitened"
+    )
     huber_threshold: Annotated[
         float,
         Gt(0),
-        OptionInfo("residual in standard deviations above which the cost is linear; .inf for squares"),
+        OptionInfo("residual in standard deviations above which the cost is linear; .inf for least squares"),
     ] = float("inf")
     path_cutoff: Annotated[
-        float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of the efforts compared with them", "Hz")
+        float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of compared efforts", "Hz")
     ] = 10.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
     clamp_pose_definitions_from_points: tuple[ClampPoseDefinition, ...] = ()
@@ -127,17 +130,17 @@ class ProblemOptions:
         float,
         Ge(0),
         OptionInfo(
-            "factor up or down that is one standard deviation of the weak prior, which keeps positive parameters "
-            "without a prior near their start where nothing informs them; 0 for none; weighting: paper has none"
+            "one standard deviation of the weak prior, as a factor; it keeps uninformed positive parameters without "
+            "a prior near their initial value; 0: none; weighting paper has none"
         ),
     ] = 10.0
     initial_configuration_std: Annotated[
-        float, Gt(0), OptionInfo("standard deviation of an estimated start", "rad")
+        float, Gt(0), OptionInfo("standard deviation of an estimated initial configuration", "rad")
     ] = 0.05
-    initial_velocity_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an estimated start", "rad/s")] = 0.2
+    initial_velocity_std: Annotated[float, Gt(0), OptionInfo("standard deviation of an estimated one", "rad/s")] = 0.2
     duration: Annotated[float | None, Gt(0), OptionInfo("use only the first seconds of every recording", "s")] = None
     initial_state_fit_window: Annotated[
-        float, Gt(0), OptionInfo("duration of the measured points that determine a fitted start", "s")
+        float, Gt(0), OptionInfo("duration of the measured points used for a fitted initial state", "s")
     ] = 0.02
     start_point_noise_std: Annotated[
         float | None,
@@ -146,9 +149,7 @@ class ProblemOptions:
     ] = None
     initial_state_fit_parameters: Annotated[
         tuple[str, ...],
-        OptionInfo(
-            "fitted along with a fitted start in every recording, held-out ones too, from these points alone; not free"
-        ),
+        OptionInfo("parameters fitted with a fitted initial state in every recording, held-out ones too; not free"),
     ] = ()
     parameters_by_recording: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     known_initial_states: Mapping[str, ArrayLike] = field(default_factory=dict)

@@ -33,38 +33,37 @@ class SensorOptions:
     use: Annotated[
         bool | None,
         OptionInfo(
-            "whether the estimation sees it; when absent yes, but for joints.position: the encoders of driven joints "
-            "are measurements only if the arm has no measured points"
+            "whether the estimation uses it; default: yes, but encoders of driven joints (joints.position) only if "
+            "the arm has no measured points"
         ),
     ] = None
     std: Annotated[
         _Positive | Mapping[str, _Positive] | None,
         OptionInfo(
-            "noise standard deviation instead of the recorded one, by name where they differ, in the channel's unit",
+            "noise standard deviation instead of the recorded one, by name if values differ, in the channel's unit",
             "m, rad, N m, ...",
         ),
     ] = None
     frames: Annotated[
         Mapping[str, str],
         OptionInfo(
-            "frame of the model that a point marks, or T1:40%, or that a wrist sensor or IMU sits on, where the two "
-            "have different names"
+            "model frame of a point, or T1:40%, or of a wrist sensor or IMU, if its name differs from the recorded name"
         ),
     ] = field(default_factory=dict)
-    points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; all that the model has when absent")] = None
+    points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; default: all points of the model")] = None
     bias_std: Annotated[
         _NonNegative | Mapping[str, _NonNegative] | None,
         OptionInfo(
-            "standard deviation of a constant error in each joint's torque or each component of a wrist sensor or IMU, "
-            "another in every recording, instead of the recorded one",
+            "standard deviation of a constant error of each joint's torque, or of each component of a wrist sensor "
+            "or IMU, independent in every recording, instead of the recorded one",
             "N m, ...",
         ),
     ] = None
     clock_std: Annotated[
         _NonNegative | None,
         OptionInfo(
-            "standard deviation of a constant offset of a group of points' clock from that of the joints, another "
-            "in every recording; half a sample when absent and dampers are free, else 0; 0 where one clock drives both",
+            "standard deviation of a constant offset between the clocks of a point group and the joints, "
+            "independent in every recording; default: half a sample if damping is free, else 0",
             "s",
         ),
     ] = None

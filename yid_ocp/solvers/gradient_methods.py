@@ -56,10 +56,10 @@ class GaussNewton(SolverWithCheckedSettings):
     step_tolerance: Annotated[
         float,
         Gt(0),
-        OptionInfo("converged when no unknown moves by more than this fraction of its size, and none should"),
+        OptionInfo("converged if no unknown moves by more than this fraction of its size, at a stationary point"),
     ] = 1e-5
     cost_tolerance: Annotated[
-        float, Gt(0), OptionInfo("converged when the predicted relative reduction of the cost is below this")
+        float, Gt(0), OptionInfo("converged if the predicted relative decrease of the cost is below this")
     ] = 1e-8
     initial_damping: Annotated[
         float, Gt(0), OptionInfo("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
@@ -156,7 +156,7 @@ class SingleShooting(SolverWithCheckedSettings):
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
     cost_tolerance: Annotated[
-        float, Gt(0), OptionInfo("converged when the cost falls by less than this fraction in an iteration")
+        float, Gt(0), OptionInfo("converged if the cost falls by less than this fraction in an iteration")
     ] = 1e-9
     name: ClassVar[str] = "single_shooting"
 
@@ -221,15 +221,15 @@ class SteepestDescent(SolverWithCheckedSettings):
     gradient_tolerance: Annotated[
         float,
         Gt(0),
-        OptionInfo("converged when the projected gradient times the unknowns' size is below this part of the cost"),
+        OptionInfo("converged if the projected gradient times the unknowns' size is below this fraction of the cost"),
     ] = 1e-5
-    sufficient_decrease: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo's constant")] = 1e-4
-    backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("backtracking factor")] = 0.5
+    sufficient_decrease: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo constant of sufficient decrease")] = 1e-4
+    backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("factor on a rejected step")] = 0.5
     first_trial_step_rule: Annotated[
-        Literal["last", "spectral"], OptionInfo("first length tried in an iteration; last: Caldwell et al. (2014)")
+        Literal["last", "spectral"], OptionInfo("first trial step length of an iteration; last: Caldwell et al. (2014)")
     ] = "last"
     nonmonotone_memory: Annotated[
-        int, Ge(1), OptionInfo("the cost must fall below the largest of this many last ones; 1 is monotone descent")
+        int, Ge(1), OptionInfo("the cost must fall below the largest of this many previous values; 1: monotone descent")
     ] = 1
     name: ClassVar[str] = "steepest_descent"
 

@@ -84,27 +84,27 @@ class MultipleShooting(SolverWithCheckedSettings):
     condensing: Annotated[
         bool,
         OptionInfo(
-            "whether node states are condensed onto the parameters, at the cost of single shooting, in place of IPOPT"
+            "whether node states are condensed onto the parameters, at the cost of single shooting, instead of IPOPT"
         ),
     ] = False
     node_interval: Annotated[
         int | None,
         Ge(1),
-        OptionInfo("steps between nodes; above 1 with condensing only; when absent 1, with condensing 20"),
+        OptionInfo("steps between nodes; above 1 only with condensing; default: 1, with condensing 20"),
     ] = None
     hessian: Annotated[
-        HessianKind, OptionInfo("of the Lagrangian in IPOPT; exact adds the curvature of equations and sensors")
+        HessianKind, OptionInfo("Hessian of the Lagrangian in IPOPT; exact adds the curvature of equations and sensors")
     ] = "gauss_newton"
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
-    ipopt_tolerance: Annotated[float, Gt(0), OptionInfo("IPOPT's tol")] = 1e-6
+    ipopt_tolerance: Annotated[float, Gt(0), OptionInfo("IPOPT's option tol")] = 1e-6
     step_tolerance: Annotated[
-        float, Gt(0), OptionInfo("condensing: converged when no unknown moves by more than this fraction of its size")
+        float, Gt(0), OptionInfo("condensing: converged if no unknown moves by more than this fraction of its size")
     ] = 1e-5
     cost_tolerance: Annotated[
-        float, Gt(0), OptionInfo("condensing: converged when the promised relative reduction of the cost is below this")
+        float, Gt(0), OptionInfo("condensing: converged if the predicted relative decrease of the cost is below this")
     ] = 1e-5
     mu_init: Annotated[float, Gt(0), OptionInfo("initial barrier parameter, in units of the initial cost")] = 1e-7
-    ipopt: Annotated[dict[str, Any], OptionInfo("further options of IPOPT, which win")] = field(default_factory=dict)
+    ipopt: Annotated[dict[str, Any], OptionInfo("further IPOPT options; they prevail")] = field(default_factory=dict)
     name: ClassVar[str] = "multiple_shooting"
     needs_rollout: ClassVar[bool] = False
 

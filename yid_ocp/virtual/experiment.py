@@ -86,21 +86,19 @@ class VirtualArmOptions:
 
     friction: Annotated[
         Literal["none", "varied", "coulomb", "stribeck", "load", "load_stribeck"],
-        OptionInfo(
-            "law of the joints' dry friction, which MuJoCo's solver holds at rest; varied: another by experiment"
-        ),
+        OptionInfo("law of the joints' dry friction, which MuJoCo's solver simulates; varied: one law per experiment"),
     ] = "varied"
     link_mass_deviation: Annotated[
         float,
         Ge(0),
         Le(0.2),
-        OptionInfo("most by which a link's mass is off, as a fraction; at least three fifths of it"),
+        OptionInfo("largest relative error of a link's mass; the smallest is three fifths of it"),
     ] = 0.05
-    encoder_counts: Annotated[int, Ge(0), OptionInfo("steps of an encoder per turn; 0: none")] = 16384
+    encoder_counts: Annotated[int, Ge(0), OptionInfo("encoder steps per turn; 0: continuous")] = 16384
     period_jitter_std: Annotated[
-        float, Ge(0), Le(2e-3), OptionInfo("of the controller's and recorder's ticks", "s")
+        float, Ge(0), Le(2e-3), OptionInfo("standard deviation of the controller's and recorder's tick times", "s")
     ] = 5e-4
-    lost_fraction: Annotated[float, Ge(0), Le(0.2), OptionInfo("of the joints' samples that are not recorded")] = 0.01
+    lost_fraction: Annotated[float, Ge(0), Le(0.2), OptionInfo("fraction of the joints' samples that are lost")] = 0.01
 
 
 @dataclass(frozen=True)

@@ -57,21 +57,21 @@ _MAX_CLOCK_STEP = 0.05  # largest change of an offset in one iteration [s]
 class CameraClockOptions:
     """Settings for the estimation of the camera clock's offset and drift relative to the joints' clock."""
 
-    initial_offset: Annotated[float, OptionInfo("stamp minus joint time, as far as known", "s")] = 0.0
+    initial_offset: Annotated[float, OptionInfo("initial value of stamp minus joint time", "s")] = 0.0
     search_half_width: Annotated[
-        float, Ge(0), OptionInfo("how far from there the offset is looked for; 0 to take it as it is", "s")
+        float, Ge(0), OptionInfo("half width of the search for the offset around the initial value; 0: no search", "s")
     ] = 0.5
     drift_prior_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of the drift of the camera's clock, in seconds per second")
     ] = 1e-3
-    max_offset_std: Annotated[PositiveFloat, OptionInfo("an offset of larger standard deviation is not used", "s")] = (
-        0.02
-    )
+    max_offset_std: Annotated[
+        PositiveFloat, OptionInfo("largest standard deviation of an offset that is used", "s")
+    ] = 0.02
     max_frame_offset_deviation: Annotated[
         PositiveFloat,
         OptionInfo(
-            "a frame whose own offset differs from the common one by more, and by more than four "
-            "standard deviations, is dropped",
+            "a frame is dropped if its offset deviates from the common offset by more, and by more than four "
+            "standard deviations",
             "s",
         ),
     ] = 0.03
@@ -176,12 +176,12 @@ class CameraCalibrationOptions:
     fix_pose: Annotated[
         bool,
         OptionInfo(
-            "whether the specified pose and depth are kept (of a hand-eye calibration, for example); "
-            "the arm then determines the clock and checks the rest"
+            "whether the specified pose and depth are kept (from a hand-eye calibration, for example); the arm then "
+            "determines the clock and checks the rest"
         ),
     ] = False
     n_frames: Annotated[
-        int, Ge(_MIN_FRAMES), OptionInfo("so many, spread over the sequence, are compared with the arm")
+        int, Ge(_MIN_FRAMES), OptionInfo("number of frames, spread over the sequence, that are compared with the arm")
     ] = 24
     rotation_prior_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of the specified orientation, about each axis", "rad")
@@ -189,18 +189,15 @@ class CameraCalibrationOptions:
     translation_prior_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of the specified position, along each axis", "m")
     ] = 0.04
-    depth_scale_prior_std: Annotated[PositiveFloat, OptionInfo("standard deviation of the scale of its depth")] = 0.03
+    depth_scale_prior_std: Annotated[PositiveFloat, OptionInfo("standard deviation of the camera's depth scale")] = 0.03
     depth_offset_prior_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of an offset of its depth", "m")
+        PositiveFloat, OptionInfo("standard deviation of the camera's depth offset", "m")
     ] = 0.01
     min_arm_coverage_over_frames: Annotated[
         float,
         Gt(0),
         Le(1),
-        OptionInfo(
-            "of the arm's surface that the camera should see and nothing hides, at least this "
-            "share must be in the clouds where the calibration has it"
-        ),
+        OptionInfo("fraction of the arm's visible, unoccluded surface that must coincide with points of the clouds"),
     ] = 0.6
 
     def __post_init__(self) -> None:

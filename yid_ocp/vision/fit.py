@@ -57,13 +57,13 @@ class ShapeFitOptions:
     node_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
         OptionInfo(
-            "scale of the robust loss on the nodes, pass after pass: wide first, to catch a start some decimetres off",
+            "scale of the robust loss on skeleton nodes, per pass: wide first, for poor initial shapes",
             "m",
         ),
     ] = (0.15, 0.05)
     surface_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
-        OptionInfo("the same on the points of the cloud; empty for a fit to the nodes alone, as Caldwell et al.", "m"),
+        OptionInfo("scale of the loss on points, per pass; empty: a fit to nodes only, as Caldwell et al.", "m"),
     ] = (0.03, 0.015)
     surface_noise_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
@@ -75,24 +75,24 @@ class ShapeFitOptions:
         ),
     ] = 8.0
     grasp_position_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation between a gripper, by its joint angles, and what it holds", "m")
+        PositiveFloat, OptionInfo("standard deviation between a gripper, by joint angles, and the grasped point", "m")
     ] = 0.004
     grasp_direction_std: Annotated[
-        PositiveFloat, OptionInfo("the same of the axes that grasps of kind axis and weld make coincide", "rad")
+        PositiveFloat, OptionInfo("standard deviation between axes aligned by grasps of kind axis and weld", "rad")
     ] = 0.05
     bend_prior_std: Annotated[
         PositiveFloat,
         OptionInfo("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad"),
     ] = 0.3
-    max_iterations: Annotated[int, Ge(1), OptionInfo("at most so many in a pass")] = 25
-    max_point_weight: Annotated[PositiveFloat, OptionInfo("a point counts at most for so many of the camera's")] = 6.0
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations per pass")] = 25
+    max_point_weight: Annotated[PositiveFloat, OptionInfo("largest weight of a point [camera points]")] = 6.0
     min_link_coverage: Annotated[
         UnitIntervalFloat,
-        OptionInfo("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
+        OptionInfo("a link with points along a smaller fraction of its length counts as hidden or misplaced"),
     ] = 0.5
     min_tube_length_coverage: Annotated[
         UnitIntervalFloat,
-        OptionInfo("a tube with points on a smaller share of its visible length is not where the fit has it"),
+        OptionInfo("a tube with points on a smaller fraction of its visible length counts as misplaced"),
     ] = 0.75
 
     def __post_init__(self) -> None:

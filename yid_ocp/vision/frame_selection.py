@@ -35,23 +35,23 @@ _RootPlacement = Literal["model", "fixed", "free"]
 class TrackOptions:
     """Settings for the conversion of a frame sequence to measured points, and the selection of good frames."""
 
-    filters: Annotated[CloudFilterOptions, OptionInfo("what counts as the object")] = field(
+    filters: Annotated[CloudFilterOptions, OptionInfo("selection of the object's points")] = field(
         default_factory=CloudFilterOptions
     )
-    skeleton: Annotated[SkeletonOptions, OptionInfo("how a cloud is thinned")] = field(default_factory=SkeletonOptions)
-    shape_fit: Annotated[ShapeFitOptions, OptionInfo("how a shape is fitted")] = field(default_factory=ShapeFitOptions)
-    clock: Annotated[CameraClockOptions, OptionInfo("how the camera's clock is compared with the joints'")] = field(
-        default_factory=CameraClockOptions
-    )
+    skeleton: Annotated[SkeletonOptions, OptionInfo("skeleton of a cloud")] = field(default_factory=SkeletonOptions)
+    shape_fit: Annotated[ShapeFitOptions, OptionInfo("fit of a shape")] = field(default_factory=ShapeFitOptions)
+    clock: Annotated[
+        CameraClockOptions, OptionInfo("estimation of the camera clock's offset from the joints' clock")
+    ] = field(default_factory=CameraClockOptions)
     calibration: Annotated[
         CameraCalibrationOptions,
-        OptionInfo("how pose, depth and clock of the camera are estimated from the arm that it sees"),
+        OptionInfo("estimation of pose, depth and clock of the camera from the visible arm"),
     ] = field(default_factory=CameraCalibrationOptions)
     background_estimation: Annotated[
         Literal["none", "frames"],
         OptionInfo(
-            "frames: what stands still in most frames, away from every shape that was fitted, is "
-            "left out; beside it track.background_frames_path"
+            "frames: points static in most frames, away from every fitted shape, are removed, in addition to those "
+            "of track.background_frames_path"
         ),
     ] = "none"
     estimated_dimensions: Annotated[
@@ -61,34 +61,34 @@ class TrackOptions:
     max_frame_distance_in_radii: Annotated[
         PositiveFloat,
         OptionInfo(
-            "a frame whose points are further from the fitted shape on average, beyond their "
-            "noise, is dropped; in radii of the tubes"
+            "a frame is dropped if the mean distance of its points from the fitted shape, beyond noise, is larger; "
+            "in tube radii"
         ),
     ] = 0.5
     max_frame_bend_angle: Annotated[
-        PositiveFloat, OptionInfo("a frame whose shape has a joint that is bent further is dropped", "rad")
+        PositiveFloat, OptionInfo("a frame is dropped if a joint of its shape is bent further", "rad")
     ] = 1.2
     max_frame_distance_over_median: Annotated[
-        PositiveFloat, OptionInfo("a frame whose distance is so many times the median of all good frames is dropped")
+        PositiveFloat, OptionInfo("a frame with a larger multiple of the good frames' median distance is dropped")
     ] = 1.7
     max_grasp_gap_change: Annotated[
         PositiveFloat,
         OptionInfo(
-            "a frame in which an end is further from the gripper that holds it than usual by more "
-            "is dropped: its time is not what its stamp says",
+            "a frame is dropped if an end is further from its gripper than usual by more, because its stamp is then "
+            "wrong",
             "m",
         ),
     ] = 0.008
     min_covered_visible_length_fraction: Annotated[
         UnitIntervalFloat,
-        OptionInfo("a frame with points on a smaller share of the object's visible length is dropped"),
+        OptionInfo("a frame is dropped if points cover a smaller fraction of the object's visible length"),
     ] = 0.6
     max_seen_point_std: Annotated[
-        PositiveFloat, OptionInfo("a point that is known less well in a frame counts as not seen there", "m")
+        PositiveFloat, OptionInfo("a point with a larger standard deviation in a frame counts as not seen", "m")
     ] = 0.02
     min_point_std: Annotated[
         PositiveFloat,
-        OptionInfo("standard deviation that no fit is better than, of straight links in place of a curve", "m"),
+        OptionInfo("lower bound of a point's standard deviation, for straight links in place of a curve", "m"),
     ] = 0.002
     stamp_std: Annotated[
         float, Ge(0), OptionInfo("standard deviation of a frame's time stamp, beyond the common offset", "s")
@@ -96,25 +96,25 @@ class TrackOptions:
     exposure_time: Annotated[
         float,
         Ge(0),
-        OptionInfo("how long the camera looks for one frame, half of it before its stamp and half behind", "s"),
+        OptionInfo("exposure time of a frame, centred on its stamp", "s"),
     ] = 0.0
     tracked_points: Annotated[
         tuple[str, ...] | None,
-        OptionInfo("points to write down; those that no arm holds when absent, as arms know theirs better"),
+        OptionInfo("points to record; default: those that no arm holds, because arms measure held points better"),
     ] = None
     root_placement: Annotated[
         _RootPlacement,
         OptionInfo(
-            "where the object's root is: as the model has it; fixed in one place that is found from the frames; or "
-            "free, anywhere in every frame, as of a rope in a hand or on a table"
+            "position of the object's root: model: from the model; fixed: one position found from the frames; free: "
+            "any position in every frame, as for a rope in a hand or on a table"
         ),
     ] = "model"
     approximate_root_position: Annotated[
         XyzTuple | None,
-        OptionInfo("place in the world to which the root is nearer than other ends, where root is not model", "m"),
+        OptionInfo("position nearer to the root than to other ends, unless root is model", "m"),
     ] = None
     robot_mesh_kind: Annotated[UrdfMeshKind, OptionInfo("meshes of the robot's self-filter")] = "visual"
-    seed: Annotated[int, Ge(0), OptionInfo("of the walk's random points and of all subsampling")] = 0
+    seed: Annotated[int, Ge(0), OptionInfo("random seed of subsampling and skeleton extraction")] = 0
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "track options")

@@ -51,18 +51,16 @@ class CloudFilterOptions:
     voxel_size: Annotated[PositiveFloat, OptionInfo("edge of the cubes in which points are averaged", "m")] = 0.008
     robot_padding: Annotated[
         PositiveFloat,
-        OptionInfo(
-            "points this near to the robot's surface belong to it; about five standard deviations of the depth", "m"
-        ),
+        OptionInfo("points this close to the robot belong to it; about five standard deviations of the depth", "m"),
     ] = 0.03
     box_lower: Annotated[
-        XyzTuple | None, OptionInfo("corner of a box in the world outside of which points are left out", "m")
+        XyzTuple | None, OptionInfo("lower corner of a box in the world; points outside are removed", "m")
     ] = None
-    box_upper: Annotated[XyzTuple | None, OptionInfo("the opposite corner", "m")] = None
+    box_upper: Annotated[XyzTuple | None, OptionInfo("upper corner of this box", "m")] = None
     floor_height: Annotated[
         float | None,
         OptionInfo(
-            "points below this height are left out; when absent, those below floor_margin_above_object_foot above "
+            "points below this height are removed; default: points less than floor_margin_above_object_foot above "
             "the foot of an object that stands on one",
             "m",
         ),
@@ -70,46 +68,38 @@ class CloudFilterOptions:
     floor_margin_above_object_foot: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
     object_reach_margin: Annotated[
         PositiveFloat,
-        OptionInfo(
-            "points further from the object's root than its longest branch reaches, plus this, are left out", "m"
-        ),
+        OptionInfo("points further from the object's root than its longest branch plus this margin are removed", "m"),
     ] = 0.1
     max_depth_behind_robot_base: Annotated[
         float | None,
         OptionInfo(
-            "points that are further from the camera than the robot's base by more than this, "
-            "seen in the horizontal, are behind the robot and left out; null to keep them",
+            "points further from the camera than the robot's base by more than this, measured horizontally, are "
+            "removed; null keeps them",
             "m",
         ),
     ] = 0.0
     object_colours: Annotated[
         tuple[_RgbColour, ...],
         OptionInfo(
-            "of the object: red, green and blue, 0 to 255; points of other colours are left out, "
-            "where the clouds have colours; all are kept when empty"
+            "colours of the object (red, green, blue, 0 to 255); points of other colours are removed, if the clouds "
+            "have colours; empty: all colours"
         ),
     ] = ()
     max_colour_angle: Annotated[
         float,
         Gt(0),
         Le(math.pi / 2),
-        OptionInfo(
-            "between a point's and the object's colour as directions, by which light and shade change nothing", "rad"
-        ),
+        OptionInfo("largest angle to a colour of the object as directions, independent of brightness", "rad"),
     ] = 0.2
     outlier_neighbours: Annotated[
-        int, Ge(1), OptionInfo("of every point; their mean distance identifies isolated points")
+        int, Ge(1), OptionInfo("number of neighbours whose mean distance identifies isolated points")
     ] = 12
     outlier_z_max: Annotated[
         PositiveFloat,
-        OptionInfo(
-            "a point is an outlier where that distance exceeds the median by so many (robust) standard deviations"
-        ),
+        OptionInfo("a point is an outlier if that distance exceeds the median by this many robust standard deviations"),
     ] = 4.0
-    min_points: Annotated[int, Ge(0), OptionInfo("a frame with fewer points left is of no use")] = 150
-    max_points: Annotated[
-        int, Ge(1), OptionInfo("of more points left, so many are drawn at random, to bound the time that a frame takes")
-    ] = 6000
+    min_points: Annotated[int, Ge(0), OptionInfo("a frame with fewer remaining points is not used")] = 150
+    max_points: Annotated[int, Ge(1), OptionInfo("limit on remaining points; a random subset is used above it")] = 6000
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "filter options")
@@ -243,17 +233,17 @@ def weighted_median(values: Array, weight: Array) -> float:
 class SkeletonOptions:
     """Settings of the skeleton extraction."""
 
-    segment_neighbours: Annotated[int, Ge(2), OptionInfo("points of a segment, k1 in Caldwell et al.")] = 50
+    segment_neighbours: Annotated[int, Ge(2), OptionInfo("points per segment, k1 in Caldwell et al.")] = 50
     neighbour_radius: Annotated[
         PositiveFloat,
-        OptionInfo("points further away are no neighbours; somewhat more than the thickest tube's diameter", "m"),
+        OptionInfo("largest distance of neighbours; somewhat more than the thickest tube's diameter", "m"),
     ] = 0.07
-    min_segment_points: Annotated[int, Ge(1), OptionInfo("a segment of fewer points gives no node")] = 15
-    node_neighbours: Annotated[int, Ge(1), OptionInfo("neighbours of a node in the graph")] = 4
-    max_edge_length: Annotated[PositiveFloat, OptionInfo("nodes further apart are not joined", "m")] = 0.15
+    min_segment_points: Annotated[int, Ge(1), OptionInfo("a segment with fewer points gives no node")] = 15
+    node_neighbours: Annotated[int, Ge(1), OptionInfo("number of neighbours of a node in the graph")] = 4
+    max_edge_length: Annotated[PositiveFloat, OptionInfo("largest distance of connected nodes", "m")] = 0.15
     min_component_fraction: Annotated[
         UnitIntervalFloat,
-        OptionInfo("a connected part of the graph that holds a smaller fraction of the points is not the object"),
+        OptionInfo("a connected part with a smaller fraction of the points is not part of the object"),
     ] = 0.04
 
     def __post_init__(self) -> None:

@@ -58,13 +58,13 @@ class ExtraMesh:
     mesh: Annotated[str | None, OptionInfo("file that trimesh reads, in metres: STL, OBJ, DAE", is_path=True)] = None
     box_size: Annotated[
         tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None,
-        OptionInfo("in place of a file: edges along x, y, z", "m"),
+        OptionInfo("instead of a file, a box: edges along x, y, z", "m"),
     ] = None
     cylinder_radius_and_length: Annotated[
-        tuple[PositiveFloat, PositiveFloat] | None, OptionInfo("the same: radius and length along z", "m")
+        tuple[PositiveFloat, PositiveFloat] | None, OptionInfo("or a cylinder: radius and length along z", "m")
     ] = None
-    sphere_radius: Annotated[float | None, Gt(0), OptionInfo("the same: radius", "m")] = None
-    xyz: Annotated[_Triple, OptionInfo("of its middle in the link", "m")] = (0.0, 0.0, 0.0)
+    sphere_radius: Annotated[float | None, Gt(0), OptionInfo("or a sphere: radius", "m")] = None
+    xyz: Annotated[_Triple, OptionInfo("position of the centre in the link", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[_Triple, OptionInfo("roll, pitch and yaw in the link", "rad")] = (0.0, 0.0, 0.0)
 
 
