@@ -56,6 +56,7 @@ def software_fingerprint_differences(here: Mapping[str, str], there: Mapping[str
     ]
 
 
+@functools.cache
 def _version(package: str, otherwise: str) -> str:
     try:
         return metadata.version(package)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
-import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -88,26 +87,41 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
     return _unwrap(data, (), places, origin), places
 
 
+class _CheckedParser(Parser):
+    """YAML's events, none of which asks for a type, in a text that is neither too deep nor too long."""
+
+    def __init__(self, origin: str, loader: YAML) -> None:
+        super().__init__(loader)
+        self._origin, self._count = origin, 0
+        self._sizes: dict[str, int] = {}  # sizes of anchored content
+        self._begun: list[tuple[str | None, int]] = []  # anchors of the collections that are open, counts before them
+
+    def get_event(self) -> Any:
+        event = super().get_event()
+        self._count += _ALIAS_COST + self._sizes.get(event.anchor, 0) if isinstance(event, AliasEvent) else 1
+        if self._count > _MAX_ENTRIES:
+            raise self._odd(f"there are more than {_MAX_ENTRIES} entries, aliases written out", event)
+        if isinstance(event, CollectionStartEvent):
+            self._begun.append((event.anchor, self._count))
+        elif isinstance(event, CollectionEndEvent):
+            anchor, before = self._begun.pop()
+            self._sizes |= {anchor: self._count - before} if anchor else {}
+        if len(self._begun) > _MAX_DEPTH:
+            raise self._odd(f"more than {_MAX_DEPTH} levels stand in one another", event)
+        if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
+            raise self._odd(f"the tag '{event.tag}' asks for a type", event)
+        return event
+
+    def _odd(self, what: str, event: Any) -> ConfigError:
+        where = f"{self._origin}, line {event.start_mark.line + 1}"
+        return ConfigError(what, where=where, allowed=_ALLOWED_YAML, hint="write it without")
+
+
 def _loaded(text: str, origin: str) -> Any:
-    """Data of a YAML text that is not too deep and has no custom types."""
-    sizes: dict[str, int] = {}  # sizes of anchored content
-    begun: list[tuple[str | None, int]] = []  # anchors of the collections that are open, and counts before them
-    count = 0
+    yaml = YAML(typ="rt")  # keeps line numbers; comments are ignored, as their positions are sometimes wrong
+    yaml.Scanner, yaml.Parser = Scanner, functools.partial(_CheckedParser, origin)
     try:
-        for event in _yaml().parse(io.StringIO(text)):
-            count += _ALIAS_COST + sizes.get(event.anchor, 0) if isinstance(event, AliasEvent) else 1
-            if count > _MAX_ENTRIES:
-                raise _odd(f"there are more than {_MAX_ENTRIES} entries, aliases written out", origin, event)
-            if isinstance(event, CollectionStartEvent):
-                begun.append((event.anchor, count))
-            elif isinstance(event, CollectionEndEvent):
-                anchor, before = begun.pop()
-                sizes |= {anchor: count - before} if anchor else {}
-            if len(begun) > _MAX_DEPTH:
-                raise _odd(f"more than {_MAX_DEPTH} levels stand in one another", origin, event)
-            if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
-                raise _odd(f"the tag '{event.tag}' asks for a type", origin, event)
-        return _yaml().load(text)
+        return yaml.load(text)
     except MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark is not None else ""
         problem = str(error.problem or error.context).split("\n")[0]
@@ -121,18 +135,6 @@ def _loaded(text: str, origin: str) -> Any:
         hint = "look for very long numbers and for keys that are lists"
         what = f"the file is not valid YAML: {problem}"
         raise ConfigError(what, where=origin, allowed=_ALLOWED_YAML, hint=hint) from error
-
-
-def _yaml() -> YAML:
-    """A YAML reader that keeps line numbers and ignores comments, whose positions it sometimes gets wrong."""
-    yaml = YAML(typ="rt")
-    yaml.Scanner, yaml.Parser = Scanner, Parser
-    return yaml
-
-
-def _odd(what: str, origin: str, event: Any) -> ConfigError:
-    where = f"{origin}, line {event.start_mark.line + 1}"
-    return ConfigError(what, where=where, allowed=_ALLOWED_YAML, hint="write it without")
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
