@@ -229,6 +229,7 @@ def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(ben
     assert "One brief local disturbance was found and excluded" in finding.summary
 
 
+@pytest.mark.usefixtures("without_law")
 def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_everywhere(bench, monkeypatch):
     pulse = DetectedForcePulse(1.0, 1.2, -0.1, False, 0.01, 1e-9)
     size = (-0.1, -0.01, 0.001)
@@ -237,7 +238,6 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
     events = EventSet((claimed, odd))
     module = sys.modules["yid_ocp.diagnosis.diagnose"]
     monkeypatch.setattr(module, "find_force_and_fault_events", lambda *_: events)
-    monkeypatch.setattr(module, "find_gap_law", lambda *_: None)  # of what is left, which is not asked here
     rubbing = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, seed) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
         limits = Thresholds(min_event_chi2_fraction=share)

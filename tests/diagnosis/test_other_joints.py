@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from functools import lru_cache
 
 import numpy as np
@@ -16,17 +15,12 @@ from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
+pytestmark = pytest.mark.usefixtures("without_law")
 
 JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 CENTRE = np.array([0.1, -0.5, 0.2, 1.0, -0.1, 0.8, 0.0])
 DAMPING, NOISE, TIME_STEP = 0.3, 0.05, 0.01
 CANDIDATES = ("joint_spring", "joint_coulomb", "effort_offset", "link_mass")
-
-
-@pytest.fixture(autouse=True)
-def no_law(monkeypatch):
-    """Effects are sought; the law of what is left beside them is not asked here."""
-    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_gap_law", lambda *_: None)
 
 
 @lru_cache(maxsize=2)

@@ -52,5 +52,6 @@ def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):
         ({"min_excess_chi2_per_dof": 1e3, "min_channel_excess_chi2_per_dof": 1e3}, "no_gap"),
     ],
 )
+@pytest.mark.usefixtures("without_law")
 def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
     assert found(bench, **limits).verdict == verdict

@@ -113,6 +113,7 @@ def test_a_model_that_is_right_has_no_gap(bench):
 @pytest.mark.parametrize(
     ("friction", "verdict", "steps"), [({}, "no_gap", (0.04, 0.02)), ({"tau_c": 0.1}, "effect", None)]
 )
+@pytest.mark.usefixtures("without_law")
 def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench, friction, verdict, steps):
     """Steps four times as long as those of the recordings; refits of the finer step have names of their own."""
     own = {"joint_coulomb@elbow": friction} if friction else {}
@@ -130,6 +131,7 @@ def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench,
     assert ("the nominal model at 0.02 s" in names) is (steps is not None)
 
 
+@pytest.mark.usefixtures("without_law")
 def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
     recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed) for seed in (1, 2)]
     problem = bench.problem(recordings[:1])
@@ -145,6 +147,7 @@ def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
         diagnose(problem, FRICTION, recordings[1:], exclude=["joint_coulomb", "link_mass", "effort_offset"])
 
 
+@pytest.mark.usefixtures("without_law")
 def test_an_effect_that_is_not_in_the_library_is_unknown_but_placed(bench):
     def rattle(t):
         return np.stack([0 * t, 0.15 * np.sin(2 * np.pi * 7.3 * t)], axis=1)
