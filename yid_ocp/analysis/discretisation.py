@@ -142,9 +142,9 @@ def refitted_residual_at_finer_step(
 def longest_accurate_time_step(problem: EstimationProblem) -> float:
     """Find the longest time step [s] whose error is small compared with the residual at the initial unknowns.
 
-    The step starts at 20 ms and is halved, at most five times, until half of it changes the predictions by at most 3 %
-    of their residual or of the noise, whichever is larger (root mean squares, whitened). A poor initial guess has a
-    larger residual and therefore allows a larger error of the step.
+    The step starts at 20 ms and is halved at most five times. It is accepted if half the step changes the predictions
+    by at most 3 % of their residual or of the noise, whichever is larger (root mean squares, whitened). A poor initial
+    guess has a larger residual and therefore allows a larger error of the step.
     """
     x, problem = problem.initial_unknowns, problem.with_time_step(_MAX_TIME_STEP)
     for _ in range(_MAX_HALVINGS):

@@ -277,7 +277,7 @@ def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.Fi
     """Open an HDF5 file after another process has checked that it can be read (context manager).
 
     Raises `DataError` if the file is damaged, contains more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers
-    to other files (which its hash does not cover), and for errors of the library within the block.
+    to other files, which its hash does not cover. Errors of the library within the block are raised as `DataError` too.
     """
     check_readable_in_fork(Path(path), _complaint, "HDF5")
     try:

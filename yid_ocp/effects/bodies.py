@@ -140,18 +140,18 @@ class PointMass(EffectBase):
 class Payload(EffectBase):
     """Payload fixed to a frame, with its centre at (mx, my, mz)/mass. A negative mass removes excess mass of the model.
 
-    First moments are limited to L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 + (`_MAX_COM_SHIFT` M)^2). The limited and
-    reported moments are s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8). M, C and Sigma are the mass, the centre and
-    the integral of r r' dm about the centre of all bodies of the joint (M is at least 1 kg in L). With e = s + mass
-    (frame - C), the payload adds to the link `mass`, the first moment e about C, and the second moment about C
+    The first moments are limited to L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 + (`_MAX_COM_SHIFT` M)^2). The limited
+    and reported moments are s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8). All bodies of the joint together have
+    the mass M (in L at least 1 kg), the centre C, and Sigma, the integral of r r' dm about C. With e = s + mass (frame
+    - C), the payload adds to the link `mass`, the first moment e about C, and the second moment about C
 
         K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),
         w(mass) = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4).
 
     Usually w is 1/mass, and K = e e'/mass is the second moment of a point. Only for a location further than
     `_POINT_INERTIA_DISTANCE`, and near mass zero, w goes smoothly to zero. The second moment of the link about its new
-    centre is Sigma + c h e e'. h is 1 for an added mass. For a removed mass h = (1 + a^4)^(-1/4) with a = c e' Sigma^-1
-    e, which keeps the link's inertia positive and is almost 1 if the removed mass was part of the link.
+    centre is Sigma + c h e e'. For an added mass h is 1. For a removed mass h = (1 + a^4)^(-1/4) with a = c e' Sigma^-1
+    e. This keeps the link's inertia positive, and is almost 1 if the removed mass was part of the link.
     """
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"

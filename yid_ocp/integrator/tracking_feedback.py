@@ -49,12 +49,12 @@ def lqr_tracking_feedback(
 ) -> TrackingFeedback:
     """Compute a tracking feedback with finite-horizon LQR gains, linearised about the driven arms' measured motion.
 
-    The cost is the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording, for the arms
-    without the object, with fixed scales for angle, rate and torque (Anderson and Moore 1990, Optimal Control: Linear
-    Quadratic Methods, section 2.4). The gains act on the arms' angles and momenta. The reference momentum follows from
-    the measured angles (N + 1, nu) [rad] and torques (N, nu) [N m] by the arms' DEL equations, so it is comparable with
-    the model's momentum. The angles must be smooth enough for numerical differentiation. `arms` is the result of
-    `compile_driven_arms_only_step`, compiled if absent.
+    The cost is the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording, with fixed scales
+    for angle, rate and torque (Anderson and Moore 1990, Optimal Control: Linear Quadratic Methods, section 2.4). The
+    model is that of the arms without the object. The gains act on the arms' angles and momenta. The reference momentum
+    follows from the measured angles (N + 1, nu) [rad] and torques (N, nu) [N m] by the arms' DEL equations. It is
+    therefore comparable with the model's momentum. The angles must be smooth enough for numerical differentiation.
+    `arms` is the result of `compile_driven_arms_only_step`, compiled if absent.
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
