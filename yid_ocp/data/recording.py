@@ -223,7 +223,7 @@ class Recording(ReprMixin):
     Attributes
     ----------
     joints : JointGroup or None
-        Positions, velocities, efforts and commands at M times `t` (M,) [s], shape (M, nj) [rad, rad/s, N m; m, m/s, N].
+        Positions, velocities, efforts and commands of the joints (revolute: rad, rad/s, N m; prismatic: m, m/s, N).
     points, channel_groups : tuple of PointGroup, tuple of SensorChannelGroup
         Measured points and the channels of other sensors, each group with its own clock.
     name, sha256 : str, str or None
@@ -334,8 +334,8 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
         There is no group, or a group is empty. Names are repeated or do not match the arrays. A clock is not finite and
         strictly increasing. A joint channel is not finite, or a point is infinite or partly seen. A standard deviation
         is negative. The kind of effort is unknown. A pose is not a rigid transform. Joint positions exceed 50 rad or
-        points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any machine. `straight` does
-        not match the first group of points.
+        points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any machine.
+        `marker_reference_pose` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
     require_data(recording.all_groups, "the recording has no group", origin, "joints, points, points_<name>")
