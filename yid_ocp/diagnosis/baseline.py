@@ -55,7 +55,7 @@ class EarlierRunsComparison:
 
     baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
     is_baseline_explained: bool  # whether the model explained their recordings
-    baseline_effects: tuple[str, ...]  # labels of the effects that they had and that the model keeps
+    baseline_effects: tuple[str, ...]  # labels of the runs' effects that the model keeps
     between_runs_chi2: float  # chi2 of the differences between earlier runs; zero, with p-value one, for one run
     between_runs_p_value: float
     parameter_shifts: tuple[_ParameterShift, ...]
@@ -221,9 +221,9 @@ class _PredictionErrors:
 class ErrorsWithEffectsRemovedAndAdded:
     """Prediction errors on reference recordings without the effects, and on diagnosed recordings with the effects."""
 
-    # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted
+    # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model
     effects_removed: _PredictionErrors
-    # made with them: by the model of the world without them with the effects put in, against that model alone
+    # recordings with the effects: the model without effects plus the effects found, against that model alone
     effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:

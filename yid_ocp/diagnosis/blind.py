@@ -48,7 +48,7 @@ BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
 """Fraction of the cases in every category."""
 ALLOWED_ENSEMBLE_PURPOSES = ("report", "calibration")
 """Purposes of an ensemble; the same seed draws different cases for each."""
-_MIN_CASES_PER_EXPERIMENT = 3  # cases below which an experiment is not worth its compiled step
+_MIN_CASES_PER_EXPERIMENT = 3  # with fewer cases, an experiment is not worth its compilation
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class PlannedBlindCase:
     experiment: str
     category: str  # key of `BLIND_CASE_CATEGORY_SHARES`
     multiple: float | None  # multiple of the detectable size; None if not applicable
-    is_brisk: bool = False  # whether it moves with thrice the acceleration
+    is_brisk: bool = False  # whether it moves with three times the acceleration
 
 
 def plan_blind_cases(
@@ -85,7 +85,7 @@ def plan_blind_cases(
         if category == "single":
             sizes = _dealt(number, dict.fromkeys(_DETECTABLE_MULTIPLES, 1.0))
         slots += [(category, size) for size, times in sizes.items() for _ in range(times)]
-    # the experiment that is furthest behind its part gets the next case, so that every sort is spread over all
+    # the experiment furthest behind its share gets the next case, so that all have all categories
     given = dict.fromkeys(kept, 0)
     cases = []
     slots.sort(key=lambda slot: slot[0] != "finer_chain")  # rare categories first; later cases balance the shares
@@ -165,7 +165,7 @@ class BlindCase:
     name: str
     estimation_recordings: tuple[Recording, ...]
     held_out_recording: Recording
-    excluded_kinds: tuple[str, ...]  # left out of the library; mostly one that has nothing to do with the case
+    excluded_kinds: tuple[str, ...]  # excluded kinds, mostly unrelated to the case
 
 
 def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
@@ -189,7 +189,7 @@ class SyntheticMeasurementConditions:
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     simulation: SimulationOptions = field(default_factory=SimulationOptions)  # duration of each, and the engine's step
     has_camera: bool = False  # whether a camera sees the object
-    # that the engine's solver holds at rest, and what is injected with it; None: smooth forces
+    # friction that the engine simulates with sticking, together with injected friction; None: smooth forces
     ordinary_friction: Sequence[InjectedEffect] | None = None
     is_brisk: bool = False
     purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0]  # one of `ALLOWED_ENSEMBLE_PURPOSES`
@@ -517,7 +517,7 @@ def true_effects_gap_closure(
             reported = true[effect.label].get(quantity.reported_name_and_unit[0])
             if reported is not None:
                 start[f"{effect.label}.{quantity.name}"] = quantity.to_internal(reported)
-    # under the weights of the nominal fit, as all that it is compared with
+    # whitened as the nominal fit, like all models that it is compared with
     fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
     if fit is None or len(chosen) < len(true):
         return math.nan

@@ -63,7 +63,7 @@ class BlindCaseScore:
     # effect of a pair likewise, unknown at the right location for an effect outside the library
     right: bool
     closure: float  # fraction of the held-out gap closed by the effects added
-    best: float  # the same by a refit of the true effects
+    best: float  # closure by a refit of the true effects
     # per parameter of an accepted true effect: relative error, and whether the 95 % interval contains the truth
     errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
     seconds: float = math.nan
@@ -282,7 +282,7 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
 def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
     """chi2/n - 1 of the residual, if it is significant at all."""
     if said["chi2_per_dof"] is None:
-        return math.inf  # it could not be followed at all
+        return math.inf  # the model could not follow the recording
     return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.gap_significance_level else -math.inf
 
 

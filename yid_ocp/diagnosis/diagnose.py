@@ -77,7 +77,7 @@ from yid_ocp.solvers.base import INITIAL_VALUE_RESTART_FACTORS
 
 log = logging.getLogger(__name__)
 
-_SAME_WEIGHTS_STDS = 0.05  # standard deviations by which a fit may leave the point at which its weights were frozen
+_SAME_WEIGHTS_STDS = 0.05  # change of a fit in stds from which its whitening is repeated
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
@@ -121,7 +121,7 @@ def diagnose(
         A candidate does not fit the system; a held-out recording is also estimated on; there is no noise level; the
         nominal model cannot be rolled out, or its residual is not whitened.
     """
-    # the matrices are small: threads of the linear algebra library cost more than they give
+    # small matrices: threads of the linear algebra library cost more than they save
     with threadpoolctl.threadpool_limits(1):
         clock = {"": time.perf_counter()}
         told = progress or LoggingProgress(log)
@@ -487,7 +487,7 @@ def _composed(
         hint = "set problem.weighting: whitened and the noise levels under `sensors`"
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    exclude_candidates(effects, leave_out)  # refused before anything is compiled
+    exclude_candidates(effects, leave_out)  # reject names before compilation
     progress.begin_stage(f"composing {len(effects)} candidates into one step", ahead=16.0)
     composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
     return replace(composed, candidate_effects=tuple(exclude_candidates(composed.candidate_effects, leave_out)))

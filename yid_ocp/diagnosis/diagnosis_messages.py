@@ -22,7 +22,7 @@ from yid_ocp.inference.null_test import residuals_exceed_noise
 from yid_ocp.inference.smoother import GapLocation, main_gap_locations
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
-_PRIOR_RANGE_TOLERANCE = 0.25  # part of its range by which an amplitude may leave it unnoticed
+_PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range without a message
 _GAP_ORIGIN_PHRASES = {
     "plant": ", in the mechanics rather than in what sensors read",
     "sensor": ", in what sensors read",

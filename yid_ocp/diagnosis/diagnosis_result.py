@@ -94,7 +94,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     located_gap: LocatedGap | None = None
     record: SearchRecord = field(default_factory=SearchRecord)
-    events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
+    events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first; empty if all were done
     search_seconds: float = 0.0  # duration until the end of the search for effects
     # stated time step, and the step used if the error of the stated one was part of the gap [s]

@@ -50,13 +50,13 @@ _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 
 _FORCE_INTERVAL = 0.05  # interval of constant unknown force in the search for events [s]
 _MAX_SPAN_POINTS = 250  # maximum number of points of a force history processed together
-_MAX_WRONG_SAMPLES = 3  # wrong samples in a row; more of them are a gap or a stuck channel
+_MAX_WRONG_SAMPLES = 3  # largest number of consecutive wrong samples; more are a gap or a stuck channel
 _STENCIL_STEPS = (4, 7, 10)  # distances of the samples through which a smooth curve is fitted around a wrong sample
 _NEIGHBOUR_COUNT = 20  # samples on either side with which one is compared
-_MIN_NEIGHBOUR_RATIO = 3.0  # times the largest deviation among its neighbours by which a wrong sample stands out
+_MIN_NEIGHBOUR_RATIO = 3.0  # ratio of a wrong sample's deviation to the largest one of its neighbours
 _MIN_RECURRENCE_OVERLAP = 0.5  # of the longer of two windows; overlap from which they are the same time
 _MAX_RECURRING_FRACTION = 0.5  # of all forces; fraction of recurring forces from which these belong to the motion
-_WRONG_SAMPLE_Z = 8.0  # standard deviations of noise, and robust ones of its neighbours, by which it does
+_WRONG_SAMPLE_Z = 8.0  # smallest deviation, in stds of noise and robust stds of its neighbours
 
 
 @dataclass(frozen=True)

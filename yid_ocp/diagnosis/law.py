@@ -35,7 +35,7 @@ from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.options import MultivariateGaussianPrior
 
 _N_KNOTS = 12
-_MAX_PLACES = 3  # places of the gap at which a law is sought
+_MAX_PLACES = 3  # largest number of gap locations at which a law is estimated
 _MAX_REFITS = 5  # the torque over time included
 _ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # curvature weights; the evidence chooses among them
 _RIDGE_STD_RATIO = 3.0  # std of a value at a knot, apart from its curvature, over the torques there
@@ -50,7 +50,7 @@ class GapLaw:
     """A law for a gap that no effect of the library explains, with its held-out closure."""
 
     location: str
-    tables: tuple[LawTable, ...]  # one for every quantity that it depends on
+    tables: tuple[LawTable, ...]  # one table per quantity
     visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
     closure: GapClosure  # closure of the held-out gap of the model without the law
     runner_up: tuple[str, str, float] | None  # location, quantities and closure of the next best

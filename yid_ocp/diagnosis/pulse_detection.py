@@ -32,7 +32,7 @@ from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
 from yid_ocp.model.system import MidpointState, System
 from yid_ocp.problem.signal_filters import twice_applied_effort_filter
 
-_STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m/s]
+_STANDSTILL_SPEED = 0.1  # speed below which friction can stick [rad/s or m/s]
 
 
 @dataclass(frozen=True)
@@ -115,12 +115,12 @@ _MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS = (1.0, 2.0, 4.0
 """c, w in units of the robust spread of the history, s in units of its root mean square."""
 _MIN_PULSE_POINTS = 2.5  # points that the shortest pulse covers
 _WINDOW_GROWTH = 1.25  # ratio of successive window lengths
-_FLAT_RAMP_FRACTION = 0.5  # part of a flat pulse in which it rises and falls
-_MAX_PROFILES = 12  # pulses and what is like them in one history
+_FLAT_RAMP_FRACTION = 0.5  # rising and falling fraction of a flat-topped pulse
+_MAX_PROFILES = 12  # largest number of pulses and similar profiles in one history
 MAX_EVENT_TIME_FRACTION = 1 / 3
 """Part of the time above which forces in short windows are not events: model error dominates."""
 _MIN_PROMINENCE_RATIO = 1.5  # times the median size anywhere that a pulse must have: more than a sine's maximum has
-_MAX_PULSE_RANGE_RATIO = 1.5  # times the range of the history about it that one may have: a larger one is made up
+_MAX_PULSE_RANGE_RATIO = 1.5  # largest ratio of a pulse to the range of the history around it
 
 
 @dataclass(frozen=True)
@@ -168,9 +168,9 @@ class DetectedForcePulse:
 
     start_time: float  # [s]
     end_time: float
-    peak_value: float  # largest value, with its sign, in the history's unit
-    is_flat_topped: bool  # whether it stays at its size for half of the time; else it is a sine squared
-    peak_std: float  # standard deviation of the size, counting the rest
+    peak_value: float  # largest signed value, in the history's unit
+    is_flat_topped: bool  # whether it stays at its peak for half of the time; otherwise it is a squared sine
+    peak_std: float  # standard deviation of the peak, background included
     p_value: float  # probability that chance raises the evidence this far in one window
 
     @property

@@ -42,7 +42,7 @@ from yid_ocp.solvers.base import SolverResult
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
 """A refit starts near its end and must be good to a small part of its std only."""
 _Answer = TypeVar("_Answer")
-_UNINFORMATIVE_STD_RATIO = 100.0  # times the prior range that a std may be: beyond it the parameter is not known at all
+_UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
 _HALF_DONE_FRACTION = 0.2  # explained fraction of the excess from which a refit that leaves more than noise is repeated
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
@@ -154,7 +154,7 @@ class RefitContext:
     thresholds: Thresholds
     progress: Progress
     store: RefitStore | None = None
-    deadline: float = math.inf  # value of `time.perf_counter` after which nothing more is tried [s]
+    deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
     record: SearchRecord = field(default_factory=SearchRecord)  # likewise

@@ -227,7 +227,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Residu
     slope = -(x.T @ residual)
     lower, upper = _room(effect)
     step, decrease = _promised(x.T @ x, slope, lower, upper)
-    # the candidate's own share of the residual would hide it: what would be left is what its score scatters with
+    # without the candidate's share of the residual, which would hide its significance
     covariance = _newey_west_covariance(x, residual + x @ step, series)
     # a residual below the noise must not make a score significant
     covariance = covariance if np.trace(covariance) > np.trace(floor) else floor

@@ -18,8 +18,8 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 
-_MODEL_ERROR_CHI2 = 1e3  # chi2/n from which noise is no part of what is left
-_LOSS_RTOL = 1.4e-3  # part of a loss by which refits of equivalent effects differ
+_MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not noise
+_LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
@@ -43,7 +43,7 @@ class SelectedEffect:
     effect: EffectBase
     refitted_model: RefitStatistics  # refit with all effects up to this one
     cumulative_closure: GapClosure  # closure of the whole gap by all effects up to this one
-    equivalent_effects: tuple[EffectBase, ...]  # effects that the data cannot tell from this one, the chosen one first
+    equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
 
 
 def held_out_gap_closure(
@@ -238,7 +238,7 @@ def select_effects(
             ahead = 3.5 if _is_explained(current, limits) else 20.0
             search.progress.begin_stage(f"scoring the residual gap next to {beside}", 1.0, ahead)
             screened = search.screen(base, current.values, f"beside {beside}")
-            # a rest that the residual as a whole does not show may show along a candidate, as a gap does
+            # a candidate can show a residual gap that the whole residual does not
             p_value = bonferroni_min_p_value(screened.candidate_scores)
             if _is_explained(current, limits) and p_value >= limits.gap_significance_level:
                 break
@@ -308,7 +308,7 @@ def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choi
     """The choice without one effect, or with it or another effect last, and the equivalent effects there."""
     limits, full, label = search.thresholds, chosen.fit, effect.label
     rest = tuple(other for other in full.effects if other is not effect)
-    # it begins elsewhere than a refit of the same effects in an earlier round
+    # it starts elsewhere than a refit of the same effects in an earlier round
     without = search.refit(rest, full.values, f"{join_effect_labels(full.effects)} without {label}")
     if without is None:
         return chosen

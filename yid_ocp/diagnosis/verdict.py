@@ -75,7 +75,7 @@ class NominalEvidence:
     nominal_held_out_test: NullTestResult
     screening: ScreeningResult
     are_offsets_stated: bool  # whether the size of torque offsets or of constant sensor errors is
-    has_left_baseline: bool = False  # whether parameters are no more what an earlier run found
+    has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
 
     def has_gap(self, limits: Thresholds) -> bool:
         """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.

@@ -147,7 +147,7 @@ class SplinePath:
     points, so limits on control points hold at all times, not only at nodes."""
 
     duration: float  # [s]
-    n_coefficients: int  # K, coefficients of each joint; the last one is its displacement at the end
+    n_coefficients: int  # number K of coefficients per joint; the last one is the final displacement
 
     def _splines(self, order: int) -> BSpline:
         ends, free = _N_REST_CONTROL_POINTS, self.n_coefficients - 1
@@ -181,7 +181,7 @@ class SplinePath:
 class PathSimulator:
     """Simulates a system, initially at rest, whose prescribed joints follow a spline path."""
 
-    step: Step  # every joint that moves is prescribed; nothing is driven
+    step: Step  # all moving joints are prescribed, none is driven
     theta: Array  # (ntheta,)
     start_equilibrium: Equilibrium
     path: SplinePath

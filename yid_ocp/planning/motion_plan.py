@@ -31,7 +31,7 @@ from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, Target
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
 _MAX_STEP_HALVINGS = 3  # largest number of halvings of the time step
-_CONVERGED_TOLERANCE_FRACTION = 0.1  # change by halving it, in parts of the tolerances, that counts as none
+_CONVERGED_TOLERANCE_FRACTION = 0.1  # change after halving, as a fraction of the tolerances, that counts as zero
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class TargetMotionPlan(PlannedMotion):
 
     target_point: str
     target_position: Array  # (3,) [m]
-    max_position_error: float  # largest distance of the point from its target while the arms stand still at the end [m]
+    max_position_error: float  # largest distance of the point from its target during the final standstill [m]
     max_residual_speed: float  # largest speed of a point of the object in that time [m/s]
-    max_path_deviation: float | None  # largest distance from its reference path at the same time [m]; None without one
+    max_path_deviation: float | None  # largest distance from the reference path [m]; None without one
     end_position_std: Array | None  # (3,), of the final position, from the parameters' covariance [m]; None without one
     n_evaluations: int
 

@@ -35,7 +35,7 @@ _ACCELERATION_WEIGHT = 1e-3  # of the mean square acceleration [limits], to pref
 
 @dataclass(frozen=True, eq=False)
 class _LimitRows:
-    description: str  # the limited quantity, with its unit
+    description: str  # limited quantity, with its unit
     lower: Array  # (rows,)
     upper: Array  # (rows,)
     unit: Array  # (rows,), divisor that scales each row to order one
@@ -56,7 +56,7 @@ class PlanResidualAndLimitFunctions:
     options: PlanOptions
     point: FramePositionEvaluator  # evaluator of the target frame, and of all frames that must come to rest
     target: Array  # (3,), target position in the world [m]
-    quasi_static_coefficients: Array  # (K, nc); of motions that do equally well, the one nearest to them is wanted
+    quasi_static_coefficients: Array  # (K, nc); the search prefers motions near these coefficients
     inside: FramePositionEvaluator | None = None  # frames that stay in the box
 
     def __post_init__(self) -> None:
@@ -78,7 +78,7 @@ class PlanResidualAndLimitFunctions:
             [first, *(first + np.asarray(via) for via in self.options.waypoint_offsets_from_start), self.target]
         )
         at = np.linspace(0.0, self.simulator.path.duration, len(places))
-        # the clock starts and stops gently as well, so that the way is one that can be followed
+        # clamped ends, so that the reference motion starts and stops smoothly
         return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.simulator.node_times, at[-1])))
 
     def _goal_residual(self, rollout: Rollout, w: Array) -> list[tuple[Array, Array]]:
@@ -183,7 +183,7 @@ def _even(what: str, names: tuple[str, ...], limit: Array, count: int) -> _Limit
 
 
 _INITIAL_PENALTY, _PENALTY_GROWTH, _MAX_PENALTY = 1e3, 10.0, 1e8
-_LIMIT_TOLERANCE = 1e-4  # largest violation of a limit, in parts of it, that counts as none
+_LIMIT_TOLERANCE = 1e-4  # largest violation of a limit, as a fraction of it, that counts as zero
 _MAX_OUTER_ITERATIONS = 12
 _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: the trust region shrinks
 
@@ -305,7 +305,7 @@ class EffectDiscriminationCriterion:
     unknowns. The smallest distances dominate the sum."""
 
     amplitude_columns: tuple[tuple[int, ...], ...]  # columns of the amplitudes of every effect
-    # of the amplitudes, in units of the columns, (amplitudes, cases): one case where they are known, else one for each
+    # amplitudes in units of the columns, (amplitudes, cases): one case if they are known, else one per amplitude
     amplitude_cases: tuple[Array, ...]
     parameter_columns: tuple[int, ...]  # columns with a prior: nominal parameters and parameters of effects
 

@@ -40,7 +40,7 @@ from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 _PLANNED_RECORDING_NAME = "planned"
 _MIN_POINT_RATE = 20.0  # lowest rate at which the information of a slow sensor is spread over the motion [Hz]
 _MAX_SEARCH_POINT_RATE = 40.0  # of points in the search: three times the bandwidth of motion errors [Hz]
-_PATH_ERROR_BANDWIDTH = 12.0  # up to which the motion may be wrong: beyond it efforts are smoothed away [Hz]
+_PATH_ERROR_BANDWIDTH = 12.0  # bandwidth of motion errors: beyond it, efforts are filtered out [Hz]
 _PATH_DIFFERENCE_STEP = 1e-6  # difference step of the arms' motion for the effect of its errors [rad or m]
 _SPLINE_DIFFERENCE_STEP = 1e-5  # difference step of a motion's coefficient [rad or m]
 
@@ -100,7 +100,7 @@ class ParameterizedExperiment:
             np.stack([np.interp(at, mover.node_times, x) for x in impulse.T], axis=1) for at in (t, t + period)
         )
         effort = (end - begin) / period
-        # nothing is known of what comes after
+        # the effort after the end is unknown
         effort[t + period > duration + 1e-9] = rollout.effort[-1]
         columns = [joints.names.index(name) for name in system.prescribed]
         errors = base.input_errors

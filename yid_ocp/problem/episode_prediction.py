@@ -291,7 +291,7 @@ class EpisodePredictor:
             if by_applied is not None and inputs.torque_sensitivity is not None:
                 by_correction = by_applied.copy()
                 by_correction[:, :, : len(wanted)] -= inputs.torque_sensitivity
-        # states by all directions are the largest arrays of all, and what samples need of them has been taken
+        # the derivatives of the states are the largest arrays, and samples no longer need them
         rollout = replace(rollout, state_sensitivity=None, multipliers_sensitivity=None, effort_sensitivity=None)
         slopes = tuple(sensitivities) if prepared.derivatives else None
         guess = None if start.equilibrium is None else start.equilibrium.state[: self.system.n_coordinates]
@@ -431,7 +431,7 @@ class EpisodePredictor:
         if by_torque is not None:
             own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.prescribed_path_sensitivity is not None:
-            # node 0 is part of the start state
+            # node 0 is part of the initial state
             by_path = by_inputs.by_prescribed_path[1:]
             own[: len(total)] += np.einsum("kc,kcw->w", by_path, inputs.prescribed_path_sensitivity[1:])
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)

@@ -95,7 +95,7 @@ class InputErrorModel:
     torque_std: Array  # standard deviation of w, (nu,)
     torque_bias_std: Array  # standard deviation of b, (nu,)
     angle_std: Array  # standard deviation of v, (nu,)
-    sample_of_step: IntArray  # recorded sample that each step's torque comes from: w is the same in all its steps, (N,)
+    sample_of_step: IntArray  # recorded sample of each step's torque, (N,); w is the same in all steps of a sample
     encoder_noise_steps: float  # number of steps that share one encoder sample's noise through interpolation
     has_encoder_measurements: bool
     torque_bias: Array  # value of b that is subtracted from the recorded torque, (nu,)
@@ -168,7 +168,7 @@ def _recorded_input_errors(
     period = float(np.median(np.diff(joints.t)))
     middle = grid.node_times[:-1] + grid.time_step / 2
     sample = np.clip(np.searchsorted(joints.t, middle, "right") - 1, 0, len(joints.t) - 1)
-    # a step that spans several samples averages them
+    # a step over several samples averages their noise
     held, shared = std * min(1.0, np.sqrt(period / grid.time_step)), max(1.0, period / grid.time_step)
     none = (np.zeros(len(driven)), *(np.zeros((grid.steps, len(driven))) for _ in range(3)))
     return InputErrorModel(held, bias, angle, sample.astype(np.int64), shared, encoders, *none)
@@ -311,7 +311,7 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
     places = [step.system.mechanism.joint_index(name) for name in names]
     q = np.zeros((len(angles), step.sizes["n"]))
     q[:, places] = angles
-    # every joint's unit velocity in every configuration, in one go
+    # unit velocity of every joint in every configuration, together
     velocity = np.zeros((len(places), *q.shape))
     velocity[range(len(places)), :, places] = 1.0
     still = np.broadcast_to(q, velocity.shape).reshape(-1, q.shape[1])

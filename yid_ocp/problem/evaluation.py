@@ -131,7 +131,7 @@ def whitened_episode_residual(
         columns = np.hstack([columns, plain.jacobian])
     if whitening is not None:
         kept, push = columns.shape[1], result.torque_correction_and_sensitivity
-        # constant errors of sensors drive nothing
+        # constant sensor errors do not drive the motion
         push = None if push is None else np.pad(push, ((0, 0), (0, 0), (0, by_constants.shape[1])))
         innovations, _ = whitening.whiten_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
@@ -153,7 +153,7 @@ class UnknownVectorLayout:
 
     shared_parameters: tuple[str, ...]  # free, with one value for all recordings
     local_parameters: tuple[str, ...]  # free, with a value in each
-    initial_state_names: tuple[str, ...]  # estimated: `q.JOINT`, `p.JOINT` and, of unobserved internal ones, `z.NAME`
+    initial_state_names: tuple[str, ...]  # `q.JOINT`, `p.JOINT`, and `z.NAME` of unobserved internal coordinates
     recording_names: tuple[str, ...]
 
     @cached_property

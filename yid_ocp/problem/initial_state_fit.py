@@ -23,7 +23,7 @@ from yid_ocp.sensors import Sensor, sensor_reading_function
 # Width of the elastic prior [rad]: this bend at a joint of mean stiffness costs as much as one standard deviation of a
 # measured point. The cost of other joints is proportional to their stiffness.
 _BEND_STD = 0.5
-# Joints without a spring, or with one far softer than the rest, are still held a little.
+# Joints without a spring, or with a much softer one, still have a weak prior.
 _MIN_STIFFNESS_RATIO = 1e-4
 # Standard deviation of a coordinate's velocity that the points do not determine [rad/s].
 _RATE_STD = 3.0
@@ -41,7 +41,7 @@ class PrecomputedInitialState:
     """Initial state that does not depend on the unknowns, given or fitted to the first measured points."""
 
     state: Array  # (q, p, z) at node 0, (nx,)
-    fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # along with it, in their units
+    fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # in their units
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class InitialStateFitter:
         theta[index] = values
         wanted = index[: task.wanted]
         span = (upper - lower)[: task.wanted]
-        # an angle goes round, anything else stops at its bound
+        # an angle is periodic, other parameters stop at their bounds
         turns = np.abs(span - 2 * np.pi) < 1e-9
 
         def spread(x: Array) -> tuple[Array, Array]:

@@ -190,7 +190,7 @@ class SensorMeasurements:
         `at_nodes` (len(nodes), k) is the prediction. `unmoved` are the measurements before the delay of `steps`
         (k,)."""
         nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
-        if not len(nodes):  # a short piece may hold no sample of a slow sensor
+        if not len(nodes):  # a short part may hold no sample of a slow sensor
             return np.zeros((0, at_nodes.shape[1]))
         place = self.node - nodes[0]
 

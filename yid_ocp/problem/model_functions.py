@@ -150,7 +150,7 @@ class InputCorrectionFunctions:
         for i, joint in enumerate(self.joint_names):
             # the last effect is the nearest to the reading
             true_effort, true_angle = effort[i], angle[i]
-            # a servo is commanded what its encoder is to read
+            # a servo's command is a target of its encoder reading
             channel = "joints.position" if joint in self.system.servos else "joints.effort"
             for effect in reversed(self._effects):
                 true_effort = effect.corrected_reading(f"{channel}.{joint}", true_effort, true_effort)
@@ -165,7 +165,7 @@ class InputCorrectionFunctions:
         kind, _, joint = channel.partition(".")
         if kind == "torque" and joint in self.system.servos:
             total += self.system.servos[joint].command_delay
-        # a delay is in true time, a recording in its own
+        # delays are in true time, a recording has its own clock
         return total / self.system.recorded_time_scale
 
     def _lag(self, channel: str) -> ca.SX:

@@ -112,7 +112,7 @@ def _courses(
 ) -> list[scipy.interpolate.PPoly]:
     """Input of each joint over time, from the first sample to the end of the last sample's interval."""
     t = joints.t
-    # the last sample lasts as long as the one before it
+    # the last sample lasts as long as the previous one
     edges = np.append(t, 2 * t[-1] - t[-2])
     if servos:
         if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):

@@ -24,12 +24,12 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint, mesh_sources_sha256
 
-_MAX_FRAMES = 150  # moments of a motion that a page holds; between two it goes straight
+_MAX_FRAMES = 150  # largest number of frames on a page, interpolated linearly
 _PUSHED_POINT = "75%"  # location on a segment at which an unknown push is drawn
 _ARM_RADIUS = 0.03  # how thick an arm is drawn [m]
-_POSITION_SCALE = 1e4  # places are kept as whole numbers of a tenth of a millimetre
+_POSITION_SCALE = 1e4  # positions are integers in 0.1 mm
 _MAX_MESH_FACES = {True: 6000, False: 4000}  # largest number of triangles on a page, for moving and fixed links
-_FIRST_MESH_CELL, _CELL_GROWTH = 0.004, 1.3  # edge of the cubes in which vertices become one [m], and what it grows by
+_FIRST_MESH_CELL, _CELL_GROWTH = 0.004, 1.3  # edge of the cubes in which vertices are merged [m], and its growth factor
 _QUATERNION_SCALE = 1e4
 _MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # shortest stick [m], and tolerance of equal times [s]
 
@@ -216,7 +216,7 @@ def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _Animate
     for a, b, own in pairs:
         ends = (first[base if a < 0 else a], first[b])
         if (a >= 0 or not own) and ends[0] != ends[1]:
-            # an effect may have put joints between two links
+            # an effect may have added joints between two links
             child = owned.get(names[b] if b < len(names) else names[a], _ARM_RADIUS)
             known[ends] = (owned.get(names[a], child) if own else _ARM_RADIUS, own)
     marked = [-1 if place is None else first[indices[place]] for place in acting]

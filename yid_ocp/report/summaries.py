@@ -43,7 +43,7 @@ _MAX_DIRECTIONS = 8
 _MAX_NOISE_RATIO = 2.0  # of an error over noise, or over the fit's error, above which a sentence explains it
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # characters of a cell
-_NEGLIGIBLE_STDS = 1e-6  # standard deviations: beneath are the tolerance of a rest and what hundred steps make of it
+_NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
 @register_summary("yid-solve/1")

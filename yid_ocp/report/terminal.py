@@ -27,7 +27,7 @@ _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings side by side
 _MAX_NUMBERS_BEYOND_MODEL = 6  # numbers that a sentence lists; the table has all
 _MAX_NAMES_IN_LINE = 12  # parameters in a line; tables list all
-MAX_CHANNELS_SHOWN_SINGLY = 4  # a group of more points is shown as a whole; result.json has every point
+MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
 

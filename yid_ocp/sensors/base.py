@@ -207,11 +207,11 @@ class Sensor(ABC):
 
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each)."""
 
-    channel: ClassVar[ChannelSpecification]  # kind of its recorded channels
-    group_name: str  # key of its settings: a group of points, such as `points_camera`, or `joints.effort`
+    channel: ClassVar[ChannelSpecification]  # kind of recorded channels
+    group_name: str  # settings key: a point group, such as `points_camera`, or `joints.effort`
     # prediction without a model: zero, or the first measured value
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
-    has_paper_weight: ClassVar[bool] = True  # whether the source paper's cost, in square metres, counts it
+    has_paper_weight: ClassVar[bool] = True  # whether the cost of the source paper, in square metres, includes it
     frame_names: tuple[str, ...]  # the mechanism's frame that each channel marks; none for joints
     point_names: tuple[str, ...]  # recorded names of the points; none for joints
 
@@ -317,7 +317,7 @@ class SensorDataInputs:
     recording: _RecordingData
     sensor_usage: Callable[[str], SensorOptions]  # sensor's options by settings key
     node_times: Array  # times of the rollout's nodes, shape (N + 1,) [s]
-    time_step: float  # between them [s]
+    time_step: float  # distance of the nodes [s]
     effort_filter: _SmoothingFilter  # filter of prescribed joints' efforts
     path_filter: _SmoothingFilter  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]

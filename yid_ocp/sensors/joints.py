@@ -145,7 +145,7 @@ def smoothed_effort_data(
     `is_sample`, a value belongs to its time, otherwise it is the mean of the interval until the next value. Raises
     `DataError` if the recording is too short for the filter."""
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
-    # the mean of an interval belongs to its middle
+    # the mean of an interval belongs to its centre
     late = 0.0 if is_sample else 0.5 * period
     kept, measured = nodes_and_decorrelated_values(around, t, values, "efforts", late)
     times = around.node_times[kept]
@@ -200,7 +200,7 @@ def quantization_step(values: Array) -> float:
     if not math.isfinite(step):
         return 0.0
     count = apart / step
-    # a short recording repeats few values; without steps its smallest gap is far below the median of as many
+    # with few values, continuous data have a smallest gap far below the median gap
     if len(levels) >= 0.7 * values.size and np.median(count) > _MAX_STEPS_PER_GAP * len(levels):
         return 0.0
     return step if np.mean(np.abs(count - np.rint(count)) < 0.05 * np.maximum(count, 1)) > 0.95 else 0.0

@@ -35,7 +35,7 @@ class MountedSensor(Sensor):
     naive_prediction: ClassVar = "stays"
     has_paper_weight = False
     point_names = ()
-    names: tuple[str, ...]  # recorded ones of the sensors
+    names: tuple[str, ...]  # recorded names of the sensors
     signs: tuple[float, ...]  # sign of each sensor's reading, 1 or -1
     frame_names: tuple[str, ...]  # the model's frame that each sensor is mounted on
     group_name: str
@@ -97,7 +97,7 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
     sensor = kind(names, tuple(signs.tolist()), frames, key)
     values = group.values_by_quantity[channel.quantity].reshape(len(group.t), -1)
     steps = len(around.node_times) - 1
-    inner = (1, steps - 1)  # a force at either end depends on the motion beyond it
+    inner = (1, steps - 1)  # forces at both ends depend on the motion beyond the recording
     if not around.system.prescribed:
         last = around.node_times[list(inner)]
         kept = (group.t >= last[0] - 1e-9) & (group.t <= last[1] + 1e-9)

@@ -93,7 +93,7 @@ def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
     for key, entry in wide.frames.items():
         if entry.joint_index == before and key not in frame.proximal_names:
             frames[key] = replace(entry, joint_index=last, placement=back @ entry.placement)
-    if system.servos:  # a controller may carry the arm's own weight, but it still weighs on a sensor
+    if system.servos:  # a controller may compensate the arm's weight, but the weight still acts on a sensor
         joints = [replace(joint, bodies=tuple(map(_with_weight, joint.bodies))) for joint in joints]
     return replace(system, mechanism=replace(wide, joints=tuple(joints), frames=frames)), first
 

@@ -68,7 +68,7 @@ class Iterate:
     gradient_norm: float  # largest scaled component of the projected gradient
     n_evaluations: int  # rollouts of all recordings
     seconds: float
-    note: str = ""  # anything out of the ordinary, such as a shortened horizon
+    note: str = ""  # anything unusual, such as a shortened horizon
 
 
 EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
@@ -348,7 +348,7 @@ def solve(
     Solution
         Its status and message report non-convergence, which raises no error.
     """
-    # the matrices are small: threads of the linear algebra library cost more than they give
+    # small matrices: threads of the linear algebra library cost more than they save
     with threadpoolctl.threadpool_limits(1):
         if initial_unknowns is None:
             start = unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns)
@@ -514,12 +514,12 @@ def _fit_from(
         # the second pass is the first about torque offsets that are not guessed
         if (number and len(result.history) < 2) or result.stopped_by_callback:
             break
-        # a search that has come to a known fit is not weighted again
+        # a search that reaches a known fit is not whitened again
         if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
             return replace(same, n_evaluations=evaluations, history=history)
     finish = result.evaluation
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
-        # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
+        # torque errors were unknowns; the fit is judged by their likelihood about the result
         weighted, finish = problem_whitened_at(problem, x, warm, rounds=2), None
     finish = finish or weighted.evaluate(x, equilibrium_guesses=warm)
     return _Fit(result, finish, weighted, evaluations, history)

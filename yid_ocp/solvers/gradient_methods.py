@@ -179,7 +179,7 @@ class SingleShooting(SolverWithCheckedSettings):
             if key not in seen:
                 cost, gradient, evaluation = problem.cost_and_gradient(x, equilibrium_guesses=warm)
                 recorder.n_evaluations += 1
-                # a failed rollout is a wall: the line search steps back from it
+                # a failed rollout has a large cost, from which the line search steps back
                 seen[key] = (cost, gradient) if evaluation.ok else (1e3 * unit, np.zeros_like(x))
             cost, gradient = seen[key]
             return cost / unit, gradient * scale / unit

@@ -21,11 +21,11 @@ from yid_ocp.problem.signal_filters import LowPassFilter
 
 log = logging.getLogger(__name__)
 
-# Mean square whitened residual of a recording, by its number, with given node states, at unknowns of the problem.
+# Mean square whitened residual of a recording (by index), with given node states and unknowns.
 _MisfitFunction = Callable[[int, Array, Array], float]
-# Values tried of every shape parameter, across its range.
+# Number of values tried per shape parameter, over its range.
 _N_SHAPE_VALUES = 4
-# Part of an amplitude's range at which an effect begins that has no slope at its neutral value, and at the least.
+# Initial amplitude over its range, if the effect has no derivative at neutral, and smallest initial amplitude.
 _MIN_AMPLITUDE_FRACTION = 0.1
 # A start that cannot be rolled out is drawn back towards the neutral one.
 _START_FRACTIONS = (1.0, 0.5, 0.2, 0.05)

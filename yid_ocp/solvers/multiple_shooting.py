@@ -49,10 +49,10 @@ _MEMORY_WARNING_BYTES = 2e9
 _CONDENSING_NODE_INTERVAL = 20
 # Condensing. Largest factor by which one iteration changes an unknown that is positive by nature.
 _MAX_CHANGE_FACTOR = 3.0
-# Fraction of a point's cost or defects that a better point may at most have; shortest fraction of a step that is tried.
+# Required reduction factor of cost or defects; shortest fraction of a step that is tried.
 _IMPROVEMENT_MARGIN = 1.0 - 1e-5
 _MIN_STEP_FRACTION = 1e-3
-# Damping up to which a step tells how far the cost can still be lowered, and beyond which the search has stalled.
+# Damping up to which a step predicts the possible decrease of the cost; damping above which the search stalls.
 _MAX_TRUSTED_DAMPING, _STALLED_DAMPING = 0.1, 1e2
 # Largest defect that counts as closed [rad, m or N m s].
 _CLOSED_DEFECT = 1e-7
@@ -212,7 +212,7 @@ class MultipleShooting(SolverWithCheckedSettings):
             if moved < self.step_tolerance or flat:
                 if now.defect < _CLOSED_DEFECT:
                     return ended(Status.CONVERGED, f"closed to {now.defect:.1e}")
-                # a change along what the data do not inform would only open the defects again
+                # steps along uninformed directions would only increase the defects
                 step = np.zeros_like(step)
             slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
             factor = 1.0
@@ -297,7 +297,7 @@ class _Watch(ca.Callback):
         try:
             self.recorder.record_iterate(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
         except StopSearch as stop:
-            self.stop_request = stop  # IPOPT would make an error of its own of it
+            self.stop_request = stop  # IPOPT would replace it by its own error
             return [1]
         return [0]
 

@@ -38,7 +38,7 @@ from yid_ocp.vision.frames import look_at_pose
 
 _Generators = Mapping[str, np.random.Generator]
 
-# every sensor draws from a stream of its own, so that leaving one out changes no other; the order is part of the seed
+# each sensor has its own random stream, so removing one changes no other; the order is part of the seed
 _RANDOM_STREAMS = (
     *("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias", "clock"),
 )

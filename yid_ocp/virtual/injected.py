@@ -95,7 +95,7 @@ _ORDINARY_FRICTION: Mapping[str, tuple[float, float]] = {
     "joint_load_friction": (0.01, 0.04),
 }
 """Amplitudes of ordinary friction that MuJoCo's solver holds, by kind: over the effort limit, or of themselves."""
-_MAX_RATED_EFFORT = 100.0  # beyond which a limit is no motor's rating [N m]
+_MAX_RATED_EFFORT = 100.0  # larger effort limits are not a motor's rating [N m]
 
 
 def ordinary_friction_range(effect: EffectBase, system: System) -> tuple[float, float]:
@@ -267,7 +267,7 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
     apart = int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
 
     def hold(model: Any, data: Any) -> None:
-        # the controller's own model, whose grasps are off, knows of no friction
+        # the controller's model has no grasps and no friction
         if model.opt.disableflags & apart or not scene.has_motion_begun:
             return
         size = sizes["tau_c"] + sizes["tau_s"] * np.exp(-((data.qvel[at] / speeds) ** 2))
@@ -359,7 +359,7 @@ _FORCES: Mapping[str, _ForceBuilder] = {  # effects of the library
     ),
     "aerodynamic_drag": _aerodynamic_drag,
     "gravity_scale": _gravity_scale,
-    # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
+    # not MuJoCo's own spring, whose rest angle holds the arm in the search for equilibrium
     "joint_spring": _joint_law(lambda size, q, v, t: -size["stiffness"] * (q - size["rest_angle"])),
     "joint_coulomb": _joint_law(lambda size, q, v, t: -size["tau_c"] * math.tanh(v / _FRICTION_SMOOTHING_SPEED)),
     "joint_stribeck": _joint_law(
@@ -444,8 +444,8 @@ def _slipping_grasp(scene: _EffectContext, model: Any, grasp: str, size: float) 
 OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
     "torque_ripple": _joint_law(lambda size, q, v, t: size * math.sin(60.0 * q)),  # with the joint's angle [N m]
     "cross_stiffness": _bend_law(lambda size, q: -size * np.roll(q, len(q) // 2)),  # couples the two [N m/rad]
-    "quadratic_stiffness": _bend_law(lambda size, q: -size * q**2),  # stiffer one way than the other [N m/rad^2]
-    "gusts": _in_motion(_gusts),  # wind that comes and goes, spread over a segment's links [N]
+    "quadratic_stiffness": _bend_law(lambda size, q: -size * q**2),  # stiffer in one direction [N m/rad^2]
+    "gusts": _in_motion(_gusts),  # varying wind, spread over a segment's links [N]
     "crease": _crease,  # a tube that creases at one location: stiffness lost beyond an angle [N m/rad]
     # a cord from the floor side to a tip, or from above to an arm's link, taut beyond its length [N/m]
     "tether": _attached((0.0, 0.0, -_CORD_LENGTH), _cord),
@@ -460,7 +460,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
     "stiffness_drift": _in_motion(
         _spring_law(lambda size, angle, stiffness, t: size * t / _DRIFT_TIME * stiffness * angle)
     ),
-    "one_way_damping": _one_way_damping,  # bends that are damped one way only [N m s/rad]
+    "one_way_damping": _one_way_damping,  # bends that are damped in one direction only [N m s/rad]
     "saturating_drive": _saturating_drive,  # limits the torque, whatever the command and the record [N m]
     # viscous friction that fades while the gear warms up [N m s/rad]
     "warming_gear": _in_motion(_joint_law(lambda size, q, v, t: -size * math.exp(-t / _WARM_UP_TIME) * v)),
@@ -468,7 +468,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
     "shifting_load": _memory_law(
         lambda q: np.array([q, 0.0]), _load_shifted, lambda size, stiffness, q, memory: size * memory[1]
     ),
-    # a grasp that holds, lets the tube slip along itself, and holds again [m a slip]
+    # a grasp that holds, lets the tube slip along its axis, and holds again [m per slip]
     "slipping_grasp": _in_motion(_slipping_grasp),
 }
 """Effects outside the library, by kind: makers of forces from scene, MuJoCo model, location and size."""
@@ -513,7 +513,7 @@ def run_experiment_with_effects(
             raise ConfigError(what, where=effect.label, **details)
     described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in _DESCRIPTION_KINDS]
     changed = system.with_effects(described) if described else system
-    # a servo acts on what its encoder reads: gears with play are part of the mechanics
+    # a servo acts on its encoder reading: gears with play are part of the mechanics
     play = {e.location: e.values["width"] for e in effects if e.kind == "backlash" and e.location in system.servos}
     inner = [e for e in effects if e.kind not in _DESCRIPTION_KINDS and e.kind not in _SENSOR_ERROR_KINDS]
     held = [] if ordinary_friction is None else [e for e in inner if e.kind in _ORDINARY_FRICTION]

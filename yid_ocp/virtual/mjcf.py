@@ -67,7 +67,7 @@ _NATIVE_ASPECTS = (
 )
 
 _JOINTS_PER_BODY = 6  # MuJoCo's limit
-_ROTOR_INERTIA = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
+_ROTOR_INERTIA = 5e-4  # [kg m^2] of a motor behind play, as small as stability at a stop allows
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
@@ -240,7 +240,7 @@ def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> d
     constant = all(size <= scale for size in moved)
     apart = all(np.abs(x).max(initial=0.0) <= scale for entry in found for x in entry[6:])
     springs = np.abs(curve).max() <= scale and damping.max() <= scale and armature.min() >= -scale
-    loose = (np.abs(slope) <= scale) & (np.abs(pull) > scale)  # a constant torque is no spring
+    loose = (np.abs(slope) <= scale) & (np.abs(pull) > scale)  # a constant torque is not a spring
     if not (constant and apart and springs) or np.any(loose):
         return None
     return {

@@ -330,7 +330,7 @@ def _add_costs(
         return
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SURFACE_SAMPLES)).astype(np.int64)]
     points, part, own = points[chosen], part[chosen], own[chosen]
-    # a field of distances with room for the shifts, and for the arm's own way
+    # distance field with margins for the shifts and for the arm's motion
     edge = np.array([_SIDEWAYS_CELLS, _SIDEWAYS_CELLS, _FORWARD_CELLS])
     margin = _GRID_CELL_SIZE * (edge + 2) + 0.2
     low = own.min(axis=0) - margin

@@ -46,7 +46,7 @@ _END_OFFSET_STDS = 3.0  # stds of a point beyond which an end differs from the s
 _MAX_POINT_DISTANCE_SCALES = 3.0  # in last loss scales; points further away carry no information on the shape
 _TOUCHING_DISTANCE = 1e-3  # [m]
 _MIN_STIFFNESS_FRACTION = 1e-2  # lower bound of a bend's stiffness, relative to the mean
-_WEAK_REGULARISATION = 1e-2  # [1/m, 1/rad]; holds what no point tells, such as a straight rope's turn about itself
+_WEAK_REGULARISATION = 1e-2  # [1/m, 1/rad]; determines what no point shows, such as the roll of a straight rope
 _PASS_TOLERANCE = 1e-4  # change of a bend [rad] and relative change of the cost at which a pass ends
 
 
@@ -170,7 +170,7 @@ class ShapeFitter:
         at_rest = self._links_at(self.rest_configuration)
         self._lengths = np.linalg.norm(at_rest[:, 1] - at_rest[:, 0], axis=1)
         self._tube_lengths = np.array([self._lengths[self._links_of({name})].sum() for name in self.link_segments])
-        # links after which nothing comes
+        # links without successors
         places = np.array(ca.Function("held", [q], [taken])(self.rest_configuration)).reshape(-1, 3)
         apart = np.linalg.norm(at_rest[:, 1][:, None] - np.concatenate([at_rest[:, 0], places]), axis=2).min(axis=1)
         self.free_end_links = tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING_DISTANCE))
@@ -291,7 +291,7 @@ class ShapeFitter:
         factor = 1.0 / (options.correlated_points * options.surface_noise_std**2)
         weight = np.minimum(sight.point_weights, options.max_point_weight)[at_points]
         nodes, points = sight.skeleton_nodes[at_nodes], sight.points[at_points]
-        # nodes weigh together as much as the points, which share their errors
+        # nodes together weigh as much as the points, whose errors they share
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
         on_nodes, on_surface = (nodes, node_weight, _NODE_RADIUS_FRACTION), (points, weight * factor, 1.0)
         both = (on_nodes, options.node_loss_scales), (on_surface, options.surface_loss_scales)

@@ -112,7 +112,7 @@ def _read_depth_image(path: Path) -> Array:
     """A depth image (height, width) in the file's unit. `DataError` if it is not a grey 16-bit PNG."""
     o3d = import_open3d()
     with files.check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
-        head = file.read(24)  # whose last eight bytes are a PNG's width and height
+        head = file.read(24)  # the last eight bytes are a PNG's width and height
     files.check_max_input_numbers(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))

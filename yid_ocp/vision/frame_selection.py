@@ -324,7 +324,7 @@ def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
     """Whether parts of a shape that are far apart along it touch. Links are (K, 2, 3), radii (K,) [m]."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
-    edges = np.where(near < _TOUCHING_DISTANCE, 1e-6, 0.0)  # zero is no way
+    edges = np.where(near < _TOUCHING_DISTANCE, 1e-6, 0.0)  # zero would mean no edge
     lengths = np.linalg.norm(centre_line[:, 1] - centre_line[:, 0], axis=1)
     starts = 2 * np.arange(len(centre_line))
     edges[starts, starts + 1] = edges[starts + 1, starts] = lengths

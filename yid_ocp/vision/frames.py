@@ -236,10 +236,10 @@ _MIN_DEPTH = 0.05  # smallest depth in front of the camera [m]
 class OcclusionMap:
     """Map of the regions that surfaces in a frame hide, computed from all measured points."""
 
-    points: Array  # (N, 3), in the world, before anything is left out [m]
+    points: Array  # (N, 3), in the world, before filtering [m]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world
     intrinsics: CameraIntrinsics | None = None  # without it, points along most of a side define the image border
-    # (M, 3), points about which will be asked, so that what stands before them is sorted once [m]
+    # (M, 3), points near later queries, so that occluders are sorted only once [m]
     expected_points: Array | None = None
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 

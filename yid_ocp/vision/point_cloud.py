@@ -25,7 +25,7 @@ XyzTuple = tuple[float, float, float]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
-_SPACING_SAMPLE_POINTS = 3000  # points, at least, that tell how far neighbours usually are
+_SPACING_SAMPLE_POINTS = 3000  # smallest number of points that estimate the usual spacing
 _MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
 
 
@@ -154,7 +154,7 @@ class ReachableObjectRegion:
 
         def contains(points: Array) -> BoolArray:
             inside = np.ones(len(points), bool)
-            for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
+            for axis in range(3):  # column by column, which is faster on large clouds
                 inside &= (points[:, axis] >= self._lower[axis]) & (points[:, axis] <= self._upper[axis])
             rest = np.flatnonzero(inside)
             near = _square_distances(points[rest], centre) <= self._radius**2
@@ -254,10 +254,10 @@ class SkeletonOptions:
 class CloudSkeleton:
     """Skeleton of a cloud: nodes, a spanning forest between them, and the node of each point."""
 
-    nodes: Array  # (K, 3), centroids of the kept segments, in the order of the walk [m]
+    nodes: Array  # (K, 3), centroids of the kept segments, in order of extraction [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
     edges: IntArray  # (E, 2), minimum spanning forest of the graph of nearest neighbours
-    component_of_node: IntArray  # (K,), connected part of each node, the one with most points first
+    component_of_node: IntArray  # (K,), connected part of each node, largest part first
 
     @property
     def is_point_assigned_to_node(self) -> BoolArray:
@@ -277,7 +277,7 @@ def _thin_to_nodes(
     while len(alive):
         first = _near(points, seed, options)
         centred = _near(points, np.average(points[first], axis=0, weights=weight[first]), options)
-        if not len(centred):  # a ring about its own centre: take the segment itself, or the walk would not go on
+        if not len(centred):  # a ring around its own centre: use the segment itself to continue
             centred = first
         centre = np.average(points[centred], axis=0, weights=weight[centred])
         if len(centred) >= options.min_segment_points:

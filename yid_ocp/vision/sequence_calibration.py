@@ -279,7 +279,7 @@ def estimate_and_check_dimensions(
         covariance = np.asarray(inverse + scatter + np.diag(shared**2))
         change = change + np.clip(step, -_MAX_STEP, _MAX_STEP)
         if turn == 0 and not wanted.any() and (np.abs(change) < _CLEAR_STDS * np.sqrt(np.diag(covariance))).all():
-            break  # nothing to doubt
+            break  # no contradiction
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     known = np.sqrt(np.diag(covariance)) < _MAX_KNOWN_LOG_STD

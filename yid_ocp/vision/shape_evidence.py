@@ -26,7 +26,7 @@ _HIDDEN_SIDE_COSINE = -0.5  # cosine of normal and sight beyond which a point ca
 _MIN_LINK_STATIONS = 6  # fewest stations per link at which coverage is tested
 _ON_SURFACE_STDS = 3.0  # distance from the surface within which a point lies on it
 _MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
-_MAX_LINK_SPACINGS = 3.0  # times the usual distance of neighbours, within which two points hang together
+_MAX_LINK_SPACINGS = 3.0  # times the usual spacing, within which two points are connected
 _MIN_THING_POINTS = 12  # points of a thing
 _FOREIGN_SURFACE_FRACTION = 0.5  # foreign fraction of the surface around a point, at which a thing continues there
 _MAX_THINGS = 8  # largest number of foreign clusters kept per frame
@@ -42,8 +42,8 @@ class TubeLinks:
 
     link_ends: Array  # (K, 2, 3), start and end of every link's centre line [m]
     radius: Array  # (K,) [m]
-    free_end_links: tuple[int, ...]  # links whose end nothing holds and nothing grows on
-    tube_lengths: Array  # (K,), length of the whole tube that a link belongs to [m]
+    free_end_links: tuple[int, ...]  # links with a free end
+    tube_lengths: Array  # (K,), length of the tube of each link [m]
 
 
 def tube_link_projections(
@@ -98,7 +98,7 @@ class ShapeFitQuality:
     """Fit quality of a shape in one frame: noise, distances, link coverage, end offsets, foreign clusters."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
-    mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
+    mean_distance: float  # mean distance from the surface of nearby points that are not foreign [m]
     # (K,), fractions of each link's length with own points, and visibly without points
     covered_fraction: Array
     visibly_empty_fraction: Array
@@ -376,7 +376,7 @@ class FrameTubeDimensionCost:
 class FrameShapeFit(ShapeFitQuality):
     """Fitted shape of one frame with its uncertainty and quality."""
 
-    q: Array  # (n,), configuration, twists at rest
+    q: Array  # (n,), configuration with zero twists
     point_positions: Array  # (np, 3), positions of the system's points [m]
     point_std: Array  # (np, 3), standard deviation of each coordinate by the curvature of the cost [m]
     is_point_seen: BoolArray  # (np,), whether a gripper holds the point or enough points are near it

@@ -159,7 +159,7 @@ class ArticulatedSurfaces:
         """World points in a part's box, widened by a margin [m]: indices, and positions in the part's frame."""
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         (low, high), inside = self._boxes[part], np.ones(len(local), bool)
-        for axis in range(3):  # column by column, which is quicker than whole rows
+        for axis in range(3):  # column by column, which is faster
             inside &= (local[:, axis] > low[axis] - margin) & (local[:, axis] < high[axis] + margin)
         near = np.flatnonzero(inside)
         return near, local[near]
@@ -189,7 +189,7 @@ class ArticulatedSurfaces:
             answer = self._scenes[part].compute_closest_points(_tensor(query), nthreads=1)
             away = query - answer["points"].numpy()
             length = np.linalg.norm(away, axis=1).astype(np.float64)
-            # the way to a surface that is all but touched is rounding: its own normal is better
+            # for a nearly touched surface the difference vector is rounding noise: use the surface normal
             flat = answer["primitive_normals"].numpy()
             flat = flat * np.where((flat * away).sum(1) < 0, -1.0, 1.0)[:, None]
             unit = np.where(length[:, None] > _TOUCHING_DISTANCE, away / np.maximum(length, 1e-12)[:, None], flat)
@@ -422,7 +422,7 @@ def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = N
 
 # edges and middles of thin boxes [m]
 _FLOOR_AND_WALL = (([8.0, 8.0, 0.02], [1.0, 0.0, -0.94]), ([0.02, 8.0, 3.0], [-0.61, 0.0, 0.5]))
-_PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
+_PERIOD_JITTER = 0.25  # largest variation of a period, as a fraction of the mean
 
 
 @dataclass(frozen=True)
@@ -437,7 +437,7 @@ class DepthSensorModel:
     disparity_std: float = 1 / 16  # standard deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m
     disparity_step: float = 1 / 8  # step of the disparity [pixels]; 1/8 gives 12 mm at 2 m
     noise_correlation_length: float = 0.7  # correlation length of errors of neighbouring pixels [pixels]
-    # cosine of ray and normal below which nothing comes back; up to twice as much it comes back sometimes
+    # cosine of ray and normal below which no depth is measured; up to twice this value it is sometimes measured
     min_incidence_cosine: float = 0.12
     min_relative_edge_depth: float = 0.02  # difference of neighbouring pixels that makes an edge, relative to depth
     # probability that a pixel at an edge is lost, or lies anywhere between front and back
@@ -483,7 +483,7 @@ class DepthSensorModel:
         disparity = self.intrinsics.fx * self.baseline / depth
         height, width = depth.shape
         margin = math.ceil(float(disparity.max())) + 1
-        # the projector stands at x = -baseline, so that its image of a pixel lies to the right by the disparity
+        # the projector is at x = -baseline, so its image of a pixel is shifted right by the disparity
         column = np.rint(np.arange(width) + disparity).astype(np.int64)
         flat = np.arange(height)[:, None] * (width + margin + 1) + np.minimum(column, width + margin)
         nearest = np.zeros(height * (width + margin + 1))

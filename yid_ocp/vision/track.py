@@ -45,7 +45,7 @@ from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, Trac
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
 _MAX_SIZED_FRAMES = 8  # largest number of frames used to estimate the object's dimensions
-_DISTANCE_SAMPLE_POINTS = 2000  # points that tell how far away a cloud is
+_DISTANCE_SAMPLE_POINTS = 2000  # points that estimate the distance of a cloud
 _MAX_DISTANCE = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME_TOLERANCE = 1e-6  # [s]
 _RIVAL_SHAPE_RATIO = 1.2  # times the distance of the best shape, up to which another one may be the right one

@@ -68,10 +68,10 @@ class TrackResult:
 
     point_names: tuple[str, ...]  # points written down
     t: Array  # (M,), times of the good frames on the joints' clock [s]
-    configurations: Array  # (M, n), configurations, twists at rest
+    configurations: Array  # (M, n), configurations with zero twists
     position: Array  # (M, np, 3), NaN (as in `std`) if a point was not seen well enough [m]
     std: Array
-    shared_std: Array  # the part that all frames have in common, from the camera's pose, depth and clock
+    shared_std: Array  # common part of all frames, from the camera's pose, depth and clock
     frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
     camera_calibration: CameraCalibration
     dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them

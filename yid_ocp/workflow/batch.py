@@ -154,7 +154,7 @@ def _run_batch_task(
     name: str, config: Path, settings: Sequence[str], inputs: Sequence[Path], command: str, folder: str
 ) -> dict[str, Any]:
     """Task: one run of the batch in its own folder, replacing an earlier attempt. Returns its entry of batch.json."""
-    del inputs  # they are part of what the result is kept by
+    del inputs  # part of the key of the result
     target = Path(folder) / name
     if target.exists():
         shutil.rmtree(target)

@@ -325,7 +325,7 @@ def _excitation(
         options = _choice(run)(JOINT_EFFORT_GROUP_NAME)
         whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
         weak = [list(joint_checks.check_inertial_effort_excitation(arm, one, options)) for one in whole]
-        if all(weak):  # one recording that tells is enough
+        if all(weak):  # one informative recording is enough
             found += [doubt for doubts in weak for doubt in doubts]
     return found
 

@@ -47,7 +47,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         folder.record_run_start(run, "check")
         warnings: list[str] = []
         progress.begin_stage("building the model")
-        # the equations are the same compiled or not, and a check needs only a few steps
+        # compiled equations are the same, and a check needs only a few steps
         plain = replace(run, problem=replace(run.problem, use_compiler=False))
         step = build_step(plain)
         recordings, problem = [], None
@@ -196,7 +196,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
     warnings += notes
-    # how poorly initial values fit does not predict the uncertainty after a fit
+    # the misfit of initial values does not predict the uncertainty after a fit
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
     return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})

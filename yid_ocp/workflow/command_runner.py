@@ -98,7 +98,7 @@ def print_json(result: Mapping[str, Any]) -> None:
 _MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage [s]
 _BAR_WIDTH = 12  # on a terminal [characters]
 _MAX_TABLE_ROWS = 10  # results shown below the bar on a terminal
-_MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it is guessed [s]
+_MIN_ESTIMATE_TIME = 2.0  # shortest time of a stage before its remaining time is estimated [s]
 _USUAL_IMPORT_TIME = 1.6  # usual import time of a command, at the pace of the stages' usual times [s]
 _USUAL_ITERATIONS = 20  # usual number of iterations of a search
 
@@ -137,7 +137,7 @@ class _RemainingTime:
     def seconds_left(self) -> float:
         spent, pace = time.monotonic() - self._begun, self._spent / self._usual
         if self._work == 0:
-            return max(self._ahead * pace, 1.25 * spent)  # longer than expected: as long again, and more
+            return max(self._ahead * pace, 1.25 * spent)  # beyond the usual time: as long again, and more
         expected = self._work * pace
         if self.n_iterates:
             expected = spent * (_USUAL_ITERATIONS + 1) / (self.n_iterates + 1)
@@ -188,7 +188,7 @@ class StderrLogLinesProgress(Progress):
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Print a line for every tenth of the stage, or if the last line is some seconds old."""
         tenths, left = 10 * done // max(total, 1), self._left.of_parts(done, total)
-        # a line for every frame would be too many
+        # one line per frame would be too many
         if tenths > self._tenths or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
             self._tenths, self._last = tenths, time.monotonic()
             print(f"  {done} of {total}, {text}{left or self._left.of_command()}", file=sys.stderr, flush=True)

@@ -34,9 +34,9 @@ _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
 _JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03  # A joint [rad/s] or a point [m/s] slower than this is at rest
 _REST_WINDOW = 0.1  # window for speeds [s]; up to twice the sample period of slow sensors
 _MIN_FRICTION_TRAVEL = 0.02  # a joint that turns less than this does not inform its friction [rad]
-_COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this part of the motion are a copy of them
+_COPIED_COMMAND_RATIO = 1e-6  # relative distance to the measured angles below which commands are copies of them
 _TORQUE_BIAS_FRACTION = 0.01  # default constant torque error, as a fraction of a joint's effort limit
-_MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
+_MIN_ARM_TRAVEL = 0.1  # joints that together turn less than this do not move [rad]
 _POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays bent [%]
 _MAX_ROUNDED_PERCENT = 0.2  # largest rounding of a location on a straight segment [%]
 _MAX_BEYOND_LENGTH = 0.02  # of the object's length; no point can be farther from its holder by more
@@ -82,10 +82,10 @@ class _GroupNoise:
 class ProposedConfigChoices:
     """Proposed choices for a generated configuration, with reasons."""
 
-    joints: tuple[str, ...]  # recorded ones that move the object, in the URDF's order
-    unused_joints: tuple[str, ...]  # recorded ones that the model does not need or know
-    unrecorded_joints: tuple[str, ...]  # movable ones of the URDF
-    arms: tuple[_ArmChain, ...]  # that hold the object, the first one its root
+    joints: tuple[str, ...]  # recorded joints that move the object, in the URDF's order
+    unused_joints: tuple[str, ...]  # recorded joints that the model does not need or know
+    unrecorded_joints: tuple[str, ...]  # movable joints of the URDF that are not recorded
+    arms: tuple[_ArmChain, ...]  # arms that hold the object; the first one carries its root
     holder_frame: str  # carries the object's root
     grasps: Mapping[str, str]  # point of the object by the frame that holds it
     arm_mode: str
@@ -161,7 +161,7 @@ def propose_config_choices(
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     tree = read_urdf(robot, joints=known)
     arms = tuple(sorted(_arms(tree), key=lambda arm: -_travel(first, arm.joints)))
-    if holder is None and not branches:  # a payload hangs on what looks most like a tool, a fixed frame of it last
+    if holder is None and not branches:  # a payload is on the frame most similar to a tool
         holder = min(reversed([name for name, at in tree.frames.items() if at.joint_index >= 0]), key=_tool_rank)
     holder, own = _holder(tree, arms, holder, standing)
     held = dict(grasps or {})
@@ -337,7 +337,7 @@ def _places(
 ) -> dict[str, tuple[_PointPlacement, ...]]:
     """Locations of all points: a frame or segment of the same name, else, on an arm, from measured positions."""
     names = [branch.name for branch in branches]
-    standing = standing or not branches  # an arm alone holds nothing on which a point could sit
+    standing = standing or not branches  # an arm alone has no object with points
     frames = {f"w_{name}" for name in names} | set(tree.frames)
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for group in recording.points:
@@ -404,7 +404,7 @@ def _near(
     poses = _poses(tree, recording, holder, t[seen])
     from_holder = position[seen] - poses[:, :3, 3]
     if len(branches) == 1:
-        # an object that bends brings its points nearer, never farther: the farthest is the nearest to its arc length
+        # bending brings points nearer, never farther: the farthest position is the closest to the arc length
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:

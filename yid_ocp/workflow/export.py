@@ -109,7 +109,7 @@ class _CalibratedModel:
             return build_system(run)
         kept = {"", *labels}
         effects = tuple(effect for effect in run.model.effects if f"{effect.kind}@{effect.location}" in kept)
-        # parameters, and patterns of them, are named after their effect
+        # parameters, and patterns of them, start with the name of their effect
         owners = {name: name.rpartition(".")[0] if "@" in name else "" for name in run.parameters}
         parameters = {name: said for name, said in run.parameters.items() if owners[name] in kept}
         return build_system(replace(run, model=replace(run.model, effects=effects), parameters=parameters))
@@ -189,7 +189,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     try:
         write_strict_json(out.with_name(f"{out.name}.manifest.json"), manifest)
     except BaseException:
-        out.unlink(missing_ok=True)  # a model without its manifest would be silent about what it lacks
+        out.unlink(missing_ok=True)  # without its manifest, a model would not state its losses
         raise
     return manifest
 

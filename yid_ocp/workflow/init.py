@@ -220,7 +220,7 @@ def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -
     return str(page) if write_report(page, data) else None
 
 
-_PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")  # text that YAML reads as it stands
+_PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")  # text that YAML reads unchanged
 _YAML_KEYWORDS = ("true", "false", "null", "yes", "no", "on", "off")
 _COMMENT_COLUMN = 44
 _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
@@ -449,7 +449,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
         elif group.startswith(ESTIMATED_WRENCH_GROUP):
             entries = ["use: false", *entries]
             said = "an estimate from joint torques, less the loads that the driver knows: in place of efforts only"
-        # without a setting of its own, a comment
+        # a comment, if there is no setting
         yield _line("  ", group, f"{{{', '.join(entries)}}}", said) if entries else f"  # {group}: {said}"
         for place in places:
             yield f"  #   {place.point} at {place.frame or '?'}: {place.reason}"

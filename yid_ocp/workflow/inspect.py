@@ -62,7 +62,7 @@ def _run_inspect(
         step = build_step(run)
         seconds = time.perf_counter() - begun
         symbols, parameters = NamedStepEquations.from_equations(step.equations), step.system.parameters
-        # a wrong name is refused before anything takes time; parameters are single names without brackets
+        # check names before anything slow; parameter names have no brackets
         asked = [text.strip() for text in entries]
         named = [text for text in asked if text and not set(text) & set("[,")]
         for name in named:

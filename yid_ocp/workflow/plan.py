@@ -34,7 +34,7 @@ from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_fi
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role
 
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated noise in the recording of a plan, for later estimation [N m], [m]
-_MAX_DISCRIMINATED_EFFECTS = 3  # number of effects that one motion has to separate, the likeliest ones
+_MAX_DISCRIMINATED_EFFECTS = 3  # number of effects that one motion discriminates, the most likely ones
 _Plan = TargetMotionPlan | InformativeMotionPlan
 
 

@@ -38,7 +38,7 @@ _FULL_HINT = "choose a folder on a disk with room, with --out"
 class RunFolder:
     """A run folder while it is written, with its paths, log and hashes of inputs."""
 
-    final_path: Path  # its name when complete
+    final_path: Path  # name of the complete folder
     path: Path  # present path
     resume_folder: Path  # where an interrupted run can leave data for the next run of its name; not created here
     _log: TextIO = field(repr=False)
@@ -122,7 +122,7 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
     stem = "-".join(filter(None, (run.name, command)))
     targets = _targets(run, out, stem)
     made = [parent for parent in targets[0].parents if not parent.exists()]
-    with interruption.defer_interruption():  # no folder without anybody who knows of it
+    with interruption.defer_interruption():  # no folder without an owner
         try:
             with _refusing("made", targets[0], "choose a writable folder with --out"):
                 target, lock = _reserved(targets)
@@ -206,7 +206,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         lock = _locked(temporary)
         if lock is None:
             continue
-        if len(targets) > 1 and os.path.lexists(target):  # its run ended meanwhile
+        if len(targets) > 1 and os.path.lexists(target):  # another run completed meanwhile
             _clear(temporary, [])
             lock.release()
             continue
@@ -281,7 +281,7 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
         target = Path(out).expanduser().absolute()
         is_link, is_folder = target.is_symlink(), target.is_dir()
         filled, is_file = is_folder and any(target.iterdir()), not is_folder and target.exists()
-    except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, an unknown user's home
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, or an unknown user's home
         what = f"this cannot be a run folder: {os_error_reason(error)}"
         raise OutputError(what, where=str(out)[:200], hint="choose a writable folder with --out") from error
     if filled:
@@ -298,7 +298,7 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
 def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
     with interruption.defer_interruption():
         if temporary is not None:
-            with contextlib.suppress(OSError):  # the lock last: without it the rest is nobody's
+            with contextlib.suppress(OSError):  # delete the lock last: the rest would have no owner without it
                 _remove_all_but_lock(temporary)
             shutil.rmtree(temporary, ignore_errors=True)
         for parent in made:

@@ -178,7 +178,7 @@ def _difference(run: RunSettings, there: RunSettings | None) -> str:
     for key in _COMPARED_MODEL_SECTIONS:
         here, other = getattr(run.model, key), getattr(there.model, key)
         if key == "robot" and here is not None and other is not None:
-            here, other = Path(here).name, Path(other).name  # a folder may have moved
+            here, other = Path(here).name, Path(other).name  # a folder may have been moved
         if isinstance(here, ObjectKind) and isinstance(other, ObjectKind):
             here, other = here.with_file_names_only(), other.with_file_names_only()
         if here != other:

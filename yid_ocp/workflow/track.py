@@ -356,7 +356,7 @@ def _frame_tasks(
 
 def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
-    del inputs  # they belong to what the result depends on
+    del inputs  # part of the key of the result
     try:
         return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).estimate_sequence_calibration()))
     except DataError as error:
