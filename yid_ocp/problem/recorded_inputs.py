@@ -36,8 +36,8 @@ def mean_step_inputs(
 ) -> Array:
     """Mean input (steps, nu) of driven joints in every step: torque [N m] or servo command [rad or m].
 
-    Effort samples are interpolated by a cubic spline. Recorded interval means give the derivative of a spline through
-    their cumulative sum, which preserves every mean. Efforts of kind `command` and held commands are piecewise
+    Effort samples are interpolated by a cubic spline. For interval means, the input is the derivative of a spline
+    through their cumulative sum, which preserves every mean. Efforts of kind `command` and held commands are piecewise
     constant. A lost sample is interpolated from its neighbours. Each input acts later than recorded by `delay` (nu,)
     [s]. With `servos` (for all driven joints) the input is the position command. `where` is the name of the recording.
     Raises `DataError` if a joint is missing, or if efforts (with `servos`: commands) are not recorded."""

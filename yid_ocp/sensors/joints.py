@@ -141,9 +141,9 @@ def smoothed_effort_data(
 ) -> SensorData:
     """Low-pass filter an effort sensor's measurements and thin them until their noise is nearly independent.
 
-    `values` (M, k) are in the sensor's unit, with white noise `std` (k,) and constant errors `bias` (k,) (stds). With
-    `is_sample`, a value belongs to its time, otherwise it is the mean of the interval until the next value. Raises
-    `DataError` if the recording is too short for the filter."""
+    `values` (M, k) are in the sensor's unit. `std` and `bias` (k,) are the standard deviations of white noise and of a
+    constant error. With `is_sample`, a value belongs to its time, otherwise it is the mean of the interval until the
+    next value. Raises `DataError` if the recording is too short for the filter."""
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
     # the mean of an interval belongs to its centre
     late = 0.0 if is_sample else 0.5 * period

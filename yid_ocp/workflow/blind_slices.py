@@ -129,8 +129,8 @@ def rescore_blind(
 ) -> CommandOutcome[None]:
     """Judge finished cases of a blind validation again, with the present rules and the thresholds in `overrides`.
 
-    Nothing is refitted. `out` receives `result.json` (`yid-blind/1`). Its `rescored` lists the cases whose verdict or
-    effects change, and counts as `not_judged` the cases that need a refit which the original diagnosis did not make."""
+    Nothing is refitted. `out` receives `result.json` (`yid-blind/1`): `rescored` lists the cases whose verdict or
+    effects change, `not_judged` counts the cases that need a refit which the original diagnosis did not make."""
     made, target = Path(folder), make_folder(out)
     commitment = read_input_json(made / "commitment.json")
     labels = {}
