@@ -115,8 +115,7 @@ class InitialStateFitter:
 
         `configuration` (nk,) holds the driven, then the prescribed coordinates at node 0. Only points of `samples` are
         used, in the first `window` [s]. `path` (N + 1, nc) holds the prescribed coordinates at all nodes. With
-        `roughly`, only the pose of the object is fitted. Raises `DataError` if no point is measured within the
-        window."""
+        `roughly`, the fit stops at a coarse shape. Raises `DataError` if no point is measured within the window."""
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
         frames: dict[int, list[tuple[SensorMeasurements, int]]] = {}
