@@ -57,7 +57,7 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 def test_a_place_that_cannot_hold_a_file(tmp_path):
-    with pytest.raises(OutputError, match="that of a folder"):
+    with pytest.raises(OutputError, match="this path is a folder"):
         write_strict_json(tmp_path, 1)
     with pytest.raises(OutputError, match="does not exist"):
         write_strict_json(tmp_path / "no" / "a.json", 1)

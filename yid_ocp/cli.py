@@ -1,7 +1,6 @@
 """Command-line interface: commands, their arguments and shell completion.
 
-`workflow` implements the commands. A command's module is imported when it runs, so that `--help` loads no numerical
-library.
+`workflow` implements the commands. A command's module is imported when it runs; `--help` loads no numerical library.
 """
 
 from __future__ import annotations
@@ -25,7 +24,14 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
 
 from yid_ocp import interruption
-from yid_ocp.errors import ConfigError, InsufficientMemoryError, OutputError, YidError, unknown_name_error_arguments
+from yid_ocp.errors import (
+    ConfigError,
+    InsufficientMemoryError,
+    OutputError,
+    YidError,
+    missing_package_error,
+    unknown_name_error_arguments,
+)
 
 _EXIT_WRONG_INPUT, _EXIT_BUG, _EXIT_INTERRUPTED = 2, 3, 130
 _ERROR_FORMAT = "yid-error/1"
@@ -273,8 +279,8 @@ def _print_completion_script(arguments: argparse.Namespace) -> int:
     try:
         print(import_module("argcomplete").shellcode(["yid-ocp"], shell=arguments.shell).strip())
     except ImportError as error:
-        what = "completion needs a package that is not installed"
-        raise ConfigError(what, where="argcomplete", hint="pip install 'yid-ocp[completion]'") from error
+        what = "completion needs the package argcomplete"
+        raise missing_package_error(ConfigError, what, "completion") from error
     return 0
 
 
@@ -350,10 +356,10 @@ class _Parser(argparse.ArgumentParser):
         if rest:
             flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
             if not flag.startswith("-"):
-                raise ConfigError(f"'{rest[0]}' is one argument too many", where=self.prog, hint=self._help())
-            raise ConfigError(
-                f"there is no option '{flag}'", where=self.prog, **unknown_name_error_arguments(flag, flags)
-            )
+                what, allowed = f"'{rest[0]}' is one argument too many", "the arguments that --help lists"
+                raise ConfigError(what, where=self.prog, allowed=allowed, hint=f"leave it out, or {self._help()}")
+            said = unknown_name_error_arguments(flag, flags, self._help())
+            raise ConfigError(f"there is no option '{flag}'", where=self.prog, **said)
         return found, rest
 
     def error(self, message: str) -> NoReturn:
@@ -361,9 +367,9 @@ class _Parser(argparse.ArgumentParser):
         if chosen:
             known = [name.strip(" '") for name in chosen[3].split(",")]
             noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
-            details = unknown_name_error_arguments(chosen[2], known)
+            details = unknown_name_error_arguments(chosen[2], known, self._help())
             raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
-        raise ConfigError(message, where=self.prog, hint=self._help())
+        raise ConfigError(message, where=self.prog, allowed=self.format_usage().strip(), hint=self._help())
 
     def _help(self) -> str:
         return f"see {self.prog} --help"
@@ -461,8 +467,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0: done. 1: the solve failed; the run folder states why. 2: wrong input, or an error of the operating system.
         3: a bug. 128 plus the signal number (130 for an interruption) if a signal ended the command. With `--json` an
-        error is also printed as `yid-error/1`: kind, what, where, allowed, hint and exit_code.
-    """
+        error is also printed as `yid-error/1`: kind, what, where, allowed, hint and exit_code."""
     if "_ARGCOMPLETE" in os.environ:
         _print_shell_completions(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
@@ -491,9 +496,9 @@ def _parsed_and_carried_out(argv: Sequence[str] | None, as_json: bool) -> int:
 def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     try:
         os.getcwd()
-    except OSError as error:
-        what = f"the working directory is not there: {error.strerror or error}"
-        return _wrong(OutputError(what, hint="cd to one that is"), as_json)
+    except OSError:
+        what, allowed = "the working directory does not exist any more", "an existing working directory"
+        return _wrong(OutputError(what, where=".", allowed=allowed, hint="cd to an existing folder"), as_json)
     # matrices are small: threads of the linear algebra library cost more than they gain, in workers as well
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -521,17 +526,20 @@ def _failed(error: Exception, as_json: bool) -> int:
     if isinstance(error, BrokenPipeError):
         _discard_what_follows(sys.stdout)
         what = "standard output was closed before all was printed"
-        return _wrong(OutputError(what, hint="read it to its end"), False)
+        hint = "read the output to its end, or write it to a file"
+        return _wrong(OutputError(what, where="standard output", allowed="an open pipe or file", hint=hint), False)
     if isinstance(error, OSError):
-        what = f"the system refused: {error.strerror or error}"
-        hint = "see whether disk and rights allow it"
-        return _wrong(OutputError(what, where=str(error.filename or ""), hint=hint), as_json)
+        what = f"the operating system refused access: {error.strerror or error}"
+        allowed = "a path with the needed permissions and free disk space"
+        hint = "check permissions and free disk space"
+        return _wrong(OutputError(what, where=str(error.filename or ""), allowed=allowed, hint=hint), as_json)
     if isinstance(error, ValueError) and "embedded null" in str(error):  # what Python says of a NUL in a path
-        what, allowed = "a path holds a NUL", "names without control characters"
-        return _wrong(ConfigError(what, allowed=allowed, hint="write the path anew"), as_json)
+        what, allowed = "a path has a null character", "paths without null characters"
+        return _wrong(ConfigError(what, allowed=allowed, hint="correct the path"), as_json)
     if isinstance(error, MemoryError):
-        what = f"there is not enough memory: {error}"
-        return _wrong(InsufficientMemoryError(what, hint="shorten the run, or take fewer links"), as_json)
+        what, hint = f"there is not enough memory: {error}", "shorten the run, or use fewer links or workers"
+        allowed = "a run that fits into the free memory"
+        return _wrong(InsufficientMemoryError(what, where="this machine", allowed=allowed, hint=hint), as_json)
     # any other exception is a bug of this package
     with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
         traceback.print_exception(error, file=file)

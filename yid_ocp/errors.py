@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
 
 class YidError(Exception):
     """An error that the user can correct. It states what is wrong, where, what is allowed and what to do next.
 
-    Its text has all four parts, at most 600 characters in total, with control characters escaped.
-    """
+    Its text has all four parts, at most 600 characters in total, with control characters escaped."""
 
-    _usual_allowed = "what the documents describe"
+    _usual_allowed = "what docs/reference and docs/howto describe"
     _usual_hint = "correct it and run the command again"
 
     def __init__(self, what: str, *, where: str = "", allowed: str = "", hint: str = "") -> None:
@@ -23,7 +24,7 @@ class YidError(Exception):
         """The keys what, where, allowed and hint as the user sees them. Missing parts have general texts."""
         said = {
             "what": self.what,
-            "where": self.where or "the command as it was given",
+            "where": self.where or "the arguments of this command or function",
             "allowed": self.allowed or self._usual_allowed,
             "hint": self.hint or self._usual_hint,
         }
@@ -42,32 +43,45 @@ class YidError(Exception):
 class ConfigError(YidError):
     """Raised when the configuration file, or a value that overrides it, is invalid."""
 
-    _usual_allowed = "keys and values as docs/reference/settings.md lists them"
+    _usual_allowed = "the keys and values in docs/reference/settings.md"
 
 
 class DataError(YidError):
     """Raised when a recording or another input file is missing, malformed or does not fit the model."""
 
-    _usual_allowed = "a whole file as docs/reference/recordings.md describes it"
-    _usual_hint = "correct the file, or record it again"
+    _usual_allowed = "data in a format that docs/reference/recordings.md or docs/howto/import.md describes"
 
 
 class ModelError(YidError):
     """Raised when the mechanical model cannot be built as described."""
 
-    _usual_allowed = "a model as docs/howto/choosing.md describes it"
-    _usual_hint = "correct the robot's file, or the section `model`"
+    _usual_allowed = "a model as the section `model` of docs/reference/settings.md describes it"
 
 
 class SolverError(YidError):
     """Raised when a method does not support the task, or when a solver finds no usable solution."""
 
 
+def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
+    """Make the `SolverError` for a model that cannot be simulated."""
+    allowed, hint = "values at which the simulation succeeds", "choose other initial values, or a smaller time step"
+    return SolverError(f"the model cannot be simulated: {reason}", where=where, allowed=allowed, hint=hint)
+
+
+_Error = TypeVar("_Error", bound=YidError)
+
+
+def missing_package_error(kind: type[_Error], what: str, extra: str) -> _Error:
+    """Make the error for a missing package of the optional dependencies `extra`."""
+    where, hint = f"the Python environment {sys.prefix}", f"pip install 'yid-ocp[{extra}]'"
+    return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
+
+
 class OutputError(YidError):
     """Raised when a result cannot be written to its destination."""
 
-    _usual_allowed = "a place of your own on a disk with room"
-    _usual_hint = "choose another place with --out"
+    _usual_allowed = "a new name in a writable folder, on a disk with free space"
+    _usual_hint = "choose another path"
 
 
 class WorkerError(YidError):
@@ -95,19 +109,13 @@ def _shortened(text: str, length: int) -> str:
 _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none is similar, and listed otherwise
 
 
-def nearest_name_hint(name: str, known: Iterable[str]) -> str:
-    """Hint for an error about an unknown name: the most similar known name, or a list of known names.
+def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str = "") -> dict[str, str]:
+    """Arguments `allowed` and `hint` for an error about an unknown name. Long lists of names are shortened.
 
-    For an error that also lists what is allowed, use `unknown_name_error_arguments`.
-    """
+    The hint is the most similar known name; `otherwise` if no name is similar."""
     names = [str(entry) for entry in known]
-    return _meant(name, names) or f"known: {_listed(name, sorted(names)) or 'none'}"
-
-
-def unknown_name_error_arguments(name: str, known: Iterable[str]) -> dict[str, str]:
-    """Arguments `allowed` and `hint` of an error for an unknown name: `known` names (shortened) and the nearest one."""
-    names = [str(entry) for entry in known]
-    return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}
+    otherwise = otherwise or ("use one of the allowed names" if names else "leave it out")
+    return {"allowed": _listed(name, names) or "none", "hint": nearest_name_question(name, names) or otherwise}
 
 
 def _close(name: str, names: Sequence[str], count: int) -> list[str]:
@@ -115,8 +123,9 @@ def _close(name: str, names: Sequence[str], count: int) -> list[str]:
     return [plain[entry] for entry in difflib.get_close_matches(name.lower(), plain, n=count, cutoff=0.5)]
 
 
-def _meant(name: str, names: Sequence[str]) -> str:
-    close = _close(name, names, 1)
+def nearest_name_question(name: str, names: Iterable[str]) -> str:
+    """Ask for the most similar known name. Empty if no name is similar."""
+    close = _close(name, [*names], 1)
     return f"did you mean '{close[0]}'?" if close else ""
 
 

@@ -33,25 +33,27 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
     """Check an input file and return its path. Raises `DataError` unless it is a regular file of at most `max_bytes`.
 
     Pipes and devices are thus refused before anything is read. Every file that this package did not write or ship is
-    checked in this way.
-    """
-    allowed = "a regular file"
+    checked so."""
+    allowed = "a file that can be read"
     try:
         info = path.stat()
         readable = os.access(path, os.R_OK)
     except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
         absent = isinstance(error, FileNotFoundError)
         what = "there is no such file" if absent else f"the file cannot be read ({os_error_reason(error)})"
+        if isinstance(error, ValueError):
+            what, allowed = "the path has a null character", "a path without null characters"
         raise DataError(what, where=str(path), allowed=allowed, hint="check the path") from error
     if not readable:
         hint = "chmod it, or copy it to a folder of your own"
         raise DataError("the file cannot be read (Permission denied)", where=str(path), allowed=allowed, hint=hint)
     if not stat.S_ISREG(info.st_mode):
         what = "this is a folder" if stat.S_ISDIR(info.st_mode) else "this is a pipe or a device"
-        raise DataError(what, where=str(path), allowed=allowed, hint="copy its output into a file")
+        hint = "give the path of a file in it" if stat.S_ISDIR(info.st_mode) else "copy its output into a file"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     if max_bytes is not None and info.st_size > max_bytes:
-        what = f"the file has {info.st_size / 2**20:.0f} MiB, more than allowed"
-        allowed = f"at most {max_bytes / 2**20:.0f} MiB"
+        what = f"the file has {info.st_size / 2**20:.3g} MiB, more than allowed"
+        allowed = f"at most {max_bytes / 2**20:.3g} MiB"
         raise DataError(what, where=str(path), allowed=allowed, hint="check that it is the right file")
     return path
 
@@ -60,8 +62,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 def limited_memory() -> Iterator[None]:
     """Limit this process to 1.75 GiB beyond its present memory use (context manager; effective on Linux only).
 
-    It protects against libraries that unpack input files: a larger request raises MemoryError.
-    """
+    It protects against libraries that unpack input files: a larger request raises MemoryError."""
     before = None
     with contextlib.suppress(ImportError, OSError):
         import resource
@@ -103,19 +104,22 @@ def read_input_json(path: Path) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        what = f"the file is not JSON ({error})"
-        raise DataError(what, where=str(path), allowed="a JSON file", hint="make or download it again") from error
+        what, hint = f"the file is not JSON ({error})", "correct the file, or copy it again from its source"
+        raise DataError(what, where=str(path), allowed="a JSON file", hint=hint) from error
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Write a file atomically (context manager). The yielded temporary file replaces `path` on success.
 
-    Raises `OutputError` if the folder is missing or the file cannot be written.
-    """
+    Raises `OutputError` if the folder is missing or the file cannot be written."""
     if path.is_dir() or not path.parent.is_dir():
-        what = "the name of the file is that of a folder" if path.is_dir() else "the folder to write to does not exist"
-        raise OutputError(what, where=str(path), hint="make the folder first, or choose another name")
+        what = "the folder to write to does not exist"
+        allowed = "a file in an existing folder"
+        hint = "make the folder first"
+        if path.is_dir():
+            what, allowed, hint = "this path is a folder", "the name of a file", f"write {path / 'NAME'}{path.suffix}"
+        raise OutputError(what, where=str(path), allowed=allowed, hint=hint)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield temporary
@@ -123,7 +127,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
-        hint = "choose a writable folder on a disk with room"
+        hint = "choose another folder, or free disk space"
         what = f"the file cannot be written ({os_error_reason(error)})"
         raise OutputError(what, where=str(path), hint=hint) from error
     finally:
@@ -148,7 +152,8 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{what} cannot be made ({os_error_reason(error)})", where=str(path)) from error
+        what, hint = f"{what} cannot be made ({os_error_reason(error)})", "choose another name, in a writable folder"
+        raise OutputError(what, where=str(path), hint=hint) from error
     return path
 
 

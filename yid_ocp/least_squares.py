@@ -69,8 +69,7 @@ def levenberg_marquardt(
 
     References
     ----------
-    Nocedal and Wright (2006), Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5.
-    """
+    Nocedal and Wright (2006), Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5."""
 
     def model_at(x: Array) -> _SumOfSquares:
         return _SumOfSquares(*residual_function(x))
@@ -92,8 +91,7 @@ def minimize_by_damped_newton(
 
     The search converges if no component would move by more than `step_tolerance`, or if the cost decreases by less than
     the fraction `cost_tolerance`. `min_damping` keeps a search on a robust cost in its local minimum. The projection
-    maps a trial point to an admissible one.
-    """
+    maps a trial point to an admissible one."""
     x = np.array(initial_guess, float)
     model, damping = model_at(x), _FIRST_DAMPING
     for iteration in range(1, max_iterations + 1):

@@ -22,8 +22,9 @@ class Registry(Generic[_Entry]):
 
         def enter(entry: _Entry) -> _Entry:
             if name in self._entries:
-                what = f"the name '{name}' is taken: another {self.entry_noun} has it"
-                raise ConfigError(what, hint="register it under another name")
+                what, allowed = f"another {self.entry_noun} already has the name '{name}'", "a new name"
+                hint = "register it under another name"
+                raise ConfigError(what, where=f"register('{name}')", allowed=allowed, hint=hint)
             self._entries[name] = entry
             return entry
 
@@ -36,7 +37,8 @@ class Registry(Generic[_Entry]):
 
     def __getitem__(self, name: str) -> _Entry:
         if name not in self._entries:
-            raise ConfigError(f"there is no {self.entry_noun} '{name}'", **unknown_name_error_arguments(name, self))
+            where, said = f"the name of the {self.entry_noun}", unknown_name_error_arguments(name, self)
+            raise ConfigError(f"there is no {self.entry_noun} '{name}'", where=where, **said)
         return self._entries[name]
 
     def __contains__(self, name: object) -> bool:

@@ -71,7 +71,7 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
     assert made.camera_point_group_and_sampling(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
-    with pytest.raises(DataError, match="the noise level of group 'points_camera' is not known"):
+    with pytest.raises(DataError, match="the noise level of group 'points_camera' is neither recorded nor given"):
         unknown.existing_point_observation_schedules(episode)
 
 

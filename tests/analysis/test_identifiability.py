@@ -370,7 +370,7 @@ def test_a_point_is_a_solution_an_array_or_the_start():
         (ConfigError, r"(?s)'b2' is not a free parameter.*did you mean 'b'", {"intervals": ["b2"]}),
         (SolverError, "shape", {"solution": [1.0]}),
         (SolverError, "b is not finite", {"solution": [1.0, math.nan]}),
-        (SolverError, "the simulation fails.*it snaps", {"solution": [9.0, 9.0]}),
+        (SolverError, "cannot be simulated: .*it snaps", {"solution": [9.0, 9.0]}),
     ],
 )
 def test_bad_requests_say_what_is_wrong(error, words, more):

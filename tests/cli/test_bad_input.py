@@ -38,7 +38,7 @@ def test_a_path_with_a_nul_is_refused(cli, pendulum, tmp_path):
 def test_two_units_of_one_quantity_are_refused(cli, tmp_path):
     (tmp_path / "a.csv").write_text("t,q_a\n0,1\n1,2\n2,3\n")
     wrong = ("import", tmp_path / "a.csv", "--out", tmp_path / "a.h5", "--units", "deg,rad")
-    assert_refused(cli(*wrong), "'position' is given two units, deg and rad", "one unit for every quantity")
+    assert_refused(cli(*wrong), "'position' has two units, deg and rad", "one unit for every quantity")
 
 
 def edited(file, old, new):
@@ -56,7 +56,7 @@ def edited(file, old, new):
         ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write the number alone, in Hz")),
         ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "convert it from ms")),
         ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
-        ("bounds: [0.0, 100.0]", "bounds: [-5.0, 100.0]", ("bounds", "within 0 to inf N m/rad")),
+        ("bounds: [0.0, 100.0]", "bounds: [-5.0, 100.0]", ("bounds", "from 0 to inf N m/rad")),
         ("bounds: [0.0, 100.0]", "bounds: [0.0, 0.5]", ("upper bound of 0.5 N", "0 to 0.5 N m/rad")),
         ("bounds: [0.0, 100.0]", "initial: 200, bounds: [0.0, 100.0]", ("upper bound of 100 N", "0 to 100 N m/rad")),
         ("shoulder.stiffness:", "sholder.stiffness:", ("no parameter", "did you mean 'shoulder.stiffness'?")),
@@ -113,7 +113,7 @@ OTHER = np.array(["shoulder", "elbo"], dtype=h5py.string_dtype())
         (lambda j: setitem(j["position"].attrs, "unit", "deg"), ("the unit is 'deg'", "rad", "convert")),
         (lambda j: setitem(j["position"], ..., np.rad2deg(j["position"][...]) + 90), ("degrees", "rad")),
         (lambda j: setitem(j.attrs, "names", OTHER), ("joint 'elbow' of the model is not recorded", "mean 'elbo'?")),
-        (lambda j: delitem(j, "effort"), ("no measurement",)),
+        (lambda j: delitem(j, "effort"), ("no sensor of the model has a measurement",)),
         (lambda j: delitem(j.attrs, "effort_std"), ("noise level", "sensors.joints.effort.std")),
     ],
     ids=["nan", "backwards", "deg", "degrees unsaid", "another joint", "no effort", "no noise"],
@@ -162,7 +162,7 @@ def test_an_output_folder_that_cannot_be(cli, pendulum, tmp_path, monkeypatch, l
     monkeypatch.setattr(f"yid_ocp.workflow.{command}.build_problem", lambda *a: pytest.fail("too late"), raising=False)
     (tmp_path / "file.h5").write_text("not a folder")
     assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5" / "run"), "cannot be made", "--out")
-    assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5"), "that of a file")
+    assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5"), "existing file")
     assert_refused(cli(command, pendulum, "--out", tmp_path), "exists and is not empty", "--out")
     left_nothing()
 

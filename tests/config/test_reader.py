@@ -16,7 +16,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
 from yid_ocp.solvers import GaussNewton, SteepestDescent
 
-RENAMED = "names changed in this version: see the table in CHANGELOG.md"
+RENAMED = "find its new name in the table of CHANGELOG.md"
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
@@ -102,15 +102,18 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("description: 2024-01-01\n", ["description"]),
         ("sensors:\n  points: {std: 0}\n", ["above 0"]),
         # unknown keys: the nearest one, and the sections that have it
-        ("problem: {iteration: 3}", [f"did you mean 'duration'?; {RENAMED}"]),
-        ("problem: {max_iterations: 3}", ["key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`"]),
+        ("problem: {iteration: 3}", ["did you mean 'duration'?"]),
+        (
+            "problem: {max_iterations: 3}",
+            ["key of `solver` and of `compare.methods.NAME` and of `track"],
+        ),
         (
             "solver: {name: steepest_descent, step_tolerance: 1}",
             ["'step_tolerance' is a key of `solver` with name: gauss_newton, multiple_shooting"],
         ),
         ("solver: {time_step: 1}", ["there is no key 'time_step' in solver", "'time_step' is a key of `problem`"]),
-        ("solver: {held_out: []}", [f"'held_out' is a key of `recordings`; {RENAMED}"]),
-        ("solver: {parameters: {}}", [f"'parameters' is a key of the file itself; {RENAMED}"]),
+        ("solver: {held_out: []}", ["'held_out' is a key of `recordings`"]),
+        ("solver: {parameters: {}}", ["'parameters' is a key of the file itself"]),
         ("solver: {name: gauss_newton, backtracking_factor: 0.3}", ["there is no key 'backtracking_factor'"]),
         ("xyzzy: 3", [RENAMED]),
         # what only code sets
@@ -192,7 +195,7 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
         ("parameters.shoulder.stiffness.initail=3", ["did you mean 'parameters.shoulder.stiffness.initial'?"]),
         ("problem.time_step.deeper=1", ["no keys below 'deeper'"]),
         ("problem.time_step=[1", ["not valid YAML"]),
-        ("solver={name:single_shooting}", ["put a space behind the colon, as in {name: single_shooting}"]),
+        ("solver={name:single_shooting}", ["put a space after the colon, as in {name: single_shooting}"]),
     ],
 )
 def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words):
@@ -307,7 +310,7 @@ ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
         ("problem: {time_step: !odd 0.01}", "tag"),
         ("problem: {time_step: " + "9" * 5000 + "}", "digits"),
         ("problem: {time_step: 0x" + "f" * 6000 + "}", "too large"),
-        ('description: "a\\0b"', "NUL"),
+        ('description: "a\\0b"', "null character"),
         ("? [a, b]\n: 3", "no key"),
         ("a: 1\n---\nb: 2", "not valid YAML"),
         ("problem:\n  <<: {time_step: 0.02}\n  use_compiler: 3\n", r"line 3: problem\.use_compiler"),

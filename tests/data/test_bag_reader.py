@@ -131,7 +131,7 @@ def test_bag_order_and_sets_of_joints_may_change(tmp_path: Path) -> None:
     assert "--joints" in refused(path, "2 different sets of joints")
     assert read_any(path, joints=["b"]).joint_names == ("b",)
     assert refused(path, "no joint 'fingr'", joints=["a", "fingr"]) == "did you mean 'finger'?"
-    refused(path, "never come in one message", joints=["a", "finger"])
+    refused(path, "no message has all the chosen joints", joints=["a", "finger"])
 
 
 def two_arms(rate: int = 200, effort: bool = True) -> Messages:
@@ -167,7 +167,7 @@ def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
 
 
 def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
-    refused(write_bag(tmp_path, "mcap", two_arms(effort=False)), "/left has no effort, which another topic")
+    refused(write_bag(tmp_path, "mcap", two_arms(effort=False)), "/left has no effort, but another topic")
     (tmp_path / "twice").mkdir()
     one = joint_state(("a",), START, position=[1.0])
     path = write_bag(tmp_path / "twice", "mcap", [("/x", START, one), ("/y", START, one)])
@@ -301,7 +301,7 @@ def test_an_orientation_becomes_points_on_the_axes(tmp_path: Path) -> None:
     assert points.names == ("hand", "hand_x", "hand_y", "hand_z")
     # the quarter turn about z takes x to y and y to -x
     assert np.allclose(points.position[0], [[1, 2, 3], [1, 2.1, 3], [0.9, 2, 3], [1, 2, 3.1]])
-    refused(path, "pose_axis_point_distance = 0", pose_axis_point_distance=0.0)
+    refused(path, "pose_axis_point_distance is 0 m", pose_axis_point_distance=0.0)
 
 
 def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
@@ -313,9 +313,9 @@ def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
     options: dict[str, Any] = {"torque_constants": {"*": 0.1, "b": 0.2}, "gears": {"b": 50.0}}
     torques = joints_of(read_any(path, units={"effort": "mA"}, **options)).values_by_channel["effort"]
     assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
-    current = "effort of 'a' is a current, and its torque constant is not given"
+    current = "effort of 'a' is a current, but its torque constant is not given"
     refused(path, current, units={"effort": "A"}, torque_constants={"b": 1.0})
-    refused(path, "but the efforts are no currents", torque_constants={"*": 1.0})
+    refused(path, "unit of the efforts is not that of a current", torque_constants={"*": 1.0})
 
 
 @pytest.mark.parametrize("stamps", [(0, 0), (START - SECOND // 2, 0)])
@@ -365,7 +365,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
             "1 of 2 messages lack 'effort'",
         ),
         ([("/j", START + k, joint_state(("a",), START, position=[1.0])) for k in range(2)], "from index 0 to 1"),
-        ([("/p", START + k, point(START, (1, 1, 1))) for k in range(2)], "point 'p' comes twice"),
+        ([("/p", START + k, point(START, (1, 1, 1))) for k in range(2)], "point 'p' has two positions"),
     ],
     ids=["nothing", "no positions", "length", "sometimes", "repeated joints", "repeated point"],
 )
@@ -399,7 +399,7 @@ def test_what_a_bag_unpacks_to_is_limited(tmp_path: Path) -> None:
     if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
         pytest.skip("memory is limited from outside, which stays as it is")
     bag = OpenBag(write_bag(tmp_path, "mcap", arm_and_camera()))
-    with pytest.raises(DataError, match="MemoryError"), bag.read_errors_as_data_errors():
+    with pytest.raises(DataError, match="too much memory"), bag.read_errors_as_data_errors():
         bytearray(2 << 30)
     assert np.empty(2 << 30, np.uint8).nbytes == 2 << 30  # and afterwards nothing is
 

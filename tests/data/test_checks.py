@@ -309,8 +309,8 @@ def test_lengths_are_means_over_frames_and_medians_over_recordings() -> None:
     # one that never shows an edge does not count
     hidden, seen = stretched([np.nan]), stretched([2.0])
     assert typical_point_pair_distances([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}
-    with pytest.raises(DataError, match="edge a to b is never seen"):
+    with pytest.raises(DataError, match="no frame shows both points of the edge a to b"):
         typical_point_pair_distances([("a", "b")], [hidden])
     with pytest.raises(DataError, match="point 'c' is not recorded") as caught:
         typical_point_pair_distances([("a", "c")], [stretched([4.0], "run")])
-    assert caught.value.where == "run"
+    assert caught.value.where == "recording 'run'"

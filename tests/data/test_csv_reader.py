@@ -104,18 +104,23 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "empty": ("", {}, "the table is empty", ""),
     "no header": ("0,1\n1,2\n", {}, "no header row", ""),
     "no rows": ("t,q_a\n", {}, "no rows", ""),
-    "other delimiter": ("t;q_a\n0;1\n", {"delimiter": ","}, "one column, 't;q_a'", "delimiter=';'"),
+    "other delimiter": ("t;q_a\n0;1\n", {"delimiter": ","}, "one column, 't;q_a'", "--delimiter ';'"),
     "one column": ("t\n0\n", {}, "one column, 't'", ""),
     "long delimiter": (GOOD, {"delimiter": "::"}, "the delimiter is '::'", ""),
     "repeated column": ("t,q_a,q_a\n0,1,1\n", {}, "two columns are called 'q_a'", ""),
-    "same meaning": ("t,q_a,position_a\n0,1,1\n", {}, "'q_a' and 'position_a' mean the same, position a", ""),
+    "same meaning": ("t,q_a,position_a\n0,1,1\n", {}, "'q_a' and 'position_a' have the same meaning, position a", ""),
     "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "label=skip"),
     "bare prefix": ("t,q_\n0,1\n", {}, "meaning of column 'q_'", ""),
     "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
     "only time": ("t,label\n0,1\n", {"columns": {"label": "skip"}}, "the recording has no group", ""),
     "column not there": (GOOD, {"columns": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
-    "meaning of a column": (GOOD, {"columns": {"q_a": "angle:a"}}, "given the meaning", "known: "),
-    "meaning without joint": (GOOD, {"columns": {"q_a": "position"}}, "given the meaning 'position'", ""),
+    "meaning of a column": (GOOD, {"columns": {"q_a": "angle:a"}}, "meaning 'angle:a' of column", "q_a=position:JOINT"),
+    "meaning without joint": (
+        GOOD,
+        {"columns": {"q_a": "position"}},
+        "meaning 'position' of",
+        "q_a=position:NAME",
+    ),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
     "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' holds 'fast'", ""),
     "joint missing in a channel": ("t,q_a,q_b,effort_a\n0,1,1,1\n", {}, "no column for effort of 'b'", ""),
@@ -123,7 +128,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),
     "empty cell of a joint": ("t,q_a\n0,1\n1,\n", {}, "'position' of joint 'a' is not finite at t = 1 s", ""),
     "clock": ("t,q_a\n1,1\n0,1\n", {}, "from index 0 to 1", ""),
-    "unit of what": (GOOD, {"units": {"angle": "deg"}}, "unit is given for 'angle'", ""),
+    "unit of what": (GOOD, {"units": {"angle": "deg"}}, "the quantity 'angle' of a unit", ""),
     "unit": (GOOD, {"units": {"velocity": "deg"}}, "'deg' is not a unit of 'velocity'", "did you mean 'deg/s'"),
 }
 
@@ -142,7 +147,11 @@ def test_csv_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
     absent = tmp_path / "absent.csv"
-    for file, message in ((path, "not a table of text"), (tmp_path, "this is a folder"), (absent, "no such file")):
+    for file, message in (
+        (path, "not a table in UTF-8"),
+        (tmp_path, "this is a folder"),
+        (absent, "no such file"),
+    ):
         with pytest.raises(DataError, match=message):
             read_csv(file)
 
@@ -219,7 +228,7 @@ def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
     assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
     assert recording.notes == ("3 of 8 lines were bad and left out (line 3, 5, 6)",)
     mostly = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,slow\n")
-    with pytest.raises(DataError, match="2 of 3 lines are no rows of 2 numbers"):
+    with pytest.raises(DataError, match="2 of 3 lines are not rows of 2 numbers"):
         read_any(mostly, skip_bad_lines=True)
 
 

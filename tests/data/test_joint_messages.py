@@ -192,7 +192,7 @@ def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without
         ({"position": "/hand.q"}, "no messages on the topic '/hand'"),
         ({"position": "/arm"}, "has no name"),
         ({"effort": "/arm.state.torque"}, "no field is the position"),
-        ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "no channel of joints"),
+        ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "not a channel of joints"),
     ):
         with pytest.raises(DataError, match=what):
             read_any(path, fields=fields)

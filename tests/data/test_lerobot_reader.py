@@ -95,7 +95,7 @@ def test_the_preview_asks_for_a_unit_that_could_be_two_and_numbers_of_frames_are
     assert by_name["observation.state"].imported_as == "joints shoulder_pan, elbow_flex, gripper"
     assert by_name["frame_index"].imported_as == "t"
     assert not by_name["index"].imported_as
-    with pytest.raises(DataError, match="the unit has to be said") as caught:
+    with pytest.raises(DataError, match="unit of the joint positions is unknown") as caught:
         read_any(path, **contents.reader_options)
     assert "-100 to 100" in caught.value.hint
     options = {**contents.reader_options, "units": {"position": "deg", "position_command": "deg"}}
@@ -120,7 +120,7 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
         table = table.set_column(table.schema.get_field_index(name), name, [values])
     parquet.write_table(table, file)
     if asked:
-        with pytest.raises(DataError, match="the unit has to be said"):
+        with pytest.raises(DataError, match="unit of the joint positions is unknown"):
             read_any(path)
         recording = read_any(path, units={"position": "rad", "position_command": "rad"})
     else:
@@ -133,13 +133,13 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
     [
         ({}, {"episode": 2}, "there is no episode 2"),
         ({}, {"episode": -1}, "there is no episode -1"),
-        ({"total_episodes": 9}, {"episode": 5}, "no table has the episode"),
-        ({"codebase_version": "v1.6"}, {}, "of version v1.6"),
-        ({"fps": 0}, {}, "fps .* greater than 0"),
-        ({"fps": "fast"}, {}, "fps .* a valid number"),
+        ({"total_episodes": 9}, {"episode": 5}, "no table has this episode"),
+        ({"codebase_version": "v1.6"}, {}, "has the version v1.6"),
+        ({"fps": 0}, {}, "fps = 0 is not allowed"),
+        ({"fps": "fast"}, {}, 'fps = "fast" is not allowed'),
         ({"features": {"action": {}}}, {}, "no observation.state"),
         ({}, {"joints": ["elbow"], "units": {"position": "deg"}}, "no joint 'elbow'"),
-        ({}, {"episode": 1}, "angles reach 131"),
+        ({}, {"episode": 1}, "unit of the joint positions is unknown: they reach 131"),
     ],
     ids=["beyond", "negative", "lost", "version", "rate", "text", "state", "joint", "degrees"],
 )
@@ -197,7 +197,7 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
     table = parquet.read_table(path / FIRST).to_pydict()
     text = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * len(table[name])), ["x" * 1_000_000])
     parquet.write_table(pyarrow.table({**table, name: text}), path / FIRST, store_schema=False)
-    with pytest.raises(DataError, match=f"{name} holds string where numbers are expected"):
+    with pytest.raises(DataError, match=f"the column {name} holds string instead of numbers"):
         read_lerobot_episode(path)
 
 

@@ -152,11 +152,11 @@ HEAD = "quantity,unit,at,torque,std\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a,b\n1,2\n", "no table of a law"),
+        ("a,b\n1,2\n", "not a table of a law"),
         (HEAD + "angle,rad,0,x,1\n", "line 2"),
         (HEAD + "".join(f"speed,rad/s,{x},0,0\n" for x in range(5)), "the law depends on angle"),
         (HEAD + "".join(f"angle,rad,{x},0,0\n" for x in (0, 1, 3, 4)), "evenly spaced"),
-        (HEAD + "".join(f"angle,rad,{x},0,0\n" for x in (0, 1, 2)), "at least four"),
+        (HEAD + "".join(f"angle,rad,{x},0,0\n" for x in (0, 1, 2)), "four or more"),
     ],
 )
 def test_a_table_that_is_none_is_refused(tmp_path, text, said):
@@ -181,8 +181,8 @@ def test_a_configuration_has_a_law_by_its_table(tmp_path):
     assert [effect.label for effect in made.effects] == ["law@T1"]
     assert made.parameters["law@T1.angle3"].value == pytest.approx(tables()[0].torque[3])
     for wrong, text in (
-        ("{kind: law, location: T1}", "needs table and depends_on"),
-        (f"{{kind: kelvin_voigt, location: T1, table: {file}}}", "kelvin_voigt has no table"),
+        ("{kind: law, location: T1}", "lacks `table` or `depends_on`"),
+        (f"{{kind: kelvin_voigt, location: T1, table: {file}}}", "kelvin_voigt has `table` or `depends_on`"),
     ):
         with pytest.raises(ConfigError, match=text):
             build_system(load_config(None, [f"model.effects=[{wrong}]"]))

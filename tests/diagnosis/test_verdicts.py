@@ -140,10 +140,10 @@ def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
     assert tried == {"joint_coulomb@shoulder", "link_mass@elbow"}
     assert "joint_coulomb@elbow.tau_c" in finding.nominal_model.problem.system.parameters.names
     assert "joint_coulomb@elbow" not in {effect.label for effect in finding.accepted_effects}
-    for name, said in (("joint_viscous", "no candidate here"), ("joint_coulomb@tail", "no candidate here")):
+    for name, said in (("joint_viscous", "is not a candidate"), ("joint_coulomb@tail", "is not a candidate")):
         with pytest.raises(YidError, match=said):
             diagnose(problem, FRICTION, recordings[1:], exclude=[name])
-    with pytest.raises(YidError, match="no candidate is left"):
+    with pytest.raises(YidError, match="every candidate is excluded"):
         diagnose(problem, FRICTION, recordings[1:], exclude=["joint_coulomb", "link_mass", "effort_offset"])
 
 
@@ -190,10 +190,10 @@ def short(bench):
 @pytest.mark.parametrize(
     ("candidates", "words"),
     [
-        (["kelvin_voigt"], ("kelvin_voigt does not fit",)),
+        (["kelvin_voigt"], ("kelvin_voigt is not possible for this model",)),
         (["joint_coulom"], ("joint_coulom", "joint_coulomb")),
         (["joint_coulomb@elbo"], ("elbo", "elbow")),
-        (["camera_latency"], ("camera_latency does not fit", "camera")),
+        (["camera_latency"], ("camera_latency is not possible for this model", "camera")),
         ([], ("no candidate",)),
         ("everything", ("all",)),
     ],

@@ -129,7 +129,7 @@ def test_places_of_a_branched_cable(cable) -> None:
     [
         ("kelvin_vogt", "T3", ConfigError, "kelvin_voigt"),
         ("kelvin_voigt", "T4", ModelError, "T1, T2, T3"),
-        ("kelvin_voigt", "left_w0", ModelError, "does not fit"),
+        ("kelvin_voigt", "left_w0", ModelError, "kelvin_voigt is not possible at"),
         ("joint_coulomb", "left_w3", ModelError, "left_w0"),
         ("grasp_slip", "right", ModelError, "allowed: left"),
         ("junction_compliance", "w_T2", ModelError, "w_T1"),

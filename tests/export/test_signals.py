@@ -93,7 +93,7 @@ def test_times_before_zero_are_moved_by_whole_seconds(tmp_path):
 
 
 def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
-    with pytest.raises(OutputError, match="nothing to write"):
+    with pytest.raises(OutputError, match="signals have no samples"):
         export_mcap([], tmp_path / "none.mcap")
     (tmp_path / "file").write_text("")
     signal = RosTopicTimeSeries("/f", "vector", np.zeros(1), {"xyz": np.zeros((1, 3))})
@@ -104,7 +104,7 @@ def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
         export_recording_csv_files(tables, tmp_path / "file")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     (tmp_path / "joints.csv").mkdir()
-    with pytest.raises(OutputError, match="that of a folder"):
+    with pytest.raises(OutputError, match="this path is a folder"):
         export_recording_csv_files(tables, tmp_path)
 
 

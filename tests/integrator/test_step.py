@@ -248,7 +248,7 @@ def test_a_status_says_what_to_try(single_step, golden, theta_golden):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        *(({"time_step": h}, [f"time_step = {h}", "positive"]) for h in (0.0, -0.01, math.nan, math.inf)),
+        *(({"time_step": h}, [f"time_step = {h}", "a number above 0 [s]"]) for h in (0.0, -0.01, math.nan, math.inf)),
         ({"force_split": "right"}, ["force_split = 'right'", "symmetric, left"]),
         ({"constraint_force": "end"}, ["constraint_force = 'end'", "node, midpoint"]),
     ],

@@ -150,22 +150,22 @@ def test_inertia_is_physical_for_every_theta(length, mass, radius, links, unequa
 
 
 WRONG = {
-    "unknown_parent": ({"parent": "T9"}, ["'T9'", "does not come before"]),
-    "no_length": ({"length": 0.0}, ["length = 0.0", "positive"]),
-    "negative_mass": ({"mass": -1.0}, ["mass = -1.0", "positive"]),
-    "no_radius": ({"radius": math.nan}, ["radius = nan", "positive"]),
+    "unknown_parent": ({"parent": "T9"}, ["'T9'", "is not a segment that is listed before"]),
+    "no_length": ({"length": 0.0}, ["length = 0.0", "a number above 0 [m]"]),
+    "negative_mass": ({"mass": -1.0}, ["mass = -1.0", "a number above 0 [kg]"]),
+    "no_radius": ({"radius": math.nan}, ["radius = nan", "a number above 0 [m]"]),
     "no_links": ({"links": 0}, ["links = 0"]),
-    "empty_link": ({"link_lengths": [0.1, 0.0]}, ["a link has no length"]),
-    "no_link_lengths": ({"link_lengths": []}, ["a link has no length"]),
-    "rotations": ({"links": 3, "link_rest_rotations": [np.eye(3)]}, ["1 link rotations for 3 links", "2"]),
+    "empty_link": ({"link_lengths": [0.1, 0.0]}, ["link_lengths = ["]),
+    "no_link_lengths": ({"link_lengths": []}, ["link_lengths = ["]),
+    "rotations": ({"links": 3, "link_rest_rotations": [np.eye(3)]}, ["3 links have 1 link rotations", "2"]),
     "parent_link": ({"parent": "T1", "parent_link_index": 4}, ["parent_link_index = 4", "0 to 3"]),
     "joint_axes": ({"joint_axes": "xxz"}, ["joint_axes = 'xxz'", "x, y, z, each at most once"]),
     "no_axis": ({"joint_axes": ""}, ["joint_axes = ''"]),
-    "two_sections": ({"cross_section_size": (0.1, 0.2)}, ["a radius or a section"]),
-    "no_section": ({"radius": None}, ["a radius or a section"]),
+    "two_sections": ({"cross_section_size": (0.1, 0.2)}, ["both a radius and a section", "one of the two"]),
+    "no_section": ({"radius": None}, ["neither a radius nor a section", "one of the two"]),
     "flat_section": (
         {"radius": None, "cross_section_size": (0.0, 0.2)},
-        ["cross_section_size[0] = 0.0", "positive"],
+        ["cross_section_size[0] = 0.0", "a number above 0 [m]"],
     ),
     "same_name": ({"name": "T1"}, ["two segments are called 'T1'"]),
 }

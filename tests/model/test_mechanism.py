@@ -100,11 +100,11 @@ def test_a_cable_is_counted_from_clamp_to_clamp():
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("T1:140%", "'140%' is no place along 'T1'"),
-        ("T1:-1%", "a percentage of its length from 0% to 100%, base to tip"),
+        ("T1:140%", "'140%' is not a location along 'T1'"),
+        ("T1:-1%", "a percentage of the length from 0% (base) to 100% (tip)"),
         ("T1:40", "T1:40%"),
-        ("T1:half", "'half' is no place along 'T1'"),
-        ("T1:nan%", "'nan%' is no place"),
+        ("T1:half", "'half' is not a location along 'T1'"),
+        ("T1:nan%", "'nan%' is not a location"),
         ("T9:40%", "there is no frame 'T9:40%'"),
         ("T9:40%", ":40%'?"),
         ("w_T9", "did you mean 'w_T"),
@@ -163,7 +163,7 @@ def test_a_frame_that_the_file_does_not_have(urdf_folder):
     apart = numbers(load.placement.translation - tip.placement.translation)
     np.testing.assert_allclose(apart, numbers(tip.placement.rotation) @ [[0.1], [0.2], [0.3]])
     assert more.frame("wall").joint_index == -1
-    with pytest.raises(ModelError, match="there is a frame 'tip' already"):
+    with pytest.raises(ModelError, match="there is already a frame 'tip'"):
         robot.with_added_frame("tip", None, at)
     with pytest.raises(ModelError, match="no frame 'tips'"):
         robot.with_added_frame("load", "tips", at)

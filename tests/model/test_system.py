@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from placed_frames import numbers
 
-from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_hint, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.model import (
     Effect,
     Grasp,
@@ -120,7 +120,7 @@ def test_effects_are_appended(robot):
 
 
 WRONG = {
-    "nothing": (lambda robot: System.build(), ["no joint", "a robot, an object, or both"]),
+    "nothing": (lambda robot: System.build(), ["no joint", "an object, or both"]),
     "driven": (lambda robot: System.build(robot, driven=["slid"]), ["'slid'", "'slide'"]),
     "prescribed": (lambda robot: System.build(robot, prescribed=["tool"]), ["joint 'tool'"]),
     "both": (lambda robot: System.build(robot, driven=["nod"], prescribed=["nod"]), ["'nod'", "one of the two"]),
@@ -131,7 +131,7 @@ WRONG = {
     "held": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "noses")]), ["'noses'", "'nose'"]),
     "grasp_twice": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "nose")] * 2), ["'g'", "grasps"]),
     "point": (lambda robot: System.build(robot, point_frames=["w_T1"]), ["'w_T1'"]),
-    "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "three numbers"]),
+    "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "three finite numbers"]),
     "frame": (lambda robot: System.build(robot, objects=[(foam_y_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
     "objects": (lambda robot: System.build(objects=[(foam_y_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
     "segment": (lambda robot: System.build(robot).segment_layout("T1"), ["segment 'T1'"]),
@@ -202,7 +202,7 @@ def test_changed_sets_keep_order_and_symbols(three):
         (lambda p: p.with_nominal_values({"T1.mass": 2.0}), ["T1.mass = 2 kg", "0 to 1 kg"]),
         (lambda p: p.with_nominal_values({"T1.mas": 2.0}), ["did you mean 'T1.mass'?"]),
         (lambda p: p.bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
-        (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["named twice", "T1.bend"]),
+        (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["two parameters are called", "T1.bend"]),
         (lambda p: Parameter("x", math.inf, "1"), ["x = inf"]),
         (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "2 to inf"]),
     ],
@@ -234,21 +234,20 @@ def test_a_long_error_is_shortened_where_it_is_long_and_obeyed_by_no_terminal():
 
 
 def test_nearest_name():
-    assert nearest_name_hint("left_s3", ["left_s0", "head"]) == "did you mean 'left_s0'?"
-    assert nearest_name_hint("zzz", ["b", "a"]) == "known: a, b"
-    assert nearest_name_hint("zzz", []) == "known: none"
-    assert nearest_name_hint("W_t1", ["w_T2", "w_T1"]) == "did you mean 'w_T1'?"
+    assert nearest_name_question("left_s3", ["left_s0", "head"]) == "did you mean 'left_s0'?"
+    assert nearest_name_question("zzz", ["b", "a"]) == ""
+    assert nearest_name_question("W_t1", ["w_T2", "w_T1"]) == "did you mean 'w_T1'?"
 
 
 def test_names_are_listed_once_and_long_lists_are_cut():
     few, many, more = ["b", "a"], [f"joint_{i}" for i in range(30)], [f"frame_{i}" for i in range(70)]
-    assert unknown_name_error_arguments("zzz", few) == {"allowed": "b, a", "hint": ""}
-    assert unknown_name_error_arguments("zzz", []) == {"allowed": "none", "hint": ""}
+    assert unknown_name_error_arguments("zzz", few) == {"allowed": "b, a", "hint": "use one of the allowed names"}
+    assert unknown_name_error_arguments("zzz", []) == {"allowed": "none", "hint": "leave it out"}
+    assert unknown_name_error_arguments("zzz", few, "see --help")["hint"] == "see --help"
     # nothing is near: all of them, for somebody who looks for a name
-    assert unknown_name_error_arguments("zzz", many) == {"allowed": ", ".join(many), "hint": ""}
+    assert unknown_name_error_arguments("zzz", many)["allowed"] == ", ".join(many)
     said = unknown_name_error_arguments("joint_7x", many)
     assert said["hint"] == "did you mean 'joint_7'?"
     assert said["allowed"].startswith("joint_7, ")
     assert said["allowed"].endswith(" and 22 more")
     assert unknown_name_error_arguments("zzz", more)["allowed"] == ", ".join(more[:8]) + " and 62 more"
-    assert nearest_name_hint("zzz", more).count("frame_") == 8

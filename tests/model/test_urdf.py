@@ -154,7 +154,7 @@ BROKEN = {
     "planar": ((link("a"), link("b"), joint("j", "a", "b", "planar")), ["'j'", "'planar'"]),
     "zero_axis": (
         (link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")),
-        ["'j'", "zero axis", "allowed: an axis other than 0 0 0", "try: leave"],
+        ["'j'", "zero axis", "allowed: an axis other than 0 0 0", "try: write the axis"],
     ),
     "two_roots": ((link("a"), link("b")), ["2 root links", "exactly one"]),
     "no_root": ((link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")), ["0 root links"]),
@@ -169,7 +169,7 @@ BROKEN = {
     ),
     "ring_beside": (
         (link("a"), link("b"), link("c"), joint("j", "c", "b"), joint("k", "b", "c")),
-        ["link 'b' does not hang on 'a'"],
+        ["link 'b' is not connected to the root link 'a'"],
     ),
     "truncated": ((link("a"), "<link name="), ["cannot be read"]),
     "negative_moment": (with_tip(moments=(1, -2, 1)), ["negative moment of inertia"]),
@@ -181,7 +181,7 @@ BROKEN = {
     "vanishing_mass": (with_tip(mass="1e-320"), ["a mass of 9.99989e-321 kg", "1e-09 kg and more"]),
     "mass_with_unit": (with_tip(mass="1 kg"), ["mass is '1 kg'"]),
     "no_mass": (with_tip(change=('<mass value="1"/>', "")), ["without a mass"]),
-    "two_inertials": (with_tip(change=("</link>", "<inertial/></link>")), ["2 inertials"]),
+    "two_inertials": (with_tip(change=("</link>", "<inertial/></link>")), ["2 elements <inertial>"]),
     "axis_short": ((link("a"), link("b"), joint("j", "a", "b", axis="1 0")), ["axis xyz"]),
     "axis_nan": ((link("a"), link("b"), joint("j", "a", "b", axis="nan 0 1")), ["axis xyz"]),
     "axis_long": ((link("a"), link("b"), joint("j", "a", "b", axis="1 0 0 0")), ["axis xyz"]),
@@ -206,7 +206,7 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
     ("action", "words"),
     [
         (lambda path: read_urdf("nowhere.urdf"), ["'nowhere.urdf'", "package:NAME"]),
-        (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?", "package:STEM"]),
+        (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?", "allowed: baxter, "]),
         (lambda path: read_urdf("so101"), ["'so101'", "write package:so101"]),
         (lambda path: read_urdf("package:anymal"), ["has 2 robots 'anymal'", "package:anymal_b_simple_description/"]),
         (lambda path: read_urdf("default:y_objekt.urdf"), ["'y_objekt.urdf'", "did you mean 'y_object.urdf'?"]),
@@ -243,7 +243,7 @@ def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):
     assert float(bare.with_numeric_values().joints[0].bodies[0].mass) == 1.0
     with pytest.raises(ModelError, match=r"(?s)no link 'hands' to leave out.*did you mean 'hand'"):
         read_urdf(path, exclude_links=["hands"])
-    with pytest.raises(ModelError, match="joint 'grip' carries a link that is left out"):
+    with pytest.raises(ModelError, match="joint 'grip' carries the excluded link 'finger'"):
         read_urdf(path, joints=["turn", "grip"], exclude_links=["hand"])
 
 
@@ -272,7 +272,7 @@ def test_a_joint_that_follows_is_locked_where_its_leader_stands(tmp_path, caplog
     # and cannot be chosen
     with pytest.raises(ModelError, match="follows 'first'"):
         read_urdf(follower(tmp_path), joints=("first", "second"))
-    with pytest.raises(ModelError, match="follows a joint 'frist'"):
+    with pytest.raises(ModelError, match="a joint 'frist' that does not exist"):
         read_urdf(follower(tmp_path, "frist"))
 
 

@@ -213,20 +213,29 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"target_position": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "nearer place")),
+        ({"target_position": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "nearer target")),
         ({"point": "tipp"}, ("no frame 'tipp'",)),
-        ({"point": None}, ("no point is named",)),
-        ({"target_offset_from_start": (0.0, 0.1, 0.0)}, ("said twice", "one of place and shift")),
-        ({"target_position": None}, ("nothing says where the point is to arrive",)),
+        ({"point": None}, ("plan.point is missing",)),
+        (
+            {"target_offset_from_start": (0.0, 0.1, 0.0)},
+            ("is given twice", "either plan.target_position"),
+        ),
+        ({"target_position": None}, ("the target of the point is not given",)),
         ({"start_joint_positions": {"shoulder": 1.5}}, ("starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2")),
-        ({"start_joint_positions": {"sholder": 0.5}}, ("'sholder' is no joint that moves", "did you mean 'shoulder'?")),
-        ({"start_joint_positions": {}}, ("says nothing of shoulder",)),
-        ({"start_joint_positions": None}, ("nothing says where the motion begins",)),
+        (
+            {"start_joint_positions": {"sholder": 0.5}},
+            ("'sholder' is not a joint", "did you mean 'shoulder'?"),
+        ),
+        ({"start_joint_positions": {}}, ("the position of shoulder is missing",)),
+        ({"start_joint_positions": None}, ("the start of the motion is not given",)),
         ({"goal": "path"}, ("no waypoints",)),
-        ({"goal": "box"}, ("there is no box",)),
+        ({"goal": "box"}, ("plan.goal: box needs plan.box",)),
         ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "from 1 up to 0 m")),
         ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, ("mm outside the box along z", "plan.frames_in_box")),
-        ({"minimize_parameter_sensitivity": True}, ("uncertainty is not known", "plan.parameter_run")),
+        (
+            {"minimize_parameter_sensitivity": True},
+            ("uncertainty of the parameters", "plan.parameter_run"),
+        ),
         ({"n_spline_coefficients": 1}, ("n_spline_coefficients = 1", "from 2")),
         ({"duration": -1.0}, ("duration = -1", "above 0")),
     ],
@@ -238,5 +247,5 @@ def test_what_is_refused(moved, wanted, more, words):
 
 
 def test_a_system_without_moved_joints_is_refused(urdf_folder, wanted):
-    with pytest.raises(ConfigError, match="no joint is prescribed"):
+    with pytest.raises(ConfigError, match="the model has no prescribed joint"):
         plan_motion_to_target(pendulum_step(urdf_folder), wanted)

@@ -158,7 +158,7 @@ def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, ca
     chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run={folder}")
     assert main(list(chosen)) == 2
     told = capsys.readouterr().err
-    assert "was solved with point_mass@tip, which this model does not have" in told
+    assert "has the effect point_mass@tip, which this model does not have" in told
     assert "model.effects" in told
     assert main([*chosen, "--set", "model.effects=[{kind: point_mass, location: tip}]"]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())

@@ -124,7 +124,7 @@ def problem_of(step, group, free=("shoulder.servo_gain",), values=None, **option
 
 
 def test_a_preset_belongs_to_a_dc_motor() -> None:
-    with pytest.raises(ConfigError, match="ideal and has the preset 'xl330'"):
+    with pytest.raises(ConfigError, match="kind: ideal and the preset 'xl330'"):
         MotorOptions(preset="xl330")
 
 
@@ -134,7 +134,7 @@ def test_recordings_state_the_gain_of_the_firmware_once_for_all_joints_or_for_ea
     found = servo_gain_factors_by_recording(step.system, [one, each])
     assert found["one"] == {"shoulder.servo_gain_factor": 400.0, "elbow.servo_gain_factor": 400.0}
     assert found["each"]["elbow.servo_gain_factor"] == 100.0
-    with pytest.raises(DataError, match="does not state the proportional gain"):
+    with pytest.raises(DataError, match="has no proportional gain"):
         servo_gain_factors_by_recording(step.system, [one, recording(swing(), name="silent")])
 
 

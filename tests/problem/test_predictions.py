@@ -220,7 +220,7 @@ def test_prediction_error_is_euclidean_and_leaves_out_given_frames_and_gaps():
         (lambda r: constant_position_baseline(r, ("p1",), given=0), "given = 0"),
         (lambda r: constant_position_baseline(r, ("p1",), given=11), "given = 11"),
         (lambda r: interpolated_displacement_position_baseline(r, ("c1",), PARENT), "belongs to no branch"),
-        (lambda r: position_rmse(np.zeros((3, 1, 3)), np.zeros((4, 1, 3))), "differ in shape"),
+        (lambda r: position_rmse(np.zeros((3, 1, 3)), np.zeros((4, 1, 3))), "the prediction has the shape"),
     ],
 )
 def test_what_cannot_be_predicted_is_said(recording, call, text):

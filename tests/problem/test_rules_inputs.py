@@ -128,7 +128,7 @@ def test_at_a_jump_the_slope_is_the_mean_of_both_sides():
 def test_nothing_driven_needs_no_torque_and_a_driven_joint_does():
     silent = joints(["a"], [0.0, 0.1], np.zeros((2, 1)))
     assert mean_step_inputs(silent, (), TimeGrid(0.0, 0.1, 3), "run").shape == (3, 0)
-    with pytest.raises(DataError, match="no joint effort"):
+    with pytest.raises(DataError, match="joint efforts drive the model"):
         mean_step_inputs(silent, ("a",), TimeGrid(0.0, 0.1, 3), "run")
     with pytest.raises(DataError, match="'b' of the model is not recorded"):
         mean_step_inputs(driven([1.0, 2.0]), ("b",), TimeGrid(0.0, 0.1, 3), "run")
@@ -143,7 +143,7 @@ def test_loads_are_smoothed_and_interpolated():
     np.testing.assert_allclose(found[:, 0], 3 * grid.node_times, atol=1e-3)
     np.testing.assert_allclose(found[:, 1], 1.0, atol=1e-9)
     for without in (recording(joints(["a"], t, np.zeros((200, 1)))), pointed()):
-        with pytest.raises(DataError, match="gears give way"):
+        with pytest.raises(DataError, match="elastic gears of the model need joint efforts"):
             smoothed_joint_efforts(without, ("a",), grid, PLAIN)
 
 
@@ -183,7 +183,7 @@ def test_a_prescribed_joint_follows_its_recorded_positions():
     assert beyond[0, 0] == pytest.approx(4.0)
     assert beyond[-1, 0] == pytest.approx(9.0)
     assert prescribed_coordinates_at_nodes(made, moving(), grid, PLAIN).shape == (41, 0)
-    with pytest.raises(DataError, match="'a' is prescribed but the recording has no joints"):
+    with pytest.raises(DataError, match="'a' is prescribed, but the recording has no joints"):
         prescribed_coordinates_at_nodes(pointed(), moving("a"), grid, PLAIN)
 
 

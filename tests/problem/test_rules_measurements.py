@@ -41,7 +41,7 @@ def test_a_grid_covers_the_recording_or_as_much_as_is_wanted(last, duration, ste
 def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
     made = recording(None, seen(["p"], [1.0, 1.4], np.zeros((2, 1, 3))))
     assert (recording_time_grid(made, 0.1).start_time, recording_time_grid(made, 0.1).steps) == (1.0, 4)
-    with pytest.raises(DataError, match=r"0\.4 s of data are shorter than two time steps of 0\.3 s"):
+    with pytest.raises(DataError, match=r"0\.4 s of data are shorter than two time steps"):
         recording_time_grid(made, 0.3)
 
 

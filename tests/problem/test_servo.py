@@ -179,7 +179,7 @@ def test_what_it_is_is_found_again(step) -> None:
 
 def test_without_commands_it_says_what_is_missing(step) -> None:
     silent = recording(joints(PENDULUM, [0.0, 0.1, 0.2], np.zeros((3, 2)), position_std=1e-3, effort=np.ones((3, 2))))
-    with pytest.raises(DataError, match="no commanded positions") as caught:
+    with pytest.raises(DataError, match="follow commanded positions, but the recording has none") as caught:
         problem_of(step, silent, ["shoulder.servo_gain"])
     assert "position_command" in caught.value.where
     assert "prescribed" in caught.value.hint

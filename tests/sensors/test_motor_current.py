@@ -146,12 +146,12 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
 @pytest.mark.parametrize(
     ("options", "changes", "message"),
     [
-        (SensorOptions(), {}, "torque constants are not given"),
+        (SensorOptions(), {}, "torque constants of the motors are not given"),
         (SensorOptions(constants={"torque_constant": 0.0}), {}, "a torque constant is zero"),
         (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "joint 'shoulder' has no value"),
         (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "noise level of the motor currents"),
         (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder'"),
-        (replace(KNOWN, use=False), {}, "no measurement of the model"),
+        (replace(KNOWN, use=False), {}, "no sensor of the model has a measurement"),
     ],
 )
 def test_currents_that_cannot_be_compared_are_refused(step, made, options, changes, message):

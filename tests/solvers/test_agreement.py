@@ -190,7 +190,7 @@ def test_open_loop_is_for_multiple_shooting(make_problem):
         ({"hessian": "bfgs"}, "hessian = 'bfgs'"),
         ({"ipopt": {"hessian_approximation": "limited-memory"}}, "limited-memory"),
         ({"node_interval": 10}, "node_interval = 10 without condensing"),
-        ({"condensing": True, "node_interval": 1000}, "fewer than one node interval"),
+        ({"condensing": True, "node_interval": 1000}, "fewer than a node interval"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused_with_a_reason(pendulum, settings, said):

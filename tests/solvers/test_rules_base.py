@@ -462,7 +462,7 @@ def test_a_horizon_too_short_for_a_filter_is_left_out():
 
     def shortened(duration):
         if duration < 2.0:
-            raise DataError("0.6 s of efforts are too short for a filter of 8 Hz")
+            raise DataError("0.6 s of efforts are too short for a low-pass filter of 8 Hz")
         return whole(duration)
 
     problem.truncated_to_duration = shortened

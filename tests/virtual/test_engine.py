@@ -141,9 +141,9 @@ def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
     [
         ({"time_step": 3e-4}, "does not divide the period of 100 Hz"),
         ({"time_step": 3e-4, "controller_rate": 1e3, "effort_kind": "mean"}, "not divide the period of 1000 Hz"),
-        ({"controller_rate": 150.0, "effort_kind": "mean"}, "150 Hz is no multiple of the recording's 100 Hz"),
-        ({"controller_rate": 50.0}, "50 Hz is no multiple"),
-        ({"controller_rate": 1000.0}, "1000 Hz is not held over a sample of 100 Hz"),
+        ({"controller_rate": 150.0, "effort_kind": "mean"}, "150 Hz is not a multiple of sample_rate = 100 Hz"),
+        ({"controller_rate": 50.0}, "50 Hz is not a multiple"),
+        ({"controller_rate": 1000.0}, "1000 Hz. changes commands within a sample"),
         ({"effort_kind": "average"}, "effort_kind = 'average'"),
     ],
 )

@@ -167,5 +167,5 @@ def test_what_cannot_be_fitted_is_said(whole, urdf_folder):
         ShapeFitter(System.build(read_urdf(urdf_folder / "double_pendulum.urdf")))
     with pytest.raises(DataError, match="no point"):
         whole.fit_frame(sight, whole.rest_configuration)
-    with pytest.raises(ConfigError, match="no pass"):
+    with pytest.raises(ConfigError, match="are both empty"):
         ShapeFitOptions(node_loss_scales=(), surface_loss_scales=())

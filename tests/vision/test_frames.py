@@ -83,7 +83,7 @@ def test_formats_of_clouds(open3d, folder, ending, coloured):
         ("a.npz", lambda file: np.savez(file, dots=CLOUD), "no array `points`"),
         ("a.npz", lambda file: np.savez(file, points=CLOUD[:, :2]), "no array `points`"),
         ("a.npz", lambda file: np.savez(file, points=np.array([{}])), "damaged"),
-        ("a.npz", lambda file: np.savez(file, points=CLOUD, colours=COLOURS[:2]), "no colour for every point"),
+        ("a.npz", lambda file: np.savez(file, points=CLOUD, colours=COLOURS[:2]), "does not have one colour per point"),
         ("a.npz", lambda file: file.write_bytes(b"PK nonsense"), "damaged"),
         ("a.xyz", lambda file: file.write_text("1 2\n3 4\n"), "has 2 columns"),
         ("a.xyz", lambda file: file.write_text("1 2 here\n"), "cannot be read"),
@@ -113,7 +113,7 @@ def test_depth_images_and_their_lens(open3d, tmp_path, lens):
     with pytest.raises(DataError, match="coefficients are"):
         read_frames(folder)
     changed(folder, intrinsics=None)
-    with pytest.raises(DataError, match="intrinsics are missing"):
+    with pytest.raises(DataError, match="intrinsics of the camera are missing"):
         read_frames(folder)
 
 
@@ -136,7 +136,7 @@ def test_units_and_frames_of_clouds(folder):
         ({"frame": "base"}, "frame of the clouds is 'base'"),
         ({"posse": 1}, "unknown key 'posse'"),
         ({"format": "yid-frames/7"}, "format of the frames"),
-        ({"intrinsics": {"width": 3}}, "intrinsics are not complete"),
+        ({"intrinsics": {"width": 3}}, "intrinsics lack keys"),
         ({"depth_unit": -1}, "depth_unit is -1"),
     ],
 )
@@ -150,8 +150,8 @@ def test_what_is_wrong_with_the_camera_is_said(folder, entries, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "no time stamps"),
-        ("file,t\n", "no frame"),
+        (None, "file of time stamps does not exist"),
+        ("file,t\n", "time stamps has no rows"),
         ("name,time\n000000.ply,1\n", "the columns are"),
         ("file,t\n000000.ply,noon\n", "the time is 'noon'"),
         ("file,t\n000000.stl,1\n", "neither a cloud nor a depth image"),
@@ -234,9 +234,9 @@ def test_points_are_read(read, kind):
 WRONG = {
     "no ply": (b"plx\n", "has no head"),
     "no end": (ply_head("ascii")[:-12], "has no head"),
-    "no format": (ply_head("ascii").replace(b"format ascii 1.0\n", b"") + TEXT, "does not say the format"),
-    "another format": (ply_head("ascii").replace(b"ascii", b"utf") + TEXT, "head says 'format utf 1.0'"),
-    "another type": (ply_head("ascii").replace(b"float", b"flaot", 1) + TEXT, "head says 'property flaot x'"),
+    "no format": (ply_head("ascii").replace(b"format ascii 1.0\n", b"") + TEXT, "its header has no format"),
+    "another format": (ply_head("ascii").replace(b"ascii", b"utf") + TEXT, "header has the line 'format utf 1.0'"),
+    "another type": (ply_head("ascii").replace(b"float", b"flaot", 1) + TEXT, "header has the line 'property flaot x'"),
     "no z": (ply_head("ascii").replace(b"float z", b"float w") + TEXT, "no x, y and z"),
     "two of a name": (ply_head("ascii").replace(b"double nx", b"double x") + TEXT, "no x, y and z"),
     "lists before": (ply_head("ascii", before=FACES.decode()) + TEXT, "lists of 'face'"),
@@ -317,7 +317,7 @@ def test_pixels_that_a_lens_does_not_have_are_no_points():
 @pytest.mark.parametrize(
     ("model", "coefficients", "message"),
     [
-        ("inverse_brown", (0.1, 0, 0, 0, 0), "the distortion is 'inverse_brown'"),
+        ("inverse_brown", (0.1, 0, 0, 0, 0), "the distortion model is 'inverse_brown'"),
         ("plumb_bob", (0.1, 0.2), "has the coefficients"),
         ("equidistant", (np.nan, 0, 0, 0), "has the coefficients"),
     ],

@@ -168,7 +168,7 @@ def folded(s):
     ],
 )
 def test_what_cannot_be_followed_is_refused_with_the_reason(rope, make, reason):
-    with pytest.raises(DataError, match="not one frame could be used") as caught:
+    with pytest.raises(DataError, match="no frame could be used") as caught:
         track_object(ObservedScene(rope), None, film([make()], TABLE), OPTIONS)
     assert reason in caught.value.what
 

@@ -191,7 +191,7 @@ def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
     bare.write_text('<robot name="bare"><link name="base"/></robot>')
     with pytest.raises(ModelError, match="no visual meshes"):
         load_robot_meshes_by_joint(bare, tree)
-    with pytest.raises(ModelError, match="is not there"):
+    with pytest.raises(ModelError, match="does not exist"):
         surface_meshes._resolve_mesh_path("package://nobody/mesh.dae", bare)
 
 

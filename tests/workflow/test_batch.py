@@ -187,7 +187,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
 
 def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monkeypatch):
     prescribed = load_config(pendulum)
-    with pytest.raises(ConfigError, match=r"moves driven arms(.|\n)*model.arms.mode"):
+    with pytest.raises(ConfigError, match=r"needs arms that are driven(.|\n)*model.arms.mode"):
         run_blind([prescribed], tmp_path / "proof", 2, 3, workers=InlineExecutor())
     with pytest.raises(ConfigError, match="two configurations are called pendulum"):
         run_blind([driven, driven], tmp_path / "proof", 2, 3, workers=InlineExecutor())

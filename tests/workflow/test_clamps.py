@@ -74,9 +74,9 @@ def test_every_recording_has_its_own_places_of_markers_in_the_frame_that_carries
 @pytest.mark.parametrize(
     ("overrides", "recording", "kind", "words"),
     [
-        ((), blank(None), DataError, "has no positions of its markers"),
-        ((), blank(name="elsewhere"), ConfigError, "'mark' is no point"),
-        (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "attached to no frame of the object"),
+        ((), blank(None), DataError, "has no marker positions"),
+        ((), blank(name="elsewhere"), ConfigError, "'mark' is not a point"),
+        (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "its parent is not a frame of the object"),
         (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),
         ((JAW.replace("z_axis_point_name: b", "z_axis_point_name: a"),), None, ConfigError, "one point for both ends"),
         ((JAW, "model.object.mount.parent_frame=jaw"), None, ConfigError, "moves"),

@@ -286,7 +286,7 @@ def test_a_diagnosis_leaves_a_run_folder(carried_out, pendulum):
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("diagnosis.candidates=[kelvin_voigt]", "kelvin_voigt does not fit"),
+        ("diagnosis.candidates=[kelvin_voigt]", "kelvin_voigt is not possible for this model"),
         ("diagnosis.noise_fraction_of_std=0.1", "set sensors.joints.effort.std"),
     ],
 )

@@ -184,8 +184,8 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
     before = set(tmp_path.rglob("*"))
     for arguments, parts in (
         ((found, "--format", "usd"), ["no format 'usd'", "allowed: mjcf", "UsdPhysics has no schema for cables"]),
-        ((found, "--format", "csv"), ["no table", "export a recording"]),
-        ((recording, "--format", "mjcf"), ["no run folder", "solve"]),
+        ((found, "--format", "csv"), ["a run folder cannot be written as CSV", "export a recording"]),
+        ((recording, "--format", "mjcf"), ["is not a run folder", "solve"]),
         ((broken,), ["result.json", "not JSON"]),
         ((tmp_path,), ["no finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),

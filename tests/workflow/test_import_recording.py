@@ -90,16 +90,16 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     # file, its text (None: there is no such file), flags, what is said
     "no such file": ("run.csv", None, "", "no such file"),
     "an unknown format": ("run.xlsx", "x", "", "no reader for '.xlsx' files"),
-    "no name to write to": ("run.csv", GOOD, "--out", "is not named"),
+    "no name to write to": ("run.csv", GOOD, "--out", "the option --out is missing"),
     "an HDF5 that is none": ("run.h5", "x" * 99, "", "not an HDF5 file"),
     "a column that is not there": ("run.csv", GOOD, "--columns q_b=skip", "no column 'q_b'"),
     "more meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t,position:a,skip", "no column '3'"),
     "bad lines alone": ("run.csv", "t,q_a\n0,x\n", "--skip-bad-lines", "no rows"),
-    "a unit that is none": ("run.csv", GOOD, "--units furlong", "'furlong' is no unit"),
+    "a unit that is none": ("run.csv", GOOD, "--units furlong", "the unit 'furlong' is unknown"),
     "a joint that is not there": ("run.csv", GOOD, "--joints b", "no joint 'b'"),
-    "a pair that is none": ("run.csv", GOOD, "--points tip", "'tip' is no pair"),
-    "a number that is none": ("run.csv", GOOD, "--gears a=fast", "'fast' is no number"),
-    "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "no currents"),
+    "a pair that is none": ("run.csv", GOOD, "--points tip", "'tip' is not NAME=VALUE"),
+    "a number that is none": ("run.csv", GOOD, "--gears a=fast", "'fast' is not a number"),
+    "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "not that of a"),
     "an option of another format": ("run.csv", GOOD, "--joint-topic /j", "no option 'joint_topics'"),
     "a long delimiter": ("run.csv", GOOD, "--delimiter ::", "the delimiter is '::'"),
     "a section that is none": ("run.csv", GOOD, "--config wrong.yaml", "there is no key 'colums'"),
@@ -154,7 +154,7 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     assert (recording.point_names, recording.points[0].t[0]) == (("w_rod",), 0.5)
     for flags, what in (
         (["--columns", "x=skip"], "no file has a column 'x'"),
-        (["--episode", "1"], "none of the files"),
+        (["--episode", "1"], "no file has a format with the option"),
     ):
         assert main(["import", "joints.csv", "mocap.csv", "--out", "no.h5", "--units", "mm", *flags]) == 2
         assert what in capsys.readouterr().err

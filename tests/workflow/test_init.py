@@ -131,10 +131,10 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
             for own, k in ((measured, at), (model, model["points"][name]))
         )
         assert np.nanmax(np.abs(seen - told)) < 30  # tenths of a millimetre
-    # a page that is there already is not written over
+    # a page that already exists is not written over
     Path("run.yaml").unlink()
     assert init(*CABLE) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None:
@@ -310,7 +310,7 @@ def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsy
     assert init(*CABLE) == 0
     assert main(["check", "run.yaml", "--out", "checked", "--set", "model.arms.mode=servo"]) == 2
     said = capsys.readouterr().err
-    for words in ("no commanded positions", "joints/position_command", "prescribed"):
+    for words in ("follow commanded positions", "joints/position_command", "prescribed"):
         assert words in said
 
 
@@ -380,15 +380,15 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
 ONE = ("--length", "1", "--mass", "1")
 TREE = ("--object", "tree", "--branch", "a=1,1,1")
 REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
-    "nothing, no efforts and no commands": ((), "nothing in the recording shows what moving the arm takes", "--object"),
-    "a length of nothing": (ONE[:2], "--length describes an object, and none is named", "add --object"),
+    "nothing, no efforts and no commands": ((), "no measurement of the forces that move the arm", "--object"),
+    "a length of nothing": (ONE[:2], "--length needs --object", "add --object"),
     "cable without a length": (("--object", "cable"), "a cable needs a length", "--length"),
     "cable without a mass": (("--object", "cable", *ONE[:2]), "a cable needs a mass", "--mass"),
     "cable without a radius": (("--object", "cable", *ONE), "a cable needs a radius", "--radius"),
     "beam without a section": (("--object", "beam", *ONE), "radius or a section", "--section"),
     "tree without branches": (("--object", "tree"), "a tree needs branches", "--branches"),
     "equal branches without a mass": (("--object", "tree", "--branches", "4", *ONE[:2]), "needs a mass", "--mass"),
-    "branch of two numbers": (("--object", "tree", "--branch", "a=1,2"), "describes no branch", "NAME=LENGTH"),
+    "branch of two numbers": (("--object", "tree", "--branch", "a=1,2"), "does not describe a branch", "NAME=LENGTH"),
     "branch of no size": (("--object", "tree", "--branch", "a=1,0,1"), "not above 0", "--branch"),
     "branches of a cable": ((*CABLE, "--branch", "a=1,1,1"), "a cable has no branches", "--object tree"),
     "branch on nothing": (("--object", "tree", "--branch", "a@b=1,1,1"), "grows on 'b', which", "--branch"),
@@ -397,8 +397,8 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "too many links": ((*CABLE, "--links", "99"), "99 links", "--links"),
     "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
-    "grasp of no point": ((*CABLE, "--grasp", "hub"), "is no grasp", "FRAME=POINT"),
-    "import flags of a recording": ((*CABLE, "--units", "deg"), "a recording already", "leave"),
+    "grasp of no point": ((*CABLE, "--grasp", "hub"), "is not FRAME=POINT", "FRAME=POINT"),
+    "import flags of a recording": ((*CABLE, "--units", "deg"), "already a recording", "leave"),
 }  # fmt: skip
 
 
@@ -416,7 +416,7 @@ def test_what_is_missing_is_named_and_nothing_is_written(case, bench, capsys) ->
 def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_recording(moved(SHORT, parts=()), bench / "one.h5")
     assert init(*CABLE) == 2
-    assert "nothing in the recording shows what the object does" in capsys.readouterr().err
+    assert "no measurement of the object" in capsys.readouterr().err
     (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))
     assert init(*CABLE, files=["bag.csv"]) == 2
     told = capsys.readouterr().err
@@ -426,7 +426,7 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     (bench / "run.yaml").write_text("kept: true\n")
     write_recording(moved(SHORT), bench / "one.h5")
     assert init(*CABLE) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert (bench / "run.yaml").read_text() == "kept: true\n"
 
 
@@ -436,4 +436,4 @@ def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.Capt
     assert not run.sensors["points"].frames
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2
-    assert "none of the points of group 'points' is a frame of the model" in capsys.readouterr().err
+    assert "no point of the group is a frame of the model" in capsys.readouterr().err

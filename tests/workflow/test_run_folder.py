@@ -141,9 +141,9 @@ def test_a_hidden_folder_that_no_run_made_is_not_emptied(settings, tmp_path, kin
     ("name", "message"),
     [
         ("used", "not empty"),
-        ("used/file", "that of a file"),
-        ("link", "that of a link"),
-        ("broken link", "that of a link"),
+        ("used/file", "is an existing file"),
+        ("link", "is a symbolic link"),
+        ("broken link", "is a symbolic link"),
         ("", "not a valid folder name"),
         ("  ", "not a valid folder name"),
         ("a\0b", "not a valid folder name"),

@@ -180,8 +180,7 @@ def search_clock_offset_and_drift(
     """Search, coarse to fine, the clock offset [s] and relative drift for which points are nearest to a path.
 
     The path is known from the first to the last of `knots` [s]. The points are `seen` (N, np, 3) [m] at the times `t`
-    (N,). With `drifts` the clock may also drift, by up to `_MAX_DRIFT`.
-    """
+    (N,). With `drifts` the clock may also drift, by up to `_MAX_DRIFT`."""
     middle, span = 0.5 * float(t[0] + t[-1]), float(t[-1] - t[0])
 
     def error(late: float, drift: float) -> float:
@@ -212,8 +211,7 @@ def drift_and_overstated_noise_issues(problem: EstimationProblem, x: Array, eval
     """Find drifting clocks and overstated noise in the residuals of a fit.
 
     A constant offset of a camera's clock looks like missing damping; a diagnosis distinguishes the two (effect
-    `camera_latency`). Only an offset that grows during a recording is attributed to the clock here.
-    """
+    `camera_latency`). Only an offset that grows during a recording is attributed to the clock here."""
     if not evaluation.ok or evaluation.jacobian is None or problem.rms_noise_of_data_residuals != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}

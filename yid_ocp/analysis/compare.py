@@ -266,8 +266,7 @@ def explain_paper_estimates(
     - slow: the value is far from the truth, between the start and the point where the published method stops without
       torque errors, or within 10 % of that point
     - torque error: constant torque errors lead the published method to such values
-    - unexplained: none of these
-    """
+    - unexplained: none of these"""
     judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}
     if any(entry.verdict == "not_trusted" for entry in judged.values()):
         return ()

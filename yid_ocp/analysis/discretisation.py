@@ -42,8 +42,7 @@ class _FinerDiscretisationProblem:
     """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns.
 
     A coarse parameter times its entry in `parameter_factors` (default 1) describes the same object in the finer model.
-    `subdivided_joints` maps each joint of a divided link to the fine joints that share its angle.
-    """
+    `subdivided_joints` maps each joint of a divided link to the fine joints that share its angle."""
 
     problem: EstimationProblem
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
@@ -100,8 +99,7 @@ def _gauss_newton_step_in_finer_model(
     Also returns the linearised residual after the step, or a message if the step fails. Data, bounds and priors are
     those of the coarse problem, with the evaluation `at_x`. With `model_difference_only`, for points other than an
     estimate, the coarse prediction replaces the data. With process noise, weights and Jacobian are the coarse ones, and
-    only the residual is the finer model's (Richardson extrapolation), which saves a filter.
-    """
+    only the residual is the finer model's (Richardson extrapolation), which saves a filter."""
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
     weighted = any(own is not None for own in coarse.whitening_filters)
@@ -263,8 +261,7 @@ def inflate_estimates_by_discretisation(
 ) -> dict[str, ParameterEstimate]:
     """Include the discretisation shifts `found` of estimates in their standard deviations, intervals and verdicts.
 
-    A verdict can only get worse. `sizes` are typical sizes, as in `inference.uncertainty.parameter_verdict`.
-    """
+    A verdict can only get worse. `sizes` are typical sizes, as in `inference.uncertainty.parameter_verdict`."""
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
         entry = counted[name]
@@ -293,8 +290,7 @@ class NaturalFrequencies:
     """Natural frequencies of a system's step map about an equilibrium, with the robot fixed.
 
     Unstable modes grow from step to step although damping is included: the equilibrium is unstable, or the time step is
-    too long for the tension of the object.
-    """
+    too long for the tension of the object."""
 
     frequencies_hz: Array  # undamped, ascending, shape (k,)
     n_unstable_modes: int = 0
@@ -347,8 +343,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
-    `configuration` holds driven and prescribed coordinates [rad or m]. Lengths are taken from `theta`.
-    """
+    `configuration` holds driven and prescribed coordinates [rad or m]. Lengths are taken from `theta`."""
     if not system.grasps:
         return {}
     q, inner = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*system.effect_internal_coordinate_symbols.values())
@@ -398,8 +393,7 @@ class AlternatingErrorGrowth:
 
     Physical motion keeps its direction for several steps. A mode of the linearised step whose eigenvalue has a negative
     real part changes sign at every step; it is a numerical artefact. If the eigenvalue's magnitude exceeds one, the
-    integration is unstable, even if Newton's method converges.
-    """
+    integration is unstable, even if Newton's method converges."""
 
     recording_name: str
     growth_decades: float  # powers of ten, over the stretch on which it grows most

@@ -25,8 +25,7 @@ class RunEstimates(ReprMixin):
     """Estimates of n parameters from one run, with their covariance.
 
     Values (n,) and covariance (n, n) are in the parameters' `units`. If `is_fit_adequate` is False (the model does not
-    explain the recordings), the covariance includes the misfit.
-    """
+    explain the recordings), the covariance includes the misfit."""
 
     run_name: str
     parameter_names: tuple[str, ...]
@@ -109,8 +108,7 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
     """Pool several runs' estimates. Also returns chi2 of the differences between runs, and its degrees of freedom.
 
     A run may lack some of the parameters. The pooled estimates contain the parameters of all runs. Their standard
-    deviations are multiplied by Birge's ratio if the runs differ by more than their own standard deviations explain.
-    """
+    deviations are multiplied by Birge's ratio if the runs differ by more than their own standard deviations explain."""
     names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
     information, sums = np.zeros((len(names), len(names))), np.zeros(len(names))
     # scaled by the first known standard deviations, to avoid rounding errors
@@ -140,8 +138,7 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
 
     Each parameter is tested with its marginal variances, each run with its whole covariance. The significance level is
     divided by the number of parameters or of runs. A run is an outlier if it disagrees with the other runs and these
-    agree without it, or better than without any other run. Two runs have no outlier.
-    """
+    agree without it, or better than without any other run. Two runs have no outlier."""
     mean, chi2, degrees = pool_estimates(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))

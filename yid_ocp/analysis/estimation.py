@@ -60,8 +60,7 @@ def solve(
     Returns
     -------
     Solution
-        With its `checks`. A search that does not converge raises no error; see `status` and `message`.
-    """
+        With its `checks`. A search that does not converge raises no error; see `status` and `message`."""
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
@@ -199,8 +198,7 @@ def choose_cable_memory_fit(
 
     The load of a cable that moves at the start of a recording is unknown, and its apparent memory may be this motion.
     Each such recording is predicted from the other ones, with and without memory (by one Gauss-Newton step from the fit
-    of all). The memory is kept if the sum of its errors is smaller.
-    """
+    of all). The memory is kept if the sum of its errors is smaller."""
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
         return ChosenCableMemoryFit(problem, solution)

@@ -18,7 +18,7 @@ from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_jo
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError, SolverError, YidError
+from yid_ocp.errors import DataError, YidError, failed_rollout_error
 from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.kinematics import forward_kinematics
@@ -28,6 +28,7 @@ from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.sensors import recorded_camera_pose
+from yid_ocp.sensors.base import missing_noise_level_error
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
     JOINT_POSITION_GROUP_NAME,
@@ -109,7 +110,8 @@ class RecordedExperiment:
         if isinstance(said, float):
             return np.full(group.position.shape, said)
         if group.std is None:
-            raise DataError(f"the noise level of group '{group.name}' is not known", hint="set it under `sensors`")
+            where = f"sensors.{group.name}.std"
+            raise missing_noise_level_error(f"group '{group.name}'", where, group.name, "m")
         return group.std
 
 
@@ -275,7 +277,7 @@ class CandidateExperimentSensitivityBuilder:
         x = transfer_unknowns_by_name(setting.x, base.unknown_names, problem)
         evaluation = problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
-            raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
+            raise failed_rollout_error(evaluation.message)
         slopes: dict[tuple[int, str, str], Array] = {}
         by_joints: dict[int, Array] = {}
         encoders = self._with_encoders(problem)
@@ -375,12 +377,12 @@ class CandidateExperimentSensitivityBuilder:
     def _welded(self, system: System, others: frozenset[str]) -> System:
         layout = self.build_sensitivities(others)
         if isinstance(layout, str):
-            raise SolverError(layout)
+            raise failed_rollout_error(layout)
         problem, n = layout.problem, system.n_coordinates
         theta, offset = problem.theta_and_initial_state_deviation(layout.x, 0)
         start = problem.initial_state_of_episode(problem.episodes[0], theta, offset)
         if start.failure_message:
-            raise SolverError(start.failure_message)
+            raise failed_rollout_error(start.failure_message)
         q, parameters = ca.SX.sym("q", n), problem.system.parameters
         kinematics = forward_kinematics(problem.system.mechanism, q)
         turned = []

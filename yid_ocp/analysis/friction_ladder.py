@@ -29,8 +29,7 @@ class FrictionLawFit:
     """One friction law fitted to all recordings, with its prediction errors on recordings left out in turn.
 
     `left_out_errors` holds each recording's root mean square error, predicted by a fit without its kind of motion (NaN
-    if the fit failed). It is in the channels' unit, or in standard deviations if units differ.
-    """
+    if the fit failed). It is in the channels' unit, or in standard deviations if units differ."""
 
     law: str
     parameters: Mapping[str, ParameterEstimate]  # estimates of the fit to all recordings

@@ -20,7 +20,12 @@ from yid_ocp.analysis.profile import (
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
+from yid_ocp.errors import (
+    ConfigError,
+    SolverError,
+    failed_rollout_error,
+    unknown_name_error_arguments,
+)
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
@@ -65,10 +70,8 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that
 class ParameterIdentifiability:
     """Value, standard deviations and identifiability verdict of one parameter.
 
-    The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). It is
-    consistent with `interval`, the 95 % profile-likelihood interval about the best fit of all unknowns (None if not
-    requested).
-    """
+    The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). It agrees with
+    `interval`, the 95 % profile-likelihood interval about the best fit of all unknowns (None if not requested)."""
 
     value: float
     unit: str
@@ -84,8 +87,7 @@ class _ParameterDirection:
     """A direction of relative parameter changes and its uncertainty, judged like a parameter.
 
     The singular value is that of the whitened sensitivity to relative changes after elimination of nuisances: standard
-    deviations of the data per unit change.
-    """
+    deviations of the data per unit change."""
 
     singular_value: float
     std_relative: float  # reciprocal of the singular value
@@ -99,8 +101,7 @@ class IdentifiabilityResult(ReprMixin):
     """Identifiability of p free parameters, with correlations, Fisher information and uncertain directions.
 
     Values and standard deviations in `parameters` are in each parameter's `unit`. Relative standard deviations,
-    correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless.
-    """
+    correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless."""
 
     parameters: Mapping[str, ParameterIdentifiability]
     parameter_names: tuple[str, ...]  # in the order of the matrices
@@ -167,13 +168,12 @@ def identifiability(
     SolverError
         The rollout at the point fails.
     ConfigError
-        `intervals` contains a name that is not a free parameter.
-    """
+        `intervals` contains a name that is not a free parameter."""
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in (own for own in wanted if own not in names):
-        hint = nearest_name_hint(name, names)
-        raise ConfigError(f"'{name}' is not a free parameter", hint=hint, where="intervals")
+        said = unknown_name_error_arguments(name, names)
+        raise ConfigError(f"'{name}' is not a free parameter", where="intervals", **said)
     given = unknowns_from_solution(problem, solution)
     wide = with_nuisance_unknowns(problem, start, grasp_std)
     x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
@@ -182,8 +182,7 @@ def identifiability(
         as_solved, wide = wide is problem, problem_whitened_at(wide, x, rounds=2)
         evaluation = wide.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
-            message = f"the simulation fails at the parameters where information is computed: {evaluation.message}"
-            raise SolverError(message, hint="solve first, or choose other initial values")
+            raise failed_rollout_error(evaluation.message)
         covariance, chi2 = unknowns_covariance_and_reduced_chi2(wide, evaluation)
         inflation, fit = math.sqrt(max(1.0, chi2)), None
         if solution is None:
@@ -236,8 +235,7 @@ def system_with_grasp_offset_effects(system: System) -> System:
 def unknowns_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
     """Return a problem's unknown vector from a solution, an array or (default) its initial values.
 
-    Raises `SolverError` for a wrong shape or a value that is not finite.
-    """
+    Raises `SolverError` for a wrong shape or a value that is not finite."""
     if solution is None:
         return problem.initial_unknowns
     if isinstance(solution, Solution):
@@ -245,9 +243,10 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
     x = np.array(solution, float)
     if x.shape != (len(problem.unknown_names),):
         shape = f"({len(problem.unknown_names)},), as problem.unknown_names"
-        raise SolverError(f"the point has shape {x.shape}", allowed=shape)
+        raise SolverError(f"the array of unknowns has shape {x.shape}", where="solution", allowed=shape)
     if not np.all(np.isfinite(x)):
-        raise SolverError(f"{problem.unknown_names[int(np.argmin(np.isfinite(x)))]} is not finite at the point")
+        what = f"{problem.unknown_names[int(np.argmin(np.isfinite(x)))]} is not finite"
+        raise SolverError(what, where="solution", allowed="finite values of all unknowns")
     return x
 
 

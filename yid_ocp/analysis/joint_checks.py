@@ -43,8 +43,7 @@ _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as s
 class RecordedJointsModel:
     """Numeric kinematics and inverse dynamics of the joints whose angles are recorded.
 
-    Driven joints come first, then prescribed joints. Unknown coordinates, such as a beam's bending, are zero.
-    """
+    Driven joints come first, then prescribed joints. Unknown coordinates, such as a beam's bending, are zero."""
 
     system: System
     theta: Array
@@ -85,8 +84,7 @@ class RecordedJointsModel:
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
         """Positions (N, nf, 3) [m] of frames at recorded angles `q` (N, k), and their Jacobian by `q` (N, nf, 3, k).
 
-        Every frame must satisfy `is_frame_determined_by_angles`.
-        """
+        Every frame must satisfy `is_frame_determined_by_angles`."""
         place, slope = (np.array(ca.densify(x)) for x in self._places(frames).map(len(q)).call([q.T]))
         count, width = len(frames), len(self.joint_names)
         by_angle = slope.reshape(3 * count, len(q), width).transpose(1, 0, 2)

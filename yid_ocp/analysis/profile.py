@@ -94,8 +94,7 @@ def solution_with_profile_intervals(
     """Return a solution with profile-likelihood intervals and consistent verdicts for weakly determined parameters.
 
     For these the cost is not quadratic; nor is it for stiffnesses that are small compared with their typical size
-    (`mark_unidentifiable_near_zero_estimate`). A problem that is too large for profiles keeps its solution.
-    """
+    (`mark_unidentifiable_near_zero_estimate`). A problem that is too large for profiles keeps its solution."""
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
         return solution

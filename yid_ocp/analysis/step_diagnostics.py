@@ -51,8 +51,7 @@ def checked_step_linearisation(
 ) -> CheckedStepLinearisation:
     """Linearise a step at a state (nx,), and compare A_k and B_k with central finite differences.
 
-    The torque (nu,) is in N m. `path` (nc,) are the prescribed coordinates before and after the step.
-    """
+    The torque (nu,) is in N m. `path` (nc,) are the prescribed coordinates before and after the step."""
     n, pair = step.sizes["n"], (path, path) if len(path) else None
     a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
 
@@ -299,8 +298,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
     """Structural sparsity patterns of one step's matrices, by name.
 
     `dR_dy` is the residual by the unknowns. `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` follow from the implicit function
-    theorem. `dR_dtheta` contains all rows by the parameters.
-    """
+    theorem. `dR_dtheta` contains all rows by the parameters."""
     whole = _mask(symbols.full_jacobian_sparsity_pattern)
     system = symbols.equations.system
     free = list(system.unprescribed_coordinate_indices)
@@ -403,8 +401,7 @@ def nlp_stage_sparsity(
 
     The parameters `free` are unknowns. `sensors` are evaluated at nodes. The tracking filter feeds the state rows
     `followed` back to the torques. The rows `loose` of the initial state are estimated with a prior; the other
-    unprescribed rows are fixed.
-    """
+    unprescribed rows are fixed."""
     e, system = symbols.equations, symbols.equations.system
     kept = list(system.unprescribed_coordinate_indices)
     rows = ca.vertcat(e.residual, e.p1)
@@ -444,8 +441,7 @@ def full_nlp_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
 
     `jacobian_nonzeros` counts entries of the constraint Jacobian. `hessian_nonzeros` counts both triangles of the exact
     Hessian of the step constraints times their multipliers, without entries of measurements. The initial state is
-    linear in the parameters, as in multiple shooting.
-    """
+    linear in the parameters, as in multiple shooting."""
     (f, nx, m, height), begun = stage.sizes, len(stage.fixed_start_rows)
     # every step after the first adds the same entries
     one, two = (int(np.count_nonzero(_nlp_sparsity_masks(stage, k)[1])) for k in (1, 2))

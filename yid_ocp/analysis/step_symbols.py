@@ -12,7 +12,7 @@ import casadi as ca
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.errors import ConfigError, nearest_name_question
 from yid_ocp.integrator.discrete import DiscreteEquations
 
 # Binding strength of an expression: an operand that binds less than required gets parentheses.
@@ -170,8 +170,7 @@ class SymbolBlock:
     """A named block of equations or variables of one kind.
 
     `labels` has one entry per row of the (k, 1) expression: the name of a joint, grasp equation, internal coordinate or
-    parameter. In the LaTeX template, `#` is replaced by the label.
-    """
+    parameter. In the LaTeX template, `#` is replaced by the label."""
 
     name: str
     labels: tuple[str, ...]
@@ -225,8 +224,7 @@ class NamedStepEquations(ReprMixin):
 
     The row blocks are `del` (DEL equations; at a prescribed coordinate the residual is -h times its effort),
     `internal`, `constraint`, and `p1`, the momentum after the step. The column blocks are `q0`, `p0`, `z0`, `u`,
-    `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`.
-    """
+    `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`."""
 
     equations: DiscreteEquations
     row_blocks: tuple[SymbolBlock, ...]
@@ -310,13 +308,12 @@ class NamedStepEquations(ReprMixin):
         """Return an equation by name or, for `ROW, COLUMN`, its derivative with respect to a variable.
 
         Examples of `text`: `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]`, `constraint[left.x], T2.length`. Raises
-        `ConfigError` if there are not one or two names, or if a name does not exist.
-        """
+        `ConfigError` if there are not one or two names, or if a name does not exist."""
         said = [part.strip() for part in text.split(",")]
         if len(said) > 2 or not all(said):
             allowed = "the name of a row, or of a row and a column with a comma between them"
-            hint = "--entry 'del[T1_0_x], q1[T1_0_x]'"
-            raise ConfigError(f"'{text}' is no entry", where="--entry", allowed=allowed, hint=hint)
+            hint = "write for example --entry 'del[T1_0_x], q1[T1_0_x]'"
+            raise ConfigError(f"'{text}' is not an entry", where="--entry", allowed=allowed, hint=hint)
         row, column = _place(said[0], self.row_names, "row", self.row_blocks), ""
         expression = self._row_expressions[row]
         if len(said) == 2:
@@ -374,8 +371,7 @@ def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[SymbolBlo
     shapes = [f"{b.name}[{b.labels[0]}]" if b.full_names[0] != b.labels[0] else b.labels[0] for b in blocks if b.labels]
     # of the same block, if the block exists
     same = tuple(n for b in blocks if b.name == name.partition("[")[0] for n in b.full_names)
-    hint = nearest_name_hint(name, known if len(known) < 12 else same or known)
-    if len(known) >= 12 and not hint.startswith("did"):
-        hint = "`yid-ocp inspect` lists all names in equations.txt"
+    hint = nearest_name_question(name, known if len(known) < 12 else same or known)
+    hint = hint or "see all names in equations.txt of `yid-ocp inspect`"
     allowed = f"{kind}s of these kinds: {', '.join(shapes)}"
     raise ConfigError(f"the equations of a step have no {kind} '{name}'", where="--entry", allowed=allowed, hint=hint)

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import SolverError
+from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
 from yid_ocp.integrator.step import step_derivatives_along_rollout
 from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
@@ -48,8 +48,7 @@ def point_sensitivities_and_joint_sensor_information(
     slopes : dict of (group, frame) to ndarray, shape (N + 1, 3, nx + q)
         Derivatives with respect to the unknowns, then to the low-rank unknowns of torque and encoder errors.
     information : ndarray, shape (nx + q, nx + q)
-        Information of joint measurements, and of the prior of these errors.
-    """
+        Information of joint measurements, and of the prior of these errors."""
     assert evaluation.jacobian is not None
     episode, result = problem.episodes[i], evaluation.episode_predictions[i]
     driving = episode if encoders is None else encoders.episodes[i]
@@ -99,7 +98,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
     """Derivatives (r, nx + q) of encoder readings, in units of their noise, by the unknowns and the errors."""
     evaluation = encoders.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
-        raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
+        raise failed_rollout_error(evaluation.message)
     for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
         if isinstance(samples.sensor, PositionSensor):
             read = samples.interpolate_to_samples(blur[samples.evaluation_nodes])

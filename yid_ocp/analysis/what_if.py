@@ -24,7 +24,7 @@ from yid_ocp.analysis.experiment_design import (
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import SolverError
+from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -40,8 +40,7 @@ _MAX_CHANGE_SET_SIZE = 3
 class ExperimentChange:
     """One change of an experiment, such as a mechanical change, another measured frame or a camera rate.
 
-    Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
-    """
+    Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`."""
 
     name: str
     description: str
@@ -55,9 +54,8 @@ class ExperimentChange:
 class ChangedExperimentResult:
     """Predicted identifiability of an experiment with some changes. `verdicts` is empty if it could not be evaluated.
 
-    `gain` is the information gain 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation of
-    400 % of each parameter.
-    """
+    `gain` is the information gain 1/2 log det(1 + 16 I) over relative changes [nat], for a prior std of 400 % of each
+    parameter."""
 
     changes: tuple[str, ...]
     description: str
@@ -78,8 +76,7 @@ class ExperimentRanking(ReprMixin):
 
     `single_changes` are sorted by the number of identifiable parameters, then by gain [nat]; changes that could
     not be evaluated come last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make
-    every parameter identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly.
-    """
+    every parameter identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly."""
 
     unchanged_experiment: ChangedExperimentResult
     single_changes: tuple[ChangedExperimentResult, ...]
@@ -132,8 +129,7 @@ def what_if(
     Returns
     -------
     ExperimentRanking
-        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat].
-    """
+        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat]."""
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)
@@ -141,7 +137,7 @@ def what_if(
     outcomes = _Outcomes(setting, inflation, progress, evaluate_changes)
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
-        raise SolverError(base.message)
+        raise failed_rollout_error(base.message)
     changes = [c for c in outcomes.possible if considered_changes is None or c.name in considered_changes]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
     greedy = _greedy(outcomes, changes, base)

@@ -24,7 +24,7 @@ from ruamel.yaml.scanner import Scanner
 from yid_ocp import options
 from yid_ocp.config import schema
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.files import read_input_text
 
 _KeyPath = tuple[str | int, ...]
@@ -48,8 +48,7 @@ def load_config(
     ------
     ConfigError
         Missing file, invalid YAML, an unknown or missing key, a value of the wrong type or outside its range. The error
-        states file, line and key, what is allowed and the nearest known key.
-    """
+        states file, line and key, what is allowed and the nearest known key."""
     embedded = Path(str(resources.files("yid_ocp.data").joinpath("defaults", default)))
     file, origin = (embedded, "embedded default") if path is None else (Path(path), str(path))
     data, places = _parse(_read(file), origin)
@@ -73,7 +72,7 @@ def _read(path: Path) -> str:
         if isinstance(error.__cause__, FileNotFoundError):
             what = "there is no such configuration file"
             if path.parent.is_dir():
-                hint = nearest_name_hint(path.name, (entry.name for entry in path.parent.glob("*.yaml")))
+                hint = nearest_name_question(path.name, (entry.name for entry in path.parent.glob("*.yaml"))) or hint
         raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8 of at most 1 MiB", hint=hint) from error
 
 
@@ -82,7 +81,9 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
     if data is None:
         data = CommentedMap()
     if not isinstance(data, CommentedMap):
-        raise ConfigError("the file does not hold keys and values", where=origin, allowed="sections such as `model:`")
+        hint = "start with the file that `yid-ocp init` writes"
+        allowed = "a mapping with sections such as `model:`"
+        raise ConfigError("the file does not hold keys and values", where=origin, allowed=allowed, hint=hint)
     places: dict[_KeyPath, str] = {}
     return _unwrap(data, (), places, origin), places
 
@@ -100,21 +101,22 @@ class _CheckedParser(Parser):
         event = super().get_event()
         self._count += _ALIAS_COST + self._sizes.get(event.anchor, 0) if isinstance(event, AliasEvent) else 1
         if self._count > _MAX_ENTRIES:
-            raise self._odd(f"there are more than {_MAX_ENTRIES} entries, aliases written out", event)
+            what = f"there are more than {_MAX_ENTRIES} entries, with aliases expanded"
+            raise self._odd(what, event, "leave entries or aliases out")
         if isinstance(event, CollectionStartEvent):
             self._begun.append((event.anchor, self._count))
         elif isinstance(event, CollectionEndEvent):
             anchor, before = self._begun.pop()
             self._sizes |= {anchor: self._count - before} if anchor else {}
         if len(self._begun) > _MAX_DEPTH:
-            raise self._odd(f"more than {_MAX_DEPTH} levels stand in one another", event)
+            raise self._odd(f"the entries are nested more than {_MAX_DEPTH} levels deep", event, "use fewer levels")
         if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
-            raise self._odd(f"the tag '{event.tag}' asks for a type", event)
+            raise self._odd(f"the value has the tag '{event.tag}'", event, "remove the tag")
         return event
 
-    def _odd(self, what: str, event: Any) -> ConfigError:
+    def _odd(self, what: str, event: Any, hint: str) -> ConfigError:
         where = f"{self._origin}, line {event.start_mark.line + 1}"
-        return ConfigError(what, where=where, allowed=_ALLOWED_YAML, hint="write it without")
+        return ConfigError(what, where=where, allowed=_ALLOWED_YAML, hint=hint)
 
 
 def _loaded(text: str, origin: str) -> Any:
@@ -127,20 +129,20 @@ def _loaded(text: str, origin: str) -> Any:
         problem = str(error.problem or error.context).split("\n")[0]
         twice = re.match(r'found duplicate key "(.*?)"', problem)
         what = f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}"
-        hint = "check indentation, brackets, colons and duplicated keys"
+        hint = "remove one of the two" if twice else "check indentation, brackets and colons"
         raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED_YAML, hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         # errors of the YAML library on unusual text: numbers of thousands of digits, keys that are lists
-        problem = next(iter(str(error).splitlines()), type(error).__name__)
-        hint = "look for very long numbers and for keys that are lists"
-        what = f"the file is not valid YAML: {problem}"
+        what, hint = "the file is not valid YAML", "remove numbers of thousands of digits, and keys that are lists"
         raise ConfigError(what, where=origin, allowed=_ALLOWED_YAML, hint=hint) from error
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
     """Plain Python values instead of the YAML reader's types. Their lines are stored in `places`."""
     if len(path) > _MAX_DEPTH:
-        raise ConfigError("an alias refers to itself", where=origin, hint="replace the aliases by their content")
+        allowed = "aliases of other entries"
+        hint = "replace the aliases by their content"
+        raise ConfigError("an alias refers to itself", where=origin, allowed=allowed, hint=hint)
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
         for key, value in node.items():
@@ -153,7 +155,8 @@ def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str)
             places[(*path, i)] = f"{origin}, line {_line(node, i)}"
         return [_unwrap(value, (*path, i), places, origin) for i, value in enumerate(node)]
     if isinstance(node, str) and "\0" in node:
-        raise ConfigError("the text holds a NUL", where=places.get(path, origin), hint="leave it out")
+        what, allowed = "the text has a null character", "text without null characters"
+        raise ConfigError(what, where=places.get(path, origin), allowed=allowed, hint="remove the character")
     if isinstance(node, int) and node.bit_length() > 1023:
         raise ConfigError("the number is too large", where=places.get(path, origin), allowed="numbers below 1e308")
     for kind in (bool, int, float, str):
@@ -173,14 +176,14 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     key, equals, value_text = text.partition("=")
     origin = f"--set {key.strip()}"
     if not equals or not key.strip():
-        example = "KEY=VALUE, for example problem.time_step=0.005"
-        raise ConfigError(f"'{text}' does not set anything", where="--set", allowed=example)
+        allowed, hint = "KEY=VALUE", "write for example --set problem.time_step=0.005"
+        raise ConfigError(f"'{text}' does not set anything", where="--set", allowed=allowed, hint=hint)
     path, hint = _key_path(RunSettings, key.strip().split("."), origin, data)
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
     except ConfigError as error:
-        what = f"the value '{value_text[:80]}' is not valid YAML: {error.what}"
-        raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}") from error
+        what, hint = f"the value '{value_text[:80]}' is not valid YAML", "close brackets, and quote the value whole"
+        raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}", hint=hint) from error
     parent = data
     for i, part in enumerate(path[:-1]):
         entry = parent.get(part)
@@ -223,7 +226,8 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
             raise schema.unknown_key_error(name, known, origin)
         below = known[name].type_hint
     elif values is None:
-        raise ConfigError(f"there are no keys below '{name}'", where=origin, hint="shorten the key")
+        allowed = f"a key that ends in '{name}'"
+        raise ConfigError(f"there are no keys below '{name}'", where=origin, allowed=allowed, hint="shorten the key")
     elif inner is not None and inner.selector_key == "name":
         below = inner.variants_for_mapping_key(name, origin).classes[""]
     else:
@@ -284,14 +288,17 @@ class _Reader:
         known, kind = sections.variant_options(word), sections.classes[word]
         for name in raw:
             if name not in known:
-                raise schema.unknown_key_error(name, known, self.where((*path, name)), ".".join(map(str, path)))
+                within = ".".join(map(str, path))
+                within += f" with {sections.selector_key}: {word}" if within and len(sections.classes) > 1 else ""
+                raise schema.unknown_key_error(name, known, self.where((*path, name)), within)
         values: dict[str, Any] = {}
         for name, option in options.dataclass_options(kind).items():
             if name in raw:
                 values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
             elif option.default_value is MISSING:
                 what = f"the key '{name}' is missing"
-                raise ConfigError(what, where=self.where(path), allowed=options.describe_type(option.type_hint))
+                allowed, hint = options.describe_type(option.type_hint), f"add {'.'.join(map(str, (*path, name)))}"
+                raise ConfigError(what, where=self.where(path), allowed=allowed, hint=hint)
         return kind(**values)
 
     def _leaf(self, hint: Any, raw: Any, path: _KeyPath) -> Any:

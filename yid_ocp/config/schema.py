@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from yid_ocp import options
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_error_arguments
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class SectionVariants:
         """Return the error for the missing or unknown value `word` of the selector key."""
         if not word:
             what = f"the key '{self.selector_key}' is missing"
-            return ConfigError(what, where=where, allowed=", ".join(self.classes))
+            hint = f"add {self.selector_key}: {next(iter(self.classes))}"
+            return ConfigError(what, where=where, allowed=", ".join(self.classes), hint=hint)
         what = f"there is no {self.variant_noun} '{word}'"
         return ConfigError(what, where=where, **unknown_name_error_arguments(str(word), self.classes))
 
@@ -72,23 +73,23 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
 
 def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
     """Return the error for an unknown key in `within`, with the nearest `known` key and sections that have the key."""
-    said = unknown_name_error_arguments(name, known)
-    homes = list(dict.fromkeys(_sections_with_key(RunSettings, name)))
-    hints = [said["hint"]] if said["hint"] else []
-    hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []
-    hints.append("names changed in this version: see the table in CHANGELOG.md")
+    known = list(known)
+    homes, near = list(dict.fromkeys(_sections_with_key(RunSettings, name))), nearest_name_question(name, known)
+    hints = [near] if near else []
+    hints += [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else []
+    hints = hints or ["leave it out, or find its new name in the table of CHANGELOG.md"]
     if ":" in name:
-        hints = ["put a space behind the colon, as in {" + name.replace(":", ": ") + "}"]
+        hints = ["put a space after the colon, as in {" + name.replace(":", ": ") + "}"]
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")
-    return ConfigError(what, where=where, allowed=said["allowed"], hint="; ".join(hints))
+    allowed = unknown_name_error_arguments(name, known)["allowed"]
+    return ConfigError(what, where=where, allowed=allowed, hint="; ".join(hints))
 
 
 def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
     """Yield completions of a dotted key prefix, up to the next dot or, before a value, to `=`.
 
     `hint` is the type of the value at the key `at`, which ends with a dot. `raw` is the file's value at this key; it
-    supplies names that users choose.
-    """
+    supplies names that users choose."""
     sections, values = section_variants_from_annotation(hint), options.mapping_value_type(hint)
     named = section_variants_from_annotation(values)
     below: dict[str, Any] = {}

@@ -13,7 +13,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.sensors import CHANNEL_KINDS, SensorOptions
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORDER, quantization_step
 
@@ -232,8 +232,7 @@ def typical_point_pair_distances(
     """Distance between the two points of each of `edges` [m]: mean over frames, median over recordings.
 
     If `frames` is given, only the first `frames` frames of each recording count. Raises `DataError` without a
-    recording, or if an edge is never seen.
-    """
+    recording, or if an edge is never seen."""
     result: dict[tuple[str, str], float] = {}
     for edge in edges:
         seen = []
@@ -243,7 +242,10 @@ def typical_point_pair_distances(
             if np.any(np.isfinite(length)):
                 seen.append(float(np.nanmean(length)))
         if not seen:
-            raise DataError(f"edge {edge[0]} to {edge[1]} is never seen", hint="give recordings in which it is")
+            what = f"no frame shows both points of the edge {edge[0]} to {edge[1]}"
+            where = ", ".join(f"recording '{r.name}'" for r in recordings)
+            hint = "add a recording in which both points are visible"
+            raise DataError(what, where=where, allowed="at least one frame with both points", hint=hint)
         result[edge] = float(np.median(seen))
     return result
 
@@ -252,8 +254,8 @@ def _measured_positions(recording: Recording, point: str) -> Array:
     for group in recording.points:
         if point in group.names:
             return group.position[:, group.names.index(point)]
-    hint = nearest_name_hint(point, recording.point_names)
-    raise DataError(f"point '{point}' is not recorded", where=recording.name, hint=hint)
+    said = unknown_name_error_arguments(point, recording.point_names)
+    raise DataError(f"point '{point}' is not recorded", where=f"recording '{recording.name}'", **said)
 
 
 Severity = Literal["warning", "not_trusted", "refused"]

@@ -49,8 +49,7 @@ class _RecordingParts(NamedTuple):
 def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
     """Split a recording at gaps of its joints or, without joints, of the `driving` points.
 
-    Unless a rollout may start `anywhere`, also in motion, only later parts that start at rest are kept.
-    """
+    Unless a rollout may start `anywhere`, also in motion, only later parts that start at rest are kept."""
     t = _times(recording, driving)
     steps = np.diff(t)
     allowed = max(_MAX_SAMPLE_GAP, _MAX_MISSING_PERIODS * median_sample_period(t))
@@ -113,8 +112,7 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
     """Find data quality issues of one recording by all checks that need no model.
 
     `choice` returns the sensor options of a group, such as its stated noise. `driving` states whether joints drive the
-    model, so that gaps between their samples matter.
-    """
+    model, so that gaps between their samples matter."""
     recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(

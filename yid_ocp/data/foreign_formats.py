@@ -46,8 +46,7 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS
 def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
     """Interpret every column of `header`. Returns the meanings (None if unclear) and the units in the names.
 
-    `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
-    """
+    `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`."""
     split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
     meanings: list[_Meaning] = []
@@ -255,8 +254,7 @@ ESTIMATED_WRENCH_GROUP = "wrist_estimated"
 def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
     """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are omitted.
 
-    If the driver estimates an external wrench, `wrench` has its frame and its `values` by quantity.
-    """
+    If the driver estimates an external wrench, `wrench` has its frame and its `values` by quantity."""
     if kind == JOINT_MESSAGE_TYPES[0]:
         return _franka_state(content)
     if kind == JOINT_MESSAGE_TYPES[1]:
@@ -275,13 +273,11 @@ def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
 def joint_values_of_fields(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
     """Read joint values from the decoded message `content`. `paths` maps each channel to the path of an array.
 
-    Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or if a path does not exist or is not
-    numeric.
-    """
+    Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or a path is missing or not numeric."""
     found: dict[str, Any] = {}
     for channel, path in paths.items():
         if channel not in JOINT_CHANNEL_UNITS:
-            what = f"'{channel}' is no channel of joints"
+            what = f"'{channel}' is not a channel of joints"
             raise DataError(what, where=where, **unknown_name_error_arguments(channel, JOINT_CHANNEL_UNITS))
         value = content
         for part in path.split("."):
@@ -293,8 +289,8 @@ def joint_values_of_fields(content: Any, paths: Mapping[str, str], where: str) -
         try:
             found[channel] = np.asarray(value, float).ravel()
         except (TypeError, ValueError) as error:
-            allowed = "an array of numbers, one for each joint"
-            raise DataError(f"the field '{path}' holds no numbers", where=where, allowed=allowed) from error
+            allowed, hint = "an array of numbers, one for each joint", "choose another field with --field"
+            raise DataError(f"the field '{path}' holds no numbers", where=where, allowed=allowed, hint=hint) from error
     count = max((len(values) for values in found.values()), default=0)
     return _values([str(i + 1) for i in range(count)], found)
 

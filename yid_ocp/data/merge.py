@@ -39,8 +39,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     explain the points best. Joints of several recordings are interpolated to the fastest clock; points and other
     sensors keep their clocks. `clock_offsets` are seconds added to the times of a recording (by name), which is then
     not aligned. Raises `DataError` if two recordings have a joint in common, if clocks cannot be aligned, or if an
-    offset names no recording.
-    """
+    offset names no recording."""
     offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
     where = ", ".join(names)
     for name in offsets:
@@ -108,7 +107,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         spans = f"{first.name} has {begin:.10g} to {end:.10g} s, {other.name} {start:.10g} to {stop:.10g} s"
         what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
         hint = f"--clock-offset {other.name}=SECONDS adds to its times; {begin - start:.10g} lets both begin at once"
-        raise DataError(what, where=spans, allowed="clocks that overlap, or motion that both saw", hint=hint)
+        raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
     why = "the recording times do not overlap; with this offset the points follow the joint angles best "
     why += f"({best.explained:.1%} of the motion), to some hundredths of a second, which are left to `check`"
     return begin - start - best.lag, why
@@ -189,7 +188,7 @@ def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tupl
         if owners.setdefault(joint, source) != source:
             what = f"the joint '{joint}' is in {owners[joint]} and in {source}"
             hint = "import them one by one as recordings of their own, or keep other joints with --joints"
-            raise DataError(what, where=where, allowed="every joint in one file", hint=hint)
+            raise DataError(what, where=where, allowed="every joint in one file only", hint=hint)
     merged, notes = merge_on_fastest_clock(groups, where)
     rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
     return merged, notes if len(groups) == 1 else (f"joints: {rates}", *notes)

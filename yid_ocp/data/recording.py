@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_for_group_name
 
 ClockKind = Literal["recorded", "nominal"]
@@ -69,8 +69,7 @@ class JointGroup(ReprMixin):
     effort_kind : {'sample', 'mean', 'command'} or None
         Meaning of `effort[k]`: value at t_k, mean from t_k to t_{k+1}, or value held from t_k to t_{k+1}.
     clock : {'recorded', 'nominal'}
-        Whether `t` was measured or is a sample index times a nominal period.
-    """
+        Whether `t` was measured or is a sample index times a nominal period."""
 
     name: ClassVar[str] = "joints"
 
@@ -138,8 +137,7 @@ class PointGroup(ReprMixin):
     pose : ndarray, shape (4, 4), or None
         For a camera: the transform from camera to world coordinates [m].
     clock : {'recorded', 'nominal'}
-        As in `JointGroup`.
-    """
+        As in `JointGroup`."""
 
     name: str
     names: tuple[str, ...]
@@ -186,8 +184,7 @@ class SensorChannelGroup(ReprMixin):
     noise_and_bias_stds_by_attribute : mapping of str to float or ndarray, shape (k,)
         Standard deviations by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), in the channel's unit.
     clock : {'recorded', 'nominal'}
-        As in `JointGroup`.
-    """
+        As in `JointGroup`."""
 
     name: str
     names: tuple[str, ...]
@@ -233,8 +230,7 @@ class Recording(ReprMixin):
     marker_reference_pose : ndarray, shape (np, 3), or None
         Positions of the points of the first group while the object was held straight, in that group's frame [m].
     notes : tuple of str
-        Sentences on content that an import omitted or changed.
-    """
+        Sentences on content that an import omitted or changed."""
 
     joints: JointGroup | None = None
     points: tuple[PointGroup, ...] = ()
@@ -308,8 +304,7 @@ class Recording(ReprMixin):
     def time_slice(self, start: float, stop: float) -> Recording:
         """Return a copy with the samples from start to stop [s] and their times, without groups that have none.
 
-        Raises `DataError` if there are no samples in this interval, or if `start` is not before `stop`.
-        """
+        Raises `DataError` if there are no samples in this interval, or if `start` is not before `stop`."""
         masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.all_groups]
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
@@ -339,7 +334,8 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     """
     origin = where or f"recording '{recording.name}'"
     require_data(recording.all_groups, "the recording has no group", origin, "joints, points, points_<name>")
-    _check_text(origin, recording.description, recording.source, *recording.notes)
+    texts = (("description", recording.description), ("source", recording.source))
+    _check_text(origin, *texts, *(("notes", note) for note in recording.notes))
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
         require_data(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
@@ -368,6 +364,7 @@ def _sampled(t: Array) -> str:
 def require_data(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
     """Raise a `DataError` with the texts `what`, `where`, `allowed` and `hint` unless a condition holds."""
     if not condition:
+        hint = hint or "correct this entry of the recording, or import the original data again"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -376,7 +373,8 @@ def read_only_array(value: ArrayLike, where: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise DataError("not an array of real numbers", where=where, allowed="numbers in a regular array") from error
+        what, hint = "this is not an array of real numbers", "write numbers, in rows of equal length"
+        raise DataError(what, where=where, allowed="an array of real numbers", hint=hint) from error
     array.setflags(write=False)
     return array
 
@@ -403,17 +401,18 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         if bad.any():
             row, column = (int(index[0]) for index in np.nonzero(bad))
             what = f"channel '{channel}' of joint '{joints.names[column]}' is not finite at t = {joints.t[row]:g} s "
-            what += f"({int(bad.sum())} such values in the channel)"
-            hint = "cut the recording or leave the channel out"
-            hint += ", or read with allow_nan_effort=True" if is_effort else ""
-            raise DataError(what, where=place, allowed="finite numbers; NaN is for points only", hint=hint)
-        unit = JOINT_CHANNEL_UNITS[channel]
-        largest, allowed = float(np.nanmax(np.abs(value), initial=0.0)), f"at most {_LARGEST[unit]:g} {unit}"
-        hint = "convert it again from what was recorded: no machine does that"
+            what += f"({count_with_noun(int(bad.sum()), 'such value')} in the channel)"
+            hint = "cut the recording where the values are missing, or leave the channel out"
+            hint += ", or use read_recording(..., allow_nan_effort=True)" if is_effort else ""
+            raise DataError(what, where=place, allowed="finite numbers", hint=hint)
+        unit, size = JOINT_CHANNEL_UNITS[channel], np.nan_to_num(np.abs(value))
+        row, column = divmod(int(size.argmax()), len(joints.names))
+        what = f"channel '{channel}' reaches {size.max():g} {unit} "
+        what += f"(joint '{joints.names[column]}', t = {joints.t[row]:g} s)"
+        hint = f"check the unit of the channel; import the original data again with --units {channel}=UNIT"
         if unit == "rad":
-            hint = f"these look like degrees: convert them to radians, or import with --units {channel}=deg"
-        what = f"channel '{channel}' reaches {largest:g} {unit}"
-        require_data(largest <= _LARGEST[unit], what, place, allowed, hint)
+            hint = f"these look like degrees: import the original data again with --units {channel}=deg"
+        require_data(size.max() <= _LARGEST[unit], what, place, f"at most {_LARGEST[unit]:g} {unit}", hint)
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
     require_data(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
@@ -423,28 +422,29 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortSamplingKind)
-        what, hint = f"the kind is '{joints.effort_kind}'", "leave the attribute out where it is not known"
+        what, hint = f"the kind of the efforts is '{joints.effort_kind}'", "leave the attribute out if it is not known"
         require_data(joints.effort_kind in kinds, what, place, ", ".join(kinds), hint)
 
 
 def _validate_points(group: PointGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    _check_text(where, group.sensor, group.frame)
+    _check_text(where, ("sensor", group.sensor), ("frame", group.frame))
     _check_shape(group.position, (len(group.t), len(group.names), 3), f"{where}/position", "(M, np, 3)")
     unseen = np.isnan(group.position).all(axis=2)
     bad = ~np.isfinite(group.position).all(axis=2) & ~unseen
     if bad.any():
         row, column = (int(index[0]) for index in np.nonzero(bad))
-        what = f"point '{group.names[column]}' is {group.position[row, column]} at t = {group.t[row]:g} s"
-        allowed = "three finite coordinates, or three NaN where the point was not seen"
-        raise DataError(what, where=f"{where}/position", allowed=allowed)
-    _check_distances(group.position[~unseen], f"{where}/position", ", or import with --units points=mm")
+        position = np.round(group.position[row, column], 6).tolist()
+        what = f"the position of point '{group.names[column]}' is {position} m at t = {group.t[row]:g} s"
+        allowed, hint = "three finite coordinates, or three NaN", "write three NaN where the point was not seen"
+        raise DataError(what, where=f"{where}/position", allowed=allowed, hint=hint)
+    _check_distances(group.position[~unseen], f"{where}/position", ", or import the data again with --units points=mm")
     if group.std is not None:
         _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
         seen = group.std[~unseen]
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
-        what, allowed = f"the standard deviation of a point that was seen is {wrong[:1]}", "not negative, and at most"
-        require_data(wrong.size == 0, what, f"{where}/std", f"{allowed} {_LARGEST_SPREAD:g} m")
+        what = f"the standard deviation of a point that was seen is {next(iter(wrong), 0.0):g} m"
+        require_data(wrong.size == 0, what, f"{where}/std", f"0 to {_LARGEST_SPREAD:g} m")
     if group.pose is not None:
         _check_pose(group.pose, f"{where}, attribute pose")
 
@@ -460,12 +460,12 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     declared = {channel.quantity: channel for channel in channel_kinds_for_group_name(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
-    require_data(own, "the group has no values", where, ", ".join(declared))
+    hint = "add a dataset of this name, or leave the group out"
+    require_data(own, "the group has no values", where, ", ".join(declared) or "a group that a sensor declares", hint)
     for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:
             what = f"no sensor declares a {noun} '{name}' here"
-            allowed = ", ".join(known) or "groups that a sensor declares"
-            require_data(name in known, what, where, allowed, nearest_name_hint(name, known))
+            require_data(name in known, what, where, **unknown_name_error_arguments(name, known))
     for quantity, values in own.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
@@ -479,11 +479,12 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
     if np.ndim(std) > 0:
         _check_shape(np.asarray(std), (count,), where, letters)
     good = np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD))
-    require_data(good, f"{name} is {std}", where, f"not negative, and at most {_LARGEST_SPREAD:g}")
+    require_data(good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", "leave it out if it is not known")
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
-    require_data(groups, "the positions of a straight object belong to no points", where, "a group of points")
+    allowed, hint = "`straight` beside a group of points", "add the group of points, or leave `straight` out"
+    require_data(groups, "the recording has `straight`, but no group of points", where, allowed, hint)
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
     finite, allowed = np.isfinite(straight).all(), "finite coordinates of every point"
     require_data(finite, "a position is not finite", where, allowed)
@@ -491,7 +492,7 @@ def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str
     # a file lists its groups by name, so other orders are not stored
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    require_data(first is groups[0], what, where, "groups of points sorted by name")
+    require_data(first is groups[0], what, where, "groups of points sorted by name", "sort the groups by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
@@ -508,9 +509,9 @@ def _check_pose(pose: Array, where: str) -> None:
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, where: str) -> None:
-    place, allowed = f"{where}, names", "one for every column, each once"
+    place, allowed = f"{where}, names", "one name for every column, each once"
     require_data(group.names, "the group has no names", where, allowed, "write the attribute `names`")
-    allowed, hint = "one sample or more", "record again, or leave the group out"
+    allowed, hint = "one sample or more", "leave the group out, or import the data again"
     require_data(group.t.size > 0, "the group has no samples", where, allowed, hint)
     for name, count in Counter(group.names).items():
         usable = isinstance(name, str) and name and not _CONTROL_CHARACTER.search(name)
@@ -522,7 +523,8 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
     require_data(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
-    require_data(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
+    what = f"the time at index {next(iter(bad), 0)} is {group.t[next(iter(bad), 0)]}"
+    require_data(bad.size == 0, what, f"{where}/t", "finite numbers [s]", "remove this sample from every channel")
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])
@@ -534,12 +536,12 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
     what, allowed = f"the array has shape {array.shape}", f"{shape}, that is {letters}"
-    require_data(array.shape == shape, what, where, allowed)
+    require_data(array.shape == shape, what, where, allowed, "write an array of the allowed shape")
 
 
-def _check_text(where: str, *texts: str) -> None:
-    for text in texts:
+def _check_text(where: str, *texts: tuple[str, str]) -> None:
+    for name, text in texts:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
-        what, allowed = f"the text {text!r} cannot be stored", "Unicode text without null characters"
-        require_data(storable, what, where, allowed)
+        what, allowed = f"the text {text!r} cannot be stored", "Unicode text without null characters and surrogates"
+        require_data(storable, what, f"{where}, attribute {name}", allowed, "remove these characters")

@@ -10,6 +10,7 @@ import contextlib
 import faulthandler
 import json
 import os
+import re
 import select
 import signal
 import warnings
@@ -34,7 +35,7 @@ from yid_ocp.data.recording import (
     require_data,
     validated_recording,
 )
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
+from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.sensors import CHANNEL_KINDS
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 
@@ -55,8 +56,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     ------
     DataError
         The file is missing, not HDF5, damaged or of another format. It has an unknown group, dataset, attribute or
-        unit, lacks a required one, or fails `validated_recording`.
-    """
+        unit, lacks a required one, or fails `validated_recording`."""
     path = Path(path)
     digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
@@ -70,9 +70,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Check a recording and write a `yid-recording/1` file atomically. Efforts may contain NaN.
 
-    Raises the errors of `validated_recording`, and `OutputError` if the file cannot be written; an older file then
-    stays.
-    """
+    Raises the errors of `validated_recording`, and `OutputError` if writing fails; an older file then stays."""
     validated_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:
         file.attrs.update(format=_RECORDING_FORMAT, description=recording.description, source=recording.source)
@@ -112,7 +110,8 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         for key in ("format", "description", "source", "truth", "notes")
     }
     what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
-    require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT)
+    hint = "update yid_ocp if a newer version wrote the file; else import the original data with this version"
+    require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT, hint)
     joints, points, straight, channels, gain = None, [], None, [], {}
     if _GAIN in file.attrs:  # of all joints alike
         gain = {_GAIN: read_only_array(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
@@ -121,8 +120,8 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     for name in map(str, file):
         where, declared = f"{origin}: {name}", channel_kinds_for_group_name(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
-        hint = "" if legal else nearest_name_hint(name, ("joints", "points", *further, _STRAIGHT))
-        require_data(legal, f"the format has no group '{name}'", origin, allowed, hint)
+        hint = "" if legal else nearest_name_question(name, ("joints", "points", *further, _STRAIGHT))
+        require_data(legal, f"the format has no group '{name}'", origin, allowed, hint or "rename or delete the group")
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
             continue
@@ -164,12 +163,13 @@ def _read_group(
         ("attribute", set(map(str, group.attrs)), attributes, set(required)),
     ):
         for name in sorted(found - set(known)):
-            what = f"the format has no {noun} '{name}' here"
-            raise DataError(what, where=where, **unknown_name_error_arguments(name, known))
+            what, hint = f"the format has no {noun} '{name}' here", f"rename or delete the {noun}"
+            raise DataError(what, where=where, **unknown_name_error_arguments(name, known, hint))
         for name in sorted(wanted - found):
-            raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
+            what, hint = f"the {noun} '{name}' is missing", f"add the {noun}, or leave the group out"
+            raise DataError(what, where=where, allowed=", ".join(known), hint=hint)
     both = "std" in group and "std" in group.attrs
-    require_data(not both, "`std` is both a dataset and an attribute", where, "one of the two")
+    require_data(not both, "`std` is both a dataset and an attribute", where, "one of the two", "delete one of them")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
     for name, value in group.attrs.items():
         place = f"{where}, attribute {name}"
@@ -184,9 +184,9 @@ def _read_group(
 
 def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
     numeric = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    require_data(numeric, "not a dataset of real numbers", where, "floating point or integer numbers")
+    require_data(numeric, "this is not a dataset of real numbers", where, "floating point or integer numbers")
     found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
-    hint = f"convert the values to {unit}: recordings are never converted silently"
+    hint = f"convert the values to {unit}, and change the attribute: recordings are never converted silently"
     require_data(found == unit, f"the unit is '{found}'", where, unit, hint)
     return np.asarray(dataset[()], dtype=np.float64)
 
@@ -200,8 +200,9 @@ def _text(value: object, where: str) -> str:
         try:
             return value.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise DataError("the text is not UTF-8", where=where) from error
-    require_data(isinstance(value, str), f"found {value!r}", where, "text")
+            hint = "write the attribute again as UTF-8"
+            raise DataError("the text is not UTF-8", where=where, allowed="text in UTF-8", hint=hint) from error
+    require_data(isinstance(value, str), f"the value {value} is not text", where, "text")
     return str(value)
 
 
@@ -209,8 +210,8 @@ def _json(text: str, where: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        what, hint = f"the text is not JSON ({error})", "write the recording again"
-        raise DataError(what, where=where, allowed="a list in JSON", hint=hint) from error
+        what, hint = "the text is not JSON", "correct the text, or delete the attribute"
+        raise DataError(what, where=where, allowed="an object or a list in JSON", hint=hint) from error
 
 
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]
@@ -222,8 +223,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
 
     `complaint` reads the file in the fork and returns a description of the error, empty on success. Raises `DataError`
     if the file is not a regular file, with this description (for a file of the format `noun`), or if the fork crashes.
-    A fork is used because a new process takes a second, and pool processes may have no children.
-    """
+    A fork is used because a new process takes a second, and pool processes may have no children."""
     files.check_input_file(path)
     if not hasattr(os, "fork"):
         return
@@ -258,7 +258,9 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
     else:
         what = answer[1:]
     if what:
-        raise DataError(what, where=str(path), hint="copy or record it again, as one file of its own")
+        allowed = f"an undamaged {noun} file, without links to other files"
+        hint = "copy it again from its source; if the copy fails as well, export or import the original data again"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
 
 
 @contextlib.contextmanager
@@ -284,8 +286,14 @@ def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.Fi
         with h5py.File(path, "r") as file:
             yield file
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # all of them come from h5py
-        what = f"the HDF5 file is truncated or damaged ({files.os_error_reason(error)})"
-        raise DataError(what, where=str(path), hint="copy or record it again") from error
+        hint = "copy it again from its source, or import the original data again"
+        raise DataError(_damage(error), where=str(path), allowed="an undamaged HDF5 file", hint=hint) from error
+
+
+def _damage(error: Exception) -> str:
+    """What is wrong with a file by an error of h5py, with the sizes of a truncated file."""
+    sizes = re.search(r"eof = (\d+), .*stored_eof = (\d+)", str(error))
+    return "the HDF5 file is truncated or damaged" + (f": it has {sizes[1]} of {sizes[2]} bytes" if sizes else "")
 
 
 def _complaint(path: Path) -> str:
@@ -297,7 +305,7 @@ def _complaint(path: Path) -> str:
                 file.visititems(_read)
             return complaint
     except Exception as error:  # whatever h5py says of damaged files
-        return f"the HDF5 file is truncated or damaged ({files.os_error_reason(error)})"
+        return _damage(error)
 
 
 def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -312,11 +320,11 @@ def _foreign(group: h5py.Group, depth: int = 0) -> str:
         link = group.get(name, getlink=True)
         item = None if isinstance(link, h5py.ExternalLink) else group.get(name)
         if item is None:
-            return f"'{name}' in the HDF5 file is a link into another file, or into nowhere"
+            return f"'{name}' in the HDF5 file is a link to another file, or a broken link"
         if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
-            return f"the values of '{name}' in the HDF5 file stand in another file"
+            return f"the values of '{name}' in the HDF5 file are stored in another file"
         if isinstance(item, h5py.Group):
-            endless = "groups in the HDF5 file stand in one another"
+            endless = f"groups in the HDF5 file are nested more than {_MAX_GROUP_DEPTH} deep"
             if found := _foreign(item, depth + 1) if depth < _MAX_GROUP_DEPTH else endless:
                 return found
     return ""
@@ -332,9 +340,5 @@ def _excess(file: h5py.File) -> str:
             numbers += max(1.0, item.dtype.itemsize / 8) * item.size
 
     file.visititems(count)
-    meant = f"{files.MAX_INPUT_NUMBERS / 1e6:.0f} million are the most that can be meant"
-    return (
-        f"the HDF5 file declares {numbers / 1e6:.0f} million numbers; {meant}"
-        if numbers > files.MAX_INPUT_NUMBERS
-        else ""
-    )
+    what = f"the HDF5 file declares {numbers / 1e6:.0f} million numbers"
+    return f"{what}, more than {files.MAX_INPUT_NUMBERS / 1e6:.0f} million" * (numbers > files.MAX_INPUT_NUMBERS)

@@ -22,7 +22,13 @@ from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_channe
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
 from yid_ocp.effects import EffectBase
-from yid_ocp.errors import ConfigError, SolverError, YidError, nearest_name_hint
+from yid_ocp.errors import (
+    ConfigError,
+    SolverError,
+    YidError,
+    failed_rollout_error,
+    nearest_name_question,
+)
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
@@ -76,15 +82,14 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
         if name not in parameters:
             effect, at, _ = name.rpartition(".")
             what = f"the effect {effect}" if at and "@" in effect else f"the parameter '{name}'"
-            raise ConfigError(
-                f"the baseline has {what}, which this model does not have",
-                where=baseline.run_name,
-                allowed="a run of the same model",
-                hint="add it under model.effects" if "@" in effect else nearest_name_hint(name, parameters.names),
-            )
+            hint = "add it under model.effects" if "@" in effect else nearest_name_question(name, parameters.names)
+            what = f"the baseline has {what}, which this model does not have"
+            raise ConfigError(what, where=baseline.run_name, allowed="a run of the same model", hint=hint)
         if name in problem.options.local_parameters:
-            what = f"'{name}' has a value of its own in every recording, so a baseline says nothing of it"
-            raise ConfigError(what, where=f"parameters.{name}.per_recording", hint="leave `per_recording` out")
+            what = f"'{name}' has its own value in every recording, so a baseline gives no information about it"
+            where = f"parameters.{name}.per_recording"
+            hint = "leave `per_recording` out, or diagnose without --baseline"
+            raise ConfigError(what, where=where, allowed="false with a baseline", hint=hint)
     values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
     values |= dict(zip(names, map(float, baseline.values), strict=True))
     prior = MultivariateGaussianPrior(names, nearby_positive_definite_covariance(baseline.covariance))
@@ -261,7 +266,7 @@ def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Se
     found = problem.predict_held_out(problem.vector({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:
-        raise SolverError(f"a recording cannot be predicted: {failed[0]}")
+        raise failed_rollout_error(failed[0], "held-out recordings")
     return held_out_channel_errors(found)
 
 
@@ -271,5 +276,6 @@ def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:
         what = "the nominal model cannot be fitted to the recordings without the effects"
-        raise SolverError(f"{what}: {outcome.message}")
+        allowed, hint = "recordings that the nominal model can follow", "check recordings.reference_recordings"
+        raise SolverError(f"{what}: {outcome.message}", where="recordings", allowed=allowed, hint=hint)
     return {name: problem.named_values(outcome.x)[name] for name in shared}

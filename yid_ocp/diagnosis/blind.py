@@ -177,7 +177,8 @@ def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
     """Read sealed labels from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
-        raise DataError("the labels are not those that were committed to", where="sealed labels")
+        what, hint = "the labels differ from the commitment", "use the labels file that was written with the commitment"
+        raise DataError(what, where="sealed labels", allowed=f"text with SHA-256 {commitment[:12]}...", hint=hint)
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
 
 
@@ -209,8 +210,7 @@ class BlindCaseGenerator:
     finer : callable, optional
         Function that returns the system with a given multiple of its links.
     simulated_system : System, optional
-        The simulated system, if not the problem's: the same system with driven arms.
-    """
+        The simulated system, if not the problem's: the same system with driven arms."""
 
     def __init__(
         self,
@@ -225,8 +225,8 @@ class BlindCaseGenerator:
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
-            arms = "a robot whose arms are driven, nothing prescribed"
-            raise ConfigError("a blind proof moves driven arms", where="model", allowed=arms)
+            what, allowed = "a blind proof needs driven arms", "a robot with driven and without prescribed joints"
+            raise ConfigError(what, where="model.arms.mode", allowed=allowed, hint="set model.arms.mode: driven")
         if seed < 0:
             raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
         self.problem, self.seed, self._finer = problem, seed, finer
@@ -238,7 +238,8 @@ class BlindCaseGenerator:
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
             what, where = "MuJoCo can represent none of the candidates", "diagnosis.candidates"
-            raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_EFFECT_KINDS))
+            hint = "add one of the allowed kinds"
+            raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_EFFECT_KINDS), hint=hint)
 
     def _rng(self, *path: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, ALLOWED_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
@@ -349,7 +350,9 @@ class BlindCaseGenerator:
             label = CaseGroundTruth(name, wanted.category, injected, multiple, truth, wanted.experiment)
             return BlindCase(name, tuple(estimate), held_out, left_out), label
         what, where = f"none of {MAX_CASE_DRAWS} motions can be simulated", f"{name} of {wanted.experiment}"
-        raise ModelError(what, where=where, hint="take another --seed: a seed draws the same again")
+        allowed = "a motion that MuJoCo can simulate"
+        hint = "use another --seed: one seed always draws the same motions"
+        raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
         kinds = sorted({e.kind for e, *_ in self._detectable} - {effect.kind for effect in injected})
@@ -466,8 +469,8 @@ def first_recorded_driven_joint_positions(system: System, recording: Recording) 
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
     if joints is None or missing:
-        what = f"the first recording does not say where {missing[0]} begins"
-        raise ConfigError(what, where="recordings.estimate", allowed="a recording of all driven joints")
+        what, hint = f"the first recording has no position of joint '{missing[0]}'", "import the joint too"
+        raise ConfigError(what, where="recordings.estimate", allowed="a recording of all driven joints", hint=hint)
     return {name: float(joints.position[0, names.index(name)]) for name in system.driven}
 
 

@@ -365,8 +365,7 @@ def calibrate_thresholds(
     """Compute thresholds as conformal quantiles, and their effect on the ensemble (`yid-calibration/1`).
 
     `labels`, `marks` and `answers` belong to the same cases. An answer holds the `result` with its `statistics`, and
-    `open`, the statistics with permissive thresholds if no gap was detected. The answers were obtained with
-    `limits`."""
+    `open`, the statistics with permissive thresholds if no gap was detected. Answers were obtained with `limits`."""
     every = zip(labels, marks, answers, strict=True)
     known = ((label, mark, entry["result"].get("statistics"), entry.get("open") or {}) for label, mark, entry in every)
     cases = [(label.category, mark, said, wide) for label, mark, said, wide in known if said is not None]

@@ -50,7 +50,7 @@ from yid_ocp.diagnosis.screening import CandidateScore, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
-from yid_ocp.errors import DataError, SolverError
+from yid_ocp.errors import DataError, SolverError, failed_rollout_error
 from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
@@ -328,8 +328,7 @@ def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> Es
 def _happened(
     whole: EstimationProblem, fit: RefittedModel, limits: Thresholds, weighted: EstimationProblem | None = None
 ) -> tuple[EventSet, SmoothedUnknownsResult | None]:
-    """Events in all recordings, from the residual of a fit (none if the prediction fails), and the smoother's
-    result."""
+    """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
     if own.system.unprescribed_coordinate_indices:
@@ -530,7 +529,7 @@ def fit_nominal_model(
     if solution is not None or not composed.is_split_in_blocks:
         found = solve(problem, GaussNewton(max_iterations=30)) if solution is None else solution
         if found.evaluation is None:
-            raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
+            raise failed_rollout_error(f"its fit fails: {found.message}", "nominal model")
         start = dict(zip(found.unknown_names, map(float, found.x), strict=True))
         if found.problem is not None and composed.problem.has_process_noise:
             begun = composed.about_input_errors(found.problem)
@@ -539,7 +538,7 @@ def fit_nominal_model(
         # a gap may move parameters so far that the solver's equilibrium is not found again from there
         fit = _settled(RefitContext(composed, limits, NULL_PROGRESS, store), {}, "the nominal model from its start")
     if fit is None:
-        raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
+        raise failed_rollout_error("it fails at the fitted values", "nominal model")
     return fit
 
 
@@ -570,7 +569,9 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
     for i, (episode, result) in enumerate(problem.predict_held_out(problem.vector(fit.values), True)):
         if isinstance(result, str):
             what = f"the held-out recording cannot be predicted: {result}"
-            raise DataError(what, where=episode.name, hint="hold out a recording that the nominal model can follow")
+            raise DataError(
+                what, where=f"recording '{episode.name}'", hint="hold out a recording that the nominal model can follow"
+            )
         rows = problem.whitened_held_out_prediction_residual(i, episode, result)
         assert rows.jacobian is not None
         residuals.append(rows.residual)

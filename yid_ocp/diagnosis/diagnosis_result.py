@@ -72,8 +72,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     nominal_changes : tuple of NominalParameterChange
         Nominal parameters without and with the accepted effects, in `unit`.
     stage_seconds, search_seconds : mapping of str to float, float
-        Durations [s].
-    """
+        Durations [s]."""
 
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
     smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None if there is no gap to locate

@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
-from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
     problem_relinearized_at_torque_bias,
@@ -54,22 +54,20 @@ def make_candidate_effects(
         return [make_effect(kind, place, system) for kind, place in possible]
     if isinstance(choice, str) or not choice:
         what = f"candidates = '{choice}'" if choice else "there is no candidate to try"
-        raise ConfigError(what, where=where, allowed="all, or a list of kinds")
+        raise ConfigError(what, where=where, allowed="all, or a list of kinds", hint="leave the key out to try all")
     pairs: list[tuple[str, str]] = []
     for text in choice:
         kind, _, place = text.partition("@")
         cls = EFFECTS[kind]
         if text in present:
-            raise ConfigError(f"{text} is part of the model", where=where, hint="leave it out")
+            what, allowed = f"the effect {text} is already part of the model", "effects that the model does not have"
+            raise ConfigError(what, where=where, allowed=allowed, hint="leave it out")
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
             missing = ", ".join(sorted(cls.required_sensors - sensors))
-            raise ConfigError(
-                f"{kind} does not fit this system or these recordings",
-                where=where,
-                allowed=", ".join(dict.fromkeys(k for k, _ in possible)),
-                hint=f"it needs {missing}" if missing else "leave it out",
-            )
+            what = f"the effect {kind} is not possible for this model" + (f" without {missing}" if missing else "")
+            allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), "leave it out"
+            raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)
         pairs += [pair for pair in found if pair not in pairs]
     return [make_effect(kind, place, system) for kind, place in pairs]
 
@@ -84,10 +82,12 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
     for name in names:
         if name not in known:
             allowed = ", ".join(dict.fromkeys(effect.kind for effect in effects))
-            raise ConfigError(f"'{name}' is no candidate here", where=where, allowed=f"{allowed}, or kind@location")
+            what, hint = f"'{name}' is not a candidate", nearest_name_question(name, known) or "leave it out"
+            raise ConfigError(what, where=where, allowed=f"{allowed}, or kind@location", hint=hint)
     kept = [effect for effect in effects if not {effect.kind, effect.label} & set(names)]
     if not kept:
-        raise ConfigError("no candidate is left to try", where=where, hint="leave fewer out")
+        what, allowed = "every candidate is excluded", "at least one candidate that is not excluded"
+        raise ConfigError(what, where=where, allowed=allowed, hint="exclude fewer")
     return kept
 
 
@@ -137,7 +137,7 @@ class AllCandidatesProblem:
             if any(_same(recording, other) for other in estimate):
                 what, allowed = "a recording is both estimated on and held out", "held-out recordings of other motions"
                 hint = "leave held_out empty to split one recording in blocks"
-                raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
+                raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
@@ -211,8 +211,7 @@ class AllCandidatesProblem:
         """Problem on the step of the candidates at the place of `effects` alone, where torque noise makes it worth it.
 
         A step of all candidates costs three times as much. The problem is unchanged without effects, and where they
-        have several places, or the filters contain states of other candidates.
-        """
+        have several places, or the filters contain states of other candidates."""
         places = {effect.location for effect in effects}
         if self.functions_of_place is None or len(places) != 1 or not self.problem.has_process_noise:
             return self

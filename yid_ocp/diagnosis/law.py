@@ -130,8 +130,7 @@ def find_gap_law(
     last : RefittedModel
         The model with the accepted effects, or the nominal model.
     places : sequence of str
-        Locations of the gap, the most likely first.
-    """
+        Locations of the gap, the most likely first."""
     places = [p for p in dict.fromkeys(places) if allowed_law_quantity_names(problem.system, p)][:_MAX_PLACES]
     if not places or search.note_skip_past_deadline("a law"):
         return None

@@ -147,8 +147,8 @@ class UnrecordedRefitError(LookupError):
 class RefitContext:
     """Problem, thresholds, progress, store and deadline of one diagnosis. It makes the refits that rules request.
 
-    With `is_finished`, results come from the record alone; a missing result raises `UnrecordedRefitError`, and the
-    problem is not used."""
+    With `is_finished`, results come from the record alone; a missing result raises `UnrecordedRefitError`, the problem
+    is unused."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
@@ -245,8 +245,7 @@ def refit_with_effects(
     start : mapping of str to float
         Initial unknowns. If they cannot be rolled out, they are moved towards neutral effects.
     name : str
-        Name in the store. Default: the labels of the effects, which suffice if no other start is tried.
-    """
+        Name in the store. Default: the labels of the effects, which suffice if no other start is tried."""
     problem = problem.without_other_places(effects)
     known = load_stored_refit(problem, effects, store, name)
     if known is not None:
@@ -402,8 +401,7 @@ def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, lim
 
 
 def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Array, factor: Array) -> dict[str, float]:
-    """Wald test of each effect: all amplitudes together, at fixed shape parameters, because weak effects have any
-    shape.
+    """Wald test of each effect: all amplitudes together, at fixed shapes, because weak effects have any shape.
 
     A well-known load can be divided among amplitudes in any way, so that no single one differs from neutral. `factor` F
     gives the covariance F F'. Davies 1987, doi:10.1093/biomet/74.1.33."""

@@ -23,7 +23,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
-from yid_ocp.errors import SolverError
+from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.null_test import ResidualChannel, chi2_p_value, residual_channel_indices
 
@@ -100,7 +100,7 @@ def linearize_candidates(
         trial = trial.with_parameter_values(shape)
         evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
-            raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
+            raise failed_rollout_error(evaluation.message, "model with the candidate effects")
         names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
         data, jacobian = linearization_without_weak_priors(trial, evaluation)
         places = [names.index(name) for name in amplitudes]

@@ -117,8 +117,7 @@ class Backlash(_DistortedReading):
     """Gear backlash with the encoder on the motor side. The measured angle is q + width/2 tanh(effort/`_PLAY_TORQUE`).
 
     A servo acts on the reading of its encoder. For a joint with a servo, the present play z is therefore an internal
-    coordinate without memory, which solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every step.
-    """
+    coordinate without memory, which solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every step."""
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
     required_excitation = "how hard it pulls at its ends"
@@ -233,8 +232,7 @@ class EffortDelay(_LateTorque):
     """Delay of a joint's torque. The torque that acts at t was recorded at t - delay.
 
     For a prescribed arm, the effort recorded at t is the effort of the motion at t + delay. A negative delay means that
-    the effort is recorded late.
-    """
+    the effort is recorded late."""
 
     equation = "the torque that acts at t was recorded at t - delay"
     possible_locations = _effort_arms
@@ -252,8 +250,7 @@ class EffortLag(_LateTorque):
 
     The recorded torque is the command. For a prescribed joint, the required effort follows the recorded effort; with a
     negative time constant, the recorded effort follows the required one, as with a filtered sensor. Before the start of
-    a recording, both are constant at their initial values.
-    """
+    a recording, both are constant at their initial values."""
 
     equation = "time_constant dz/dt = command - z"
     possible_locations = _effort_joints
@@ -366,9 +363,8 @@ class ServoDelay(_ServoChange):
 class ServoSaturation(_ServoChange):
     """Additional smooth torque limit of a servo. The torque is demand / (1 + |demand/limit|^16)^(1/16).
 
-    The internal parameter is limit^-16. It adds to the model's own limit, is neutral at zero, and has a nonzero
-    derivative at zero.
-    """
+    The internal parameter is limit^-16. It adds to the model's limit and is neutral at zero, with a nonzero
+    derivative."""
 
     equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"
 

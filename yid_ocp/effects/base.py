@@ -10,7 +10,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
@@ -154,9 +154,8 @@ class EffectBase(Effect):
     ) -> dict[str, ReportedParameterValue]:
         """Convert the parameters to their reported form. For example, a compliance is reported as a stiffness.
 
-        Missing `values` are nominal, missing `stds` are NaN. The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p
-        C).
-        """
+        Missing `values` are nominal, missing `stds` NaN. The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p
+        C)."""
         result = {}
         for definition, entry in zip(self.definitions, self.parameters, strict=True):
             value = float((values or {}).get(entry.name, entry.value))
@@ -185,7 +184,8 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
     given: dict[str, float] = {}
     for name, value in values.items():
         if name not in names:
-            raise ConfigError(f"{kind} has no quantity '{name}'", where=label, hint=nearest_name_hint(name, names))
+            said = unknown_name_error_arguments(name, names)
+            raise ConfigError(f"the effect {kind} has no quantity '{name}'", where=label, **said)
         definition = names[name]
         if name != definition.name:
             signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]
@@ -303,8 +303,7 @@ def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
 def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     """Choose one frame for every arm link with mass: that of a grasp, else of a gripper, else the link's first frame.
 
-    A finger (a prismatic joint without child joints) counts as part of the link that carries it.
-    """
+    A finger (a prismatic joint without child joints) counts as part of the link that carries it."""
     tree = system.mechanism
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
     parents = {joint.parent_index for joint in tree.joints}

@@ -287,8 +287,7 @@ class AerodynamicDrag(EffectBase):
     """Quadratic air drag on a segment's links. The force is F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
     v_n is the velocity of a link's centre normal to the link, with |v_n| smoothed below `_ABS_SMOOTHING_SPEED`. r and l
-    are the link's radius and length. J_c is the Jacobian of its centre.
-    """
+    are the link's radius and length. J_c is the Jacobian of its centre."""
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
     required_excitation = "how fast it moves"
@@ -378,8 +377,7 @@ def _on_bodies(
     `slopes` (6, 6) are their symmetric derivatives by the spatial velocity. W_j and K_j are the sums of both over all
     bodies that joint j moves. S_j is its screw, D_j = V_parent(j) x S_j and F_j = S_j . W_j. The columns of
     `ForceWithDerivativeFactors` are A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because a rotation of joint i rotates
-    body and wrench together, except for the velocity D_i that it adds.
-    """
+    body and wrench together, except for the velocity D_i that it adds."""
     tree = kinematics.mechanism
     n, screws = len(tree.joints), kinematics.joint_screws
     zero = ca.SX(ca.DM.zeros(6))

@@ -40,8 +40,7 @@ _SPACING_RTOL = 1e-3  # relative tolerance on equal spacing of knots in a file
 class LawTable:
     """Torque as a function of one quantity: values and standard deviations at equally spaced knots (k,).
 
-    A natural cubic spline interpolates the values. Beyond the knots the torque is constant.
-    """
+    A natural cubic spline interpolates the values. Beyond the knots the torque is constant."""
 
     quantity: str  # one of `LAW_QUANTITY_UNITS`
     knots: Array
@@ -62,8 +61,7 @@ class Law(EffectBase):
     coordinate s with ds/dt = 1). The command is the torque that the servo requests, after saturation; for a DC motor it
     is the torque of the duty cycle without back-EMF. At a segment, the load of a joint is the torque of its spring. f
     is a natural cubic spline through values at equally spaced knots, which are the parameters; for two quantities it is
-    a sum of two splines. Beyond the knots f is constant. A law of the command is zero while the motor is off.
-    """
+    a sum of two splines. Beyond the knots f is constant. A law of the command is zero while the motor is off."""
 
     knots: Mapping[str, Array] | None = None  # knots of every quantity
 
@@ -160,8 +158,7 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
 def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
     """Quantities on which a law at a location may depend, empty if no law is possible.
 
-    `load` needs a driven joint, `command` a servo.
-    """
+    `load` needs a driven joint, `command` a servo."""
     if location in segment_names(system):
         return ("angle", "speed", "time")
     if location not in arm_joint_names(system):
@@ -175,8 +172,7 @@ def quantity_values_along(
 ) -> Array:
     """Values (N, joints) of a quantity at a location at all midpoints of a rollout. NaN without a command.
 
-    `nodes` holds `state` (N + 1, nx), `torque` (N, nu), `multipliers` (N, m) and the `time_step` [s] as an array.
-    """
+    `nodes` holds `state` (N + 1, nx), `torque` (N, nu), `multipliers` (N, m) and the `time_step` [s] as an array."""
     n, h = system.n_coordinates, float(nodes["time_step"])
     if quantity == "time":
         return np.asarray((np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h, float)
@@ -219,19 +215,19 @@ def quantity_values_along(
 def make_law(location: str, system: System, tables: Sequence[LawTable], torque_scale: float = math.inf) -> Law:
     """Make a law at a joint or segment from its tables. `torque_scale` is its expected size [N m].
 
-    Raises `ConfigError` if no law, or no law of these quantities, is possible at the location.
-    """
+    Raises `ConfigError` if no law, or no law of these quantities, is possible at the location."""
     label, possible = f"law@{location}", allowed_law_quantity_names(system, location)
     if not possible:
         places = (*segment_names(system), *arm_joint_names(system))
-        raise ConfigError(
-            f"there is no place '{location}' for a law", where=label, **unknown_name_error_arguments(location, places)
-        )
+        what, choice = f"there is no location '{location}' for a law", unknown_name_error_arguments(location, places)
+        raise ConfigError(what, where=label, **choice)
     definitions, entries = [], []
     for table in tables:
         if table.quantity not in possible:
             allowed = ", ".join(possible)
-            raise ConfigError(f"a law at {location} cannot depend on '{table.quantity}'", where=label, allowed=allowed)
+            what = f"a law at {location} cannot depend on '{table.quantity}'"
+            hint = "set depends_on to an allowed quantity"
+            raise ConfigError(what, where=label, allowed=allowed, hint=hint)
         for k, (at, torque) in enumerate(zip(table.knots, table.torque, strict=True)):
             said = f"torque at {at:.4g} {LAW_QUANTITY_UNITS[table.quantity]}"
             name, size = f"{table.quantity}{k}", min(torque_scale, 1e6)
@@ -246,12 +242,12 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
     """Read a law's tables from a CSV file in the format of `law_tables_csv`.
 
     Raises `DataError` if the file is malformed, its knots are not evenly spaced and increasing, or its quantities
-    differ from `depends_on`.
-    """
-    hint = f"the header is {','.join(_TABLE_COLUMNS)}, as in the file law.csv that `diagnose` writes"
+    differ from `depends_on`."""
+    allowed = f"a header {','.join(_TABLE_COLUMNS)}, then rows of a quantity, its unit and three numbers"
+    hint = "write it like the file law.csv of `diagnose`"
     lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]
     if not lines or tuple(word.strip() for word in lines[0]) != _TABLE_COLUMNS:
-        raise DataError("this is no table of a law", where=str(path), hint=hint)
+        raise DataError("this is not a table of a law", where=f"{path}, line 1", allowed=allowed, hint=hint)
     rows: dict[str, list[list[float]]] = {}
     for number, words in enumerate(lines[1:], 2):
         try:
@@ -261,18 +257,20 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
                 raise ValueError
         except ValueError:
             what = f"line {number} is not a quantity, its unit and three numbers"
-            raise DataError(what, where=str(path), hint=hint) from None
+            raise DataError(what, where=f"{path}, line {number}", allowed=allowed, hint=hint) from None
     wanted = depends_on.split("+")
     if set(rows) != set(wanted):
-        what = f"the table is of {', '.join(rows) or 'nothing'}, the law depends on {depends_on}"
-        raise DataError(what, where=str(path), hint="set depends_on to the quantity of the table's first column")
+        what = f"the table has {', '.join(rows) or 'no rows'}, but the law depends on {depends_on}"
+        hint = f"set depends_on: {'+'.join(rows) or depends_on}, or give another table"
+        raise DataError(what, where=str(path), allowed=f"rows of {', '.join(wanted)}", hint=hint)
     tables = []
     for quantity in wanted:
         knots, torque, std = np.array(rows[quantity]).T
         gaps = np.diff(knots)
         if len(knots) < 4 or np.any(gaps <= 0) or np.ptp(gaps) > _SPACING_RTOL * float(np.mean(gaps)):
-            what = f"the knots of {quantity} are not at least four evenly spaced, increasing numbers"
-            raise DataError(what, where=str(path), hint="interpolate the table at evenly spaced values")
+            what, allowed = f"the knots of {quantity} are not a grid", "four or more evenly spaced, increasing numbers"
+            hint = "interpolate the table at evenly spaced values"
+            raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         tables.append(LawTable(quantity, knots, torque, std))
     return tuple(tables)
 

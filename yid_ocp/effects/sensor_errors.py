@@ -101,8 +101,7 @@ class _SurfaceOffset(_CameraEffect):
 class _CameraLatency(_CameraEffect):
     """Latency of seen points, seen(t) = true(t - delay), of all cameras or of one group of points (by name).
 
-    A negative delay of a group means that the joints' clock is late.
-    """
+    A negative delay of a group means that the joints' clock is late."""
 
     equation = "seen point(t) = true point(t - delay)"
     required_excitation = "when it is read"

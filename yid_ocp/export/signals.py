@@ -15,7 +15,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data import JointGroup, Recording
-from yid_ocp.errors import OutputError
+from yid_ocp.errors import OutputError, missing_package_error
 from yid_ocp.files import atomic_write, make_folder, os_error_reason
 
 _SignalKind = Literal["joints", "point", "vector", "wrench"]
@@ -33,8 +33,7 @@ class RosTopicTimeSeries:
     """Time series of one ROS topic at times t (M,) [s]. A time without any finite value gets no message.
 
     For joints, `values` holds `position`, `velocity` and `effort`, each (M, len(names)). For other kinds it holds `xyz`
-    (M, 3), for a wrench the forces.
-    """
+    (M, 3), for a wrench the forces."""
 
     topic: str
     kind: _SignalKind
@@ -55,10 +54,10 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        hint = "pip install 'yid-ocp[bags]'"
-        raise OutputError("writing MCAP needs the package rosbags", where=str(path), hint=hint) from None
+        raise missing_package_error(OutputError, "writing MCAP needs the package rosbags", "bags") from None
     if not any(len(signal.t) for signal in signals):
-        raise OutputError("there is nothing to write", where=str(path))
+        what, hint = "the signals have no samples", "export a recording or run that has samples"
+        raise OutputError(what, where=str(path), allowed="one sample or more", hint=hint)
     store = get_typestore(Stores.ROS2_HUMBLE)
     first = min(float(np.min(signal.t)) for signal in signals if len(signal.t))
     shift = float(max(0.0, -np.floor(first)))
@@ -129,8 +128,7 @@ def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[s
     """Write each group as a table `<group>.csv`, with all digits and the column names that `read_csv` reads.
 
     The tables omit standard deviations, the kind of effort, sensor, frame, pose and clock. The cells of an unseen point
-    are empty. Returns the files, joints first. Raises `OutputError` if the folder or a file cannot be written.
-    """
+    are empty. Returns the files, joints first. Raises `OutputError` if the folder or a file cannot be written."""
     folder = make_folder(folder)
     written = []
     for group in recording.joint_and_point_groups:
@@ -155,8 +153,7 @@ def joint_trajectory_message(
     """Build a ROS trajectory_msgs/JointTrajectory message of nj joints as a dict.
 
     Times t (N,) [s] count from the start; the other arrays are (N, nj). See
-    https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html
-    """
+    https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html"""
     points = []
     for i, time in enumerate(t):
         second = math.floor(time)

@@ -58,8 +58,7 @@ class KalmanStepMatrices:
 
     The state x = (s, p) contains parameters p. It is measured by y = H x + e, where the noise e has unit covariance,
     and becomes x' = (M x, f p) + process noise. P is the covariance before the measurement, and S = I + H P H'. The
-    normalized innovations S^(-1/2) (y - H mean) of all steps are independent and have unit variance.
-    """
+    normalized innovations S^(-1/2) (y - H mean) of all steps are independent and have unit variance."""
 
     observation: Array  # H, shape (r, nx)
     whitening: Array  # S^(-1/2), shape (r, r)
@@ -120,8 +119,7 @@ def _library() -> ctypes.CDLL | None:
 class KalmanSteps:
     """Successive steps of a linear Kalman filter with fixed gains, in compiled code if possible.
 
-    The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`.
-    """
+    The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`."""
 
     row_start: Sequence[int]
     moves: Array  # state rows of k steps' transitions and, beside them, noise of the states, (k, ns, ns + m + noises)
@@ -214,8 +212,7 @@ def prepare_kalman_steps(
     """Prepare successive filter steps. Returns them and the state covariance (nx, nx) after the last step.
 
     The last columns of the moves (k, ns, ns + m + noises) are the effect of unit noises on the states. `variance` (k,
-    nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`.
-    """
+    nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`."""
     count, library, covariance = np.diff(row_start), _library(), covariance.copy()
     white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)
     moves, decay, variance, observation = map(np.ascontiguousarray, (moves, decay, variance, observation))

@@ -27,8 +27,7 @@ class NominalTrajectory:
 
     Measurements are shifted by their delays to the times at which they were true. `initial_state_by_angles` and
     `initial_state_by_torque` (nx, nu) are derivatives with respect to the driven joints' first angles and torques. They
-    are zero if the initial state does not follow from these.
-    """
+    are zero if the initial state does not follow from these."""
 
     model_functions: ModelFunctions
     theta: Array
@@ -59,8 +58,7 @@ def nominal_trajectory_from_prediction(
 class ResidualDerivativesAtNodes:
     """Derivatives of r residuals with respect to states and efforts at the nodes around each sample.
 
-    Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
-    """
+    Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights."""
 
     node: IntArray  # first of each row's nodes, shape (r,)
     by_state: Array  # derivatives by the states of this and the next nodes, shape (2 or 4, r, nx)
@@ -73,8 +71,7 @@ class ResidualDerivativesAtNodes:
         """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
 
         A sensor of velocities, accelerations or constraint forces depends on four nodes; the first one is before the
-        sample's node. Raises `DataError` for such a sensor unless `with_neighbours` is set.
-        """
+        sample's node. Raises `DataError` for such a sensor unless `with_neighbours` is set."""
         step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
         found: list[IntArray] = []
@@ -87,9 +84,10 @@ class ResidualDerivativesAtNodes:
             used = samples.evaluation_nodes
             if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
-                message = f"'{name}' depends on velocities, accelerations or constraint forces"
-                message += ", and cannot be weighted together with process noise"
-                raise DataError(message, hint=f"set sensors.{name}.use: false, or prescribe the arms' motion")
+                message = f"'{name}' measures velocities, accelerations or constraint forces"
+                allowed = "sensors of positions, while effort noise drives the arms"
+                hint = f"set sensors.{name}.use: false, or model.arms.mode: prescribed"
+                raise DataError(message, where=f"sensors.{name}", allowed=allowed, hint=hint)
             # derivatives of each reading by the states and efforts of the previous node, its own and the next
             before = 1 if read.needs_neighbours else 0
             slopes = np.zeros((2 * before + 1, *read.output.shape, nx))
@@ -133,8 +131,7 @@ class ResidualDerivativesAtNodes:
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
         """Residual derivatives (r, d) in d directions, from `by_node` (K, nx, d) of states and `effort` (K, nc, d).
 
-        The K nodes begin with node `first`. A residual beyond them uses the last node.
-        """
+        The K nodes begin with node `first`. A residual beyond them uses the last node."""
         found = np.zeros((len(self.node), by_node.shape[2]))
         for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
             used = np.flatnonzero(by_state.any(axis=1) | by_effort.any(axis=1))

@@ -515,8 +515,7 @@ def gap_locations_from_effect_closures(
 
     `before` and `rest` are the locations of the nominal model and of the model with the effects. `closed` is the part
     of the gap that the effects at each location close. `windows` are the time windows of locations at which the
-    smoother has no unknown (`world`, `clock`).
-    """
+    smoother has no unknown (`world`, `clock`)."""
     known = {place.location: place for place in before}
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
     for place in rest:
@@ -541,8 +540,7 @@ def z_scores_of_smoothed_unknowns(
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Interval edges (J + 1,) [s], names of the unknowns, and z scores (J, nd): posterior mean over standard deviation.
 
-    A score is NaN unless 1 - posterior/prior variance is above `informed_fraction`.
-    """
+    A score is NaN unless 1 - posterior/prior variance is above `informed_fraction`."""
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
     with np.errstate(divide="ignore", invalid="ignore"):

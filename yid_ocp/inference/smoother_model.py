@@ -269,9 +269,7 @@ def recording_models_with_unknown_forces(
 ) -> tuple[LinearResidualModel, ...]:
     """Linearize every recording's residual about `x` in unknown forces, offsets and biases.
 
-    `evaluation` is the evaluation at `x` with a Jacobian. Unknowns are constant over intervals of at least `interval`
-    [s].
-    """
+    `evaluation` is that at `x` with a Jacobian. Unknowns are constant over intervals of at least `interval` [s]."""
     assert evaluation.jacobian is not None
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])
     found = []

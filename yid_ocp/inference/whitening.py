@@ -99,8 +99,7 @@ class WhiteningFilter:
         """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.
 
         The columns of `rows` are a residual in units of sensor noise, then its derivatives. `push` (N, nu, c) is the
-        tracking filter's correction of the torque and its derivatives [N m].
-        """
+        tracking filter's correction of the torque and its derivatives [N m]."""
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
             result[part.rows], mean, _ = self._updated(part, mean, rows[part.rows], push)
@@ -253,8 +252,7 @@ def _whitened_episode(
     """Episode with estimated input errors, and the filter that whitens its residual at (theta, offset).
 
     The filter is None without process noise or if the rollout fails. It is linearised about the motion smoothed by
-    `before`, if given. With `keep_weights` it keeps the weights of `before`.
-    """
+    `before`, if given. With `keep_weights` it keeps the weights of `before`."""
     if episode.input_errors is None:
         return episode, None
     result = predictor.predict_episode(episode, *at, False, guess)
@@ -342,8 +340,7 @@ def problem_with_whitened_held_out(
 
     Each filter is linearised again about the motion that the present filter smooths. If there is none, a filter is
     built first. With `keep_weights`, such a first filter keeps its weights, which is sufficient for torque offsets. If
-    a rollout fails, only sensor noise is used.
-    """
+    a rollout fails, only sensor noise is used."""
     x, episodes, made = np.asarray(x, float), [], []
     known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
     for held, (before, (own, theta, offset)) in zip(problem.held_out, known, strict=True):
@@ -396,8 +393,7 @@ def _with_errors(
 def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
     """Constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
 
-    The entry is None if torques are taken as exact, or without a whitening filter (see `problem_whitened_at`).
-    """
+    The entry is None if torques are taken as exact, or without a whitening filter (see `problem_whitened_at`)."""
     x = np.asarray(x, float)
     found: list[tuple[Array, Array] | None] = []
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):

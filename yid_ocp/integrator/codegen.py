@@ -25,8 +25,7 @@ class StepFunctions:
     """CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
 
     Each is built when it is first used, because a cached kernel needs none of them. With constraint forces at the node,
-    the outputs for the midpoint and the end of the step are empty.
-    """
+    the outputs for the midpoint and the end of the step are empty."""
 
     def __init__(
         self,
@@ -47,8 +46,7 @@ class StepFunctions:
 
         Its outputs are the vectors per joint, then the nonzeros of the remaining entries of the residual, of p1 and of
         the constraints, and the curvature. The curvature is the derivative of the midpoint's constraint force with
-        respect to q_k, which equals the one with respect to q_{k+1}.
-        """
+        respect to q_k, which equals the one with respect to q_{k+1}."""
         return self._function("linear")
 
     @property
@@ -74,9 +72,7 @@ class StepFunctions:
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
-    """Build the CasADi functions that the stepping kernel calls. The bodies' Jacobians are formed from vectors per
-    joint.
-    """
+    """Build the CasADi functions of the stepping kernel. The bodies' Jacobians are formed from vectors per joint."""
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
@@ -126,8 +122,7 @@ def _pairs(e: DiscreteEquations) -> ca.SX:
 
 def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Sparse derivatives without the bodies' part: residual and p1 by (unknowns, old, input), constraints by the
-    unknowns.
-    """
+    unknowns."""
     unknown, old = ca.vertcat(e.q1, e.z1, e.lam), ca.vertcat(e.q0, e.z0)
     inputs = ca.vertcat(unknown, old, e.u)
     m, n = e.lam.numel(), e.q0.numel()
@@ -161,8 +156,7 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
     """Build a CasADi function of the sparse derivatives of a step with respect to the parameters `names`.
 
-    Its outputs are the derivatives of the residual, of p1 and of the prescribed effort.
-    """
+    Its outputs are the derivatives of the residual, of p1 and of the prescribed effort."""
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     prescribed = list(e.system.prescribed_coordinate_indices)
@@ -250,9 +244,7 @@ def kernel_source_text(functions: StepFunctions, tables: StepSparsityTables) -> 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
     """Generate the C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables and `kernel.c`.
 
-    With `batched`, the kernel integrates `yid_simd_width` rollouts at once; the result is None if a function has no
-    SIMD form.
-    """
+    With `batched`, the kernel integrates `yid_simd_width` rollouts at once; None if a function has no SIMD form."""
     made = _simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
     if made is None:
         return None
@@ -388,9 +380,7 @@ def _is_long_function(function: ca.Function) -> bool:
 
 
 def _simd_c_source(functions: Sequence[ca.Function]) -> str | None:
-    """SIMD C source of SX functions with CasADi's signatures, long ones in parts; None if an operation has no SIMD
-    form.
-    """
+    """SIMD C source of SX functions with CasADi's signatures, in parts; None if an operation has no SIMD form."""
     sources = [_source(function) for function in functions]
     return None if None in sources else "\n".join(source for source in sources if source is not None)
 

@@ -308,7 +308,9 @@ def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]
     told = "\0".join([file_sha256(Path(codegen.__file__)), Path(kernel._name).name, *places])
     library = compiler.compile_and_load_library(told, source)
     if library is None:
-        raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
+        what, where = "the C compiler failed for the derivatives by parameters", "the environment variable CC"
+        allowed, hint = "a C compiler, or CC=none for no compiled code", "set CC=none"
+        raise ModelError(what, where=where, allowed=allowed, hint=hint)
     function = ca.external("by_theta", library._name)
     sizes = model.sizes
     rows = (sizes["n"] + sizes["nz"] + sizes["m"], sizes["n"], sizes["nc"])

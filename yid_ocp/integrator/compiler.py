@@ -61,8 +61,8 @@ def _compiler_path() -> str | None:
     names = () if wanted == "none" else (wanted,) if wanted else ("cc", "gcc", "clang")
     path = next((found for name in names if (found := shutil.which(name))), None)
     if path is None and wanted not in (None, "", "none"):
-        allowed, hint = "name or path of a C compiler, without options; none", "unset CC to have cc, gcc or clang found"
-        what, where = f"there is no compiler '{wanted}'", "the environment's variable CC"
+        allowed, hint = "the name or path of a C compiler, without options, or none", "unset CC to use cc, gcc or clang"
+        what, where = f"there is no compiler '{wanted}'", "the environment variable CC"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
         _LOG.warning("no C compiler: everything works without compiled code, about ten times slower")
@@ -73,8 +73,8 @@ def _optimization_flag() -> str:
     """Optimisation flag for the step, from the environment variable YID_OCP_OPTIMIZE or the default."""
     level = os.environ.get("YID_OCP_OPTIMIZE", "")
     if level not in ("", "0", "1", "2", "3"):
-        what, where = f"there is no optimisation '{level}'", "the environment's variable YID_OCP_OPTIMIZE"
-        hint = "unset it; 0 is for many short runs, as tests are"
+        what, where = f"there is no optimisation level '{level}'", "the environment variable YID_OCP_OPTIMIZE"
+        hint = "unset the variable, or set it to 0 for many short runs such as tests"
         raise ConfigError(what, where=where, allowed="0, 1, 2, 3", hint=hint)
     return f"-O{level}" if level else _OPTIMIZATION_FLAG
 
@@ -90,13 +90,13 @@ def private_cache_folder() -> Path:
     except OSError as error:
         if wanted:
             what = f"the cache of compiled code cannot be made: {error.strerror}"
-            hint = "set YID_OCP_CACHE to a folder of your own, or CC=none to do without compiled code"
+            hint = "set YID_OCP_CACHE to a folder of your own, or CC=none for no compiled code"
             raise OutputError(what, where=str(folder), allowed=allowed, hint=hint) from error
         writable = False
     if not writable and not wanted:  # as in containers
         return _temporary_cache_folder(folder)
     if not _is_mine_alone(folder.stat()):
-        what = "the cache of compiled code belongs to, or is writable by, somebody else"
+        what = "another user owns the cache of compiled code, or can write to it"
         hint = f"empty it and chmod 700 it, or set YID_OCP_CACHE to another folder ({folder.name})"
         raise OutputError(what, where=str(folder), allowed=allowed, hint=hint)
     return folder
@@ -146,8 +146,7 @@ def compile_and_load_library(
 
     The cache key is the hash of `source`, the flags, the compiler, the processor and CasADi's version. With `make`,
     `source` is only the key. `make` is called if the library is not in the cache, and returns the C text or None.
-    `level` replaces the default optimisation flag.
-    """
+    `level` replaces the default optimisation flag."""
     target = _library_file(source, level or _optimization_flag(), make)
     if target is None:
         return None
@@ -255,8 +254,7 @@ def _is_ours(built: Path) -> bool:
 class MappedFunction:
     """A CasADi function of dense columns, evaluated at many points in one call, compiled if possible.
 
-    `shared_inputs` are the indices of inputs that have one value for all points.
-    """
+    `shared_inputs` are the indices of inputs that have one value for all points."""
 
     def __init__(self, function: ca.Function, shared_inputs: Sequence[int] = (), use_compiler: bool = True) -> None:
         self.function = function

@@ -27,7 +27,7 @@ from typing import Literal, get_args
 
 import casadi as ca
 
-from yid_ocp.errors import ModelError
+from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.kinematics import (
     Kinematics,
     MultibodyLagrangianDerivatives,
@@ -47,8 +47,7 @@ class _ConstraintImpulses:
     """Dphi (m, n) and d(Dphi(q)' lam)/dq (n, n) at q_k, q_m and q_{k+1}, with one sparsity pattern.
 
     The balance loses (start Dphi(q_k) + share Dphi(q_m))' lam with start + share = 1. p1 loses share (Dphi(q_m) -
-    Dphi(q_{k+1}))' lam.
-    """
+    Dphi(q_{k+1}))' lam."""
 
     start_share: float
     midpoint_share: float
@@ -75,8 +74,7 @@ class DiscreteEquations:
     """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system.
 
     The digits 0 and 1 denote the step's two nodes. q (n, 1) are coordinates, z (nz, 1) internal coordinates and p (n,
-    1) momenta [N m s]. The system has m constraints, nu inputs and ntheta parameters.
-    """
+    1) momenta [N m s]. The system has m constraints, nu inputs and ntheta parameters."""
 
     system: System
     force_split: ForceSplit
@@ -152,12 +150,11 @@ def discrete_equations(
     References
     ----------
     Marsden and West (2001), Acta Numerica 10:357, section 3, doi:10.1017/S096249290100006X.
-    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
-    """
+    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955."""
     rules = (("force_split", force_split, ForceSplit), ("constraint_force", constraint_force, ConstraintForcePlacement))
     for name, said, known in rules:
         if said not in get_args(known):
-            raise ModelError(f"{name} = '{said}'", allowed=", ".join(get_args(known)))
+            raise ModelError(f"{name} = '{said}'", where=name, **unknown_name_error_arguments(said, get_args(known)))
     at = _Symbols.from_system(system)
     lam, h, qm, vm = at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
@@ -263,7 +260,9 @@ def _summed_terms(
         at_rest.update(terms.static_equations)
         closed += [] if terms.force_with_derivatives is None else [terms.force_with_derivatives]
     if missing := [name for name in names if name not in equations]:
-        raise ModelError(f"internal coordinate '{missing[0]}' has no equation")
+        what = f"internal coordinate '{missing[0]}' has no equation"
+        hint = "return it in `internal_equations` of the effect"
+        raise ModelError(what, where="effects of the model", allowed="one equation per internal coordinate", hint=hint)
     parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
     summed = ForceWithDerivativeFactors(*(sum(rest, first) for first, *rest in parts)) if closed else None
     internal = [ca.vertcat(ca.SX(0, 1), *(rows[name] for name in names)) for rows in (equations, equations | at_rest)]
@@ -313,8 +312,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
     """Dphi(q) and d(Dphi(q)' lam)/dq in closed form.
 
     For joint i before joint j in the chain: d2x/dq_i dq_j = w_i x dx/dq_j for a point x, d2v/dq_i dq_j = w_i x (w_j x
-    v) for a direction v.
-    """
+    v) for a direction v."""
     n, turning = system.n_coordinates, [joint.kind != "prismatic" for joint in system.mechanism.joints]
     blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
 
@@ -418,8 +416,7 @@ class NlpStepConstraints:
     """Symbolic equality constraints of one step in a nonlinear program (NLP), with their Jacobians.
 
     `residual_jacobians` and `effort_jacobians` are the sparse derivatives of `residual` (nr, 1) and `prescribed_effort`
-    (nc, 1) with respect to `x0`, `x1`, `lam` and `u`.
-    """
+    (nc, 1) with respect to `x0`, `x1`, `lam` and `u`."""
 
     equations: DiscreteEquations
     time_step: float  # [s]
@@ -450,8 +447,7 @@ def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpS
 
     The rows do not depend on recordings: torques, prescribed coordinates and parameters may be data or unknowns. The
     bodies' second derivatives have a closed form (`MultibodyLagrangianDerivatives`) with a quarter of the operations of
-    automatic differentiation. All other derivatives come from automatic differentiation.
-    """
+    automatic differentiation. All other derivatives come from automatic differentiation."""
     e, h, system = equations, time_step, equations.system
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
     p1 = ca.SX.sym("p1", e.p0.numel())
@@ -482,8 +478,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
     """Derivatives of `momentum_balance` and of `p1` with respect to the step's symbols. The key `none` holds zeros.
 
     With L the bodies' Lagrangian at the midpoint and a = -1 in the balance, +1 in p1, the term h/2 L_q + a L_v has the
-    derivative h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv) with respect to q_k (b = -1) and q_{k+1} (b = 1).
-    """
+    derivative h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv) with respect to q_k (b = -1) and q_{k+1} (b = 1)."""
     n, h, scale, pulls = e.q0.numel(), e.h, e.row_scale, e.constraint_impulses
     rigid = e.rigid_body_terms
     L_qq, L_qv, L_vv = lagrangian_second_derivatives(rigid, e.system.mechanism)

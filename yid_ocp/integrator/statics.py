@@ -58,8 +58,7 @@ class EquilibriumSolver:
     """Newton solver for a system's static equilibrium. Driven joints are held, prescribed joints are given.
 
     `known_coordinates` are the indices of the given coordinates (driven, then prescribed), `free_coordinates` those of
-    the unknown coordinates.
-    """
+    the unknown coordinates."""
 
     def __init__(self, step: Step) -> None:
         self.step = step
@@ -101,8 +100,7 @@ class EquilibriumSolver:
         guess : array_like, shape (n,), optional
             Configuration to start from; default: the undeformed object.
         names : sequence of str
-            Parameters with respect to which the equilibrium is differentiated.
-        """
+            Parameters with respect to which the equilibrium is differentiated."""
         step, system = self.step, self.step.system
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
         theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))

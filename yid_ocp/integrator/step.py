@@ -106,8 +106,7 @@ class Step(ReprMixin):
         prescribed : pair of array_like, shape (nc,), optional
             Prescribed coordinates at both nodes; required if the system has any.
         internal : array_like, shape (nz,), optional
-            Internal coordinates z_k; default: zero.
-        """
+            Internal coordinates z_k; default: zero."""
         rollout, n = self._single(q0, p0, u, theta, prescribed, internal, None), self.sizes["n"]
         return rollout.state[1, :n], rollout.state[1, n : 2 * n], rollout.multipliers[0], rollout.status
 
@@ -152,11 +151,13 @@ class Step(ReprMixin):
         z0 = np.zeros(sizes["nz"]) if internal is None else check("internal", internal, (sizes["nz"],))
         start = np.concatenate([check("q0", q0, (sizes["n"],)), check("p0", p0, (sizes["n"],)), z0])
         if prescribed is None and sizes["nc"]:
-            what = f"{sizes['nc']} coordinates are prescribed"
-            raise ModelError(what, where="step", hint="pass prescribed=(s0, s1)")
+            what = f"{sizes['nc']} coordinates are prescribed, but `prescribed` is missing"
+            allowed = f"the pair (s0, s1), each of shape ({sizes['nc']},)"
+            raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1)")
         ends = ((), ()) if prescribed is None else prescribed
         if len(ends) != 2:
-            raise ModelError(f"prescribed has {len(ends)} entries", allowed="the pair (s0, s1)")
+            what = f"prescribed has {len(ends)} entries"
+            raise ModelError(what, where="prescribed", allowed="the pair (s0, s1)", hint="pass prescribed=(s0, s1)")
         path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in ends])
         start[list(self.system.prescribed_coordinate_indices)] = path[0]
         torque = check("u", u, (sizes["nu"],))[None, :]
@@ -192,8 +193,7 @@ def compile_step(
     Raises
     ------
     ModelError
-        The time step is not positive, or the force split or constraint force is unknown.
-    """
+        The time step is not positive, or the force split or constraint force is unknown."""
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
     library = None
     if use_compiler:
@@ -220,7 +220,7 @@ def compile_step_like(step: Step, system: System, *, use_compiler: bool | None =
 
 def _positive(time_step: float) -> float:
     if not (math.isfinite(time_step) and time_step > 0):
-        raise ModelError(f"time_step = {time_step}", allowed="a positive number of seconds")
+        raise ModelError(f"time_step = {time_step}", where="time_step", allowed="a number above 0 [s]")
     return time_step
 
 
@@ -230,7 +230,8 @@ def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[in
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)
     if array.shape != shape:
-        raise ModelError(f"{name} has shape {array.shape}", allowed=f"shape {shape}")
+        hint = "pass an array of the allowed shape"
+        raise ModelError(f"{name} has shape {array.shape}", where=name, allowed=f"shape {shape}", hint=hint)
     return array
 
 
@@ -266,8 +267,7 @@ def simulate(
     Raises
     ------
     ModelError
-        An array has the wrong shape.
-    """
+        An array has the wrong shape."""
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return simulate_rollouts(step, [inputs])[0]
 
@@ -291,7 +291,7 @@ def checked_rollout_inputs(
     sizes, check = step.sizes, float_array_with_checked_shape
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
-        raise ModelError(f"steps = {steps}", allowed="a whole number from 1")
+        raise ModelError(f"steps = {steps}", where="steps", allowed="a whole number from 1")
     begin = check("start", start, (nx,)).copy()
     fixed = list(step.system.prescribed_coordinate_indices)
     inputs = np.zeros((steps, nu)) if torque is None else check("torque", torque, (steps, nu))
@@ -353,8 +353,7 @@ def moving_observable_state_mask(
     Internal states of a neutral effect are excluded. Only the first and the last step of the rollout are examined.
     `loads` are extra excitations as in `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend
     on directly. With `disturbed` (nx,), states with an error at the start, states that neither these
-    nor errors of torques reach are excluded too.
-    """
+    nor errors of torques reach are excluded too."""
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))
     ends = [
@@ -393,8 +392,7 @@ def step_derivatives_along_rollout(
     coordinates and of the constraint forces, (k, nc + m, d). The d = nx + c + e columns are the state (including the
     feedback, if given), the c torque directions `inputs` (N, nu, c) and e loads. `loads` are additions to the nt = n +
     nz + m step equations, (nt, e), and to the next momentum, (n, e), the same in all steps. `chosen` is a range of
-    consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular.
-    """
+    consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular."""
     if loads is None:
         rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
         loads = np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0))

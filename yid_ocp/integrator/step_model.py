@@ -30,8 +30,7 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 class StepModel:
     """Equations, functions and index tables of one step, from which a kernel is built.
 
-    `sizes` holds n, nz, m, nu, nc, nx and ntheta; `time_step` is h [s]; `tolerance` is Newton's [rad or m].
-    """
+    `sizes` holds n, nz, m, nu, nc, nx and ntheta; `time_step` is h [s]; `tolerance` is Newton's [rad or m]."""
 
     system: System
     equations: DiscreteEquations
@@ -98,8 +97,7 @@ class RolloutStatus:
     """Convergence of a rollout: status code, Newton's last correction [rad or m] and totals over all steps.
 
     `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
-    the values after the last step.
-    """
+    the values after the last step."""
 
     code: NewtonStatusCode
     completed_steps: int
@@ -131,8 +129,7 @@ class SensitivityDirections:
     """The d directions in which a rollout is differentiated. The first directions are those of the named parameters.
 
     The tangents are the derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path
-    (N + 1, nc, d) along the directions.
-    """
+    (N + 1, nc, d) along the directions."""
 
     parameter_names: tuple[str, ...]
     initial_state_tangents: Array
@@ -141,8 +138,8 @@ class SensitivityDirections:
 
     def __post_init__(self) -> None:
         if self.count < len(self.parameter_names):
-            what = f"{self.count} directions for {len(self.parameter_names)} parameters"
-            raise ModelError(what, allowed="one or more each")
+            what, where = f"{self.count} directions for {len(self.parameter_names)} parameters", "SensitivityDirections"
+            raise ModelError(what, where=where, allowed="at least as many directions as parameters")
 
     @property
     def count(self) -> int:
@@ -155,8 +152,7 @@ class TrackingFeedback:
     """Time-varying feedback of the tracking filter. The torque is u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     `state_indices` (nb,) selects entries of the state (q, p, z). `gain` (N, nu, nb) holds K_k [N m/rad for a
-    coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries.
-    """
+    coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries."""
 
     state_indices: NDArray[np.int32]
     gain: Array
@@ -186,8 +182,7 @@ class Rollout:
     `state` (N + 1, nx) holds (q, p, z) at every node, q in rad or m, p in N m s or N s. `multipliers` (N, m) are in N
     s. `effort` (N, nc) is the effort of prescribed coordinates at nodes 0..N-1 [N m], `torque` (N, nu) the applied
     torque [N m]. The effort at node 0 is correct if p_0 contains the impulse of a previous step, as the p_0 of an
-    `Equilibrium` does. After p_0 = dL/dv it is half the effort, because it contains only half a step's impulse.
-    """
+    `Equilibrium` does. After p_0 = dL/dv it is half the effort, because it contains only half a step's impulse."""
 
     state: Array
     multipliers: Array
@@ -208,8 +203,7 @@ class RolloutCostGradient:
     """Gradient of a scalar cost along a rollout by the adjoint method. NaN if a step's equations are singular.
 
     Derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the
-    prescribed coordinates at every node (N + 1, nc). Those at node 0 are also part of `by_initial_state`.
-    """
+    prescribed coordinates at every node (N + 1, nc). Those at node 0 are also part of `by_initial_state`."""
 
     by_theta: Array
     by_initial_state: Array
@@ -224,8 +218,7 @@ class StepEquationLinearizations:
     Each step has nt = n + nz + m equations: momentum balance (n), internal (nz) and constraint (m). `p1` is the
     momentum p_{k+1} (n) that follows from the other values. Derivatives are with respect to the new values (q_{k+1},
     z_{k+1}, lam_k), the old values (q_k, z_k), the torque and the chosen parameters. The derivative of the balance with
-    respect to p_k is the identity.
-    """
+    respect to p_k is the identity."""
 
     residual: Array
     p1: Array
@@ -275,7 +268,8 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}: it takes {amount}"
     hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
-    return InsufficientMemoryError(said, hint=hint)
+    allowed = "a computation that fits into the free memory"
+    return InsufficientMemoryError(said, where="this machine", allowed=allowed, hint=hint)
 
 
 def attach_status_to_rollout(

@@ -29,16 +29,18 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     """Make a proportional tracking feedback on the driven joints, u_k = ubar_k - K (q_k - qbar_k), with diagonal K.
 
     `measured` holds the joint angles qbar at every node, (N + 1, nu) [rad]. `gains` holds one gain, one per joint of an
-    arm, or nu gains [N m/rad]. Raises `ModelError` for another number of gains or a negative gain.
-    """
+    arm, or nu gains [N m/rad]. Raises `ModelError` for another number of gains or a negative gain."""
     reference = np.asarray(measured, float)
     nu = step.sizes["nu"]
     values = np.atleast_1d(np.asarray(gains, float))
     if values.size not in (1, nu) and nu % max(values.size, 1):
-        raise ModelError(f"{values.size} gains for {nu} driven joints", allowed=f"one, {nu}, or one arm's worth")
+        what = f"{values.size} gains for {nu} driven joints"
+        allowed = f"1 or {nu} gains, or one for each joint of an arm"
+        raise ModelError(what, where="problem.arm_tracking_feedback_gains", allowed=allowed)
     values = np.resize(values, nu)
     if np.any(values < 0):
-        raise ModelError(f"a tracking gain is negative: {values.min():g} N m/rad", allowed="0 or more")
+        what = f"a tracking gain is negative: {values.min():g} N m/rad"
+        raise ModelError(what, where="problem.arm_tracking_feedback_gains", allowed="0 or more [N m/rad]")
     steps = len(reference) - 1
     gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
     return TrackingFeedback(np.array(step.system.driven_coordinate_indices, np.int32), gain, reference[:-1])
@@ -92,7 +94,8 @@ def compile_driven_arms_only_step(step: Step) -> Step:
     keep = [mechanism.joint_index(name) for name in system.driven]
     if sorted(keep) != list(range(len(keep))):
         what = "the LQR filter needs the driven joints to come first in the configuration"
-        raise ModelError(what, where=", ".join(system.driven), hint="use proportional gains instead")
+        where, allowed = "problem.arm_tracking_feedback", "driven joints that are the first coordinates"
+        raise ModelError(what, where=where, allowed=allowed, hint="use proportional gains instead")
     frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint_index < len(keep)}
     arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, link_chains={})
     damping = {name: value for name, value in system.joint_damping.items() if name in system.driven}
@@ -139,8 +142,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 class JointMotionWithSensitivities:
     """Angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
 
-    The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
-    """
+    The first of the d directions are parameters. A derivative is None if the quantity depends on no direction."""
 
     angles: Array  # at every node, (N + 1, nu) [rad]
     torque: Array  # held over every step, (N, nu) [N m]
@@ -161,8 +163,7 @@ class EffectMomentumShift:
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
     effect such as an armature, or a torque other than the recorded one, changes the momentum of the motion. The
     feedback would counteract this change: at a wrist, whose momentum gain times h/2 is near one, by half of the effect.
-    `parameter_names` are the effect parameters on which the momentum depends if the torques are known.
-    """
+    `parameter_names` are the effect parameters on which the momentum depends if the torques are known."""
 
     def __init__(self, step: Step) -> None:
         e, system = step.equations, step.system
@@ -226,8 +227,7 @@ class EffectMomentumShift:
         """Momentum shift at nodes 0..N-1, with effects minus recorded, (N, nu), and its derivatives (N, nu, d).
 
         `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
-        `names` are the parameters of the first of the d directions.
-        """
+        `names` are the parameters of the first of the d directions."""
         steps, plain_theta = len(true.torque), self.theta_without_effects(theta)
         still = np.zeros((steps, len(self._kept)))
         plain, *_ = self._maps(False)(
@@ -285,8 +285,7 @@ def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
 
     The reference momenta of the feedback follow from the recorded torque. The error is assumed to be the same in this
     step and the previous one. `gain` (..., nu, nb) is the feedback gain of the step. `by_torque` (nu, nu) is
-    `EffectMomentumShift.momentum_derivative_by_previous_torque`.
-    """
+    `EffectMomentumShift.momentum_derivative_by_previous_torque`."""
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
 

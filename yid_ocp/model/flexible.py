@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ModelError, nearest_name_hint
+from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import (
     ArcLengthChain,
     Frame,
@@ -103,8 +103,7 @@ class FlexibleObject(ReprMixin):
     """A flexible object as a model of rigid links with elastic joints.
 
     Its frames are `object_root`, the segment tips `w_SEGMENT`, the link tips `SEGMENT_i_tip`, and points by arc length
-    such as `SEGMENT:40%`, which do not depend on the number of links.
-    """
+    such as `SEGMENT:40%`, which do not depend on the number of links."""
 
     mechanism: Mechanism
     elastic_joints: tuple[ElasticJoint, ...]
@@ -139,8 +138,7 @@ def flexible_object(
     Raises
     ------
     ModelError
-        Unknown parent, parent after child, non-positive length, mass or radius, or inconsistent links.
-    """
+        Unknown parent, parent after child, non-positive length, mass or radius, or inconsistent links."""
     root = Placement.identity() if root_placement is None else Placement.from_matrix(root_placement)
     parts = _Parts(frames={"object_root": Frame(-1, root)})
     fraction = None if gravity_fraction == 1 else ca.SX(gravity_fraction)
@@ -215,14 +213,16 @@ def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLi
 
     They serve as `Segment.rest_rotation` and `Segment.link_rest_rotations`. `vertices` (k, 3) are the undeformed centre
     line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line; default: the world
-    frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong.
-    """
+    frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong."""
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-        raise ModelError(f"vertices have shape {points.shape}", where="polyline", allowed="(k, 3) with k from 2")
+        what, hint = f"the vertices have the shape {points.shape}", "give x, y and z of two or more vertices"
+        raise ModelError(what, where="vertices of the polyline", allowed="(k, 3) with k >= 2", hint=hint)
     edges = np.diff(points, axis=0)
     if not np.all(np.linalg.norm(edges, axis=1) > 0):
-        raise ModelError("two neighbouring vertices coincide or are not finite", where="polyline")
+        index = int(np.argmin(np.linalg.norm(edges, axis=1) > 0))
+        what, hint = f"vertices {index} and {index + 1} coincide or are not finite", "remove one of them"
+        raise ModelError(what, where="vertices of the polyline", allowed="distinct, finite vertices", hint=hint)
     frame = np.eye(3) if initial_frame is None else np.asarray(initial_frame, float)
     rotations = []
     for edge in edges:
@@ -287,24 +287,26 @@ def _check(segment: Segment, known: Mapping[str, SegmentLayout]) -> None:
         raise ModelError(what, where=f"segment {segment.name}", allowed=allowed, hint=hint)
 
     if segment.name in known:
-        refuse(f"two segments are called '{segment.name}'")
+        refuse(f"two segments are called '{segment.name}'", "a name of its own for each", "rename one of them")
     if parent is not None and parent not in known:
-        what = f"parent '{parent}' of segment '{segment.name}' does not come before it"
-        refuse(what, hint=nearest_name_hint(parent, known))
+        what = f"the parent '{parent}' is not a segment that is listed before segment '{segment.name}'"
+        refuse(what, **unknown_name_error_arguments(parent, known))
     if (segment.radius is None) == (section is None):
-        refuse("a segment needs a radius or a section", "one of the two", "cross_section_size: [0.001, 0.08]")
+        found = "both a radius and a section" if section else "neither a radius nor a section"
+        refuse(f"the segment has {found}", "one of the two", "set cross_section_size: [0.001, 0.08] or radius: 0.004")
     sizes = {"mass": segment.mass, **({"length": segment.length} if lengths is None else {})}
     sizes |= {} if segment.radius is None else {"radius": segment.radius}
     for quantity, value in (sizes | {f"cross_section_size[{i}]": size for i, size in enumerate(section or ())}).items():
         if not (math.isfinite(value) and value > 0):
-            refuse(f"{quantity} = {value}", "a positive number in SI units")
+            unit = "kg" if quantity == "mass" else "m"
+            refuse(f"{quantity} = {value}", f"a number above 0 [{unit}]")
     if lengths is None and count < 1:
         refuse(f"links = {count}", "a whole number from 1")
     if lengths is not None and not min(lengths, default=0.0) > 0:
-        refuse("a link has no length", "positive lengths [m]")
+        refuse(f"link_lengths = {list(lengths)}", "one or more numbers above 0 [m]")
     if turns is not None and len(turns) != count - 1:
-        refuse(f"{len(turns)} link rotations for {count} links", f"{count - 1}")
+        refuse(f"{count} links have {len(turns)} link rotations", f"{count - 1}, one between two neighbouring links")
     if at is not None and parent is not None and not 0 <= at < (links := len(known[parent].link_joints)):
-        refuse(f"parent_link_index = {at}", f"0 to {links - 1}")
+        refuse(f"parent_link_index = {at}", f"0 to {links - 1}, the links of segment '{parent}'")
     if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(AXIS_UNIT_VECTORS):
         refuse(f"joint_axes = '{axes}'", "letters of x, y, z, each at most once")

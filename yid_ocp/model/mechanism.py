@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ModelError, nearest_name_hint
+from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.parameters import Parameters
 
 
@@ -48,8 +48,7 @@ class Placement:
 class Inertia:
     """Mass [kg], centre of mass [m] and inertia tensor about it [kg m^2] of a rigid body, in its joint's frame.
 
-    `gravity_fraction` multiplies the weight of the body, not its inertia; None means 1.
-    """
+    `gravity_fraction` multiplies the weight of the body, not its inertia; None means 1."""
 
     mass: ca.SX
     center_of_mass: ca.SX
@@ -98,9 +97,7 @@ class Frame:
     """A named frame fixed to a joint's moving side. `joint_index` is -1 for the world.
 
     `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and further joints) are attached to the same
-    side and stay with the joint if the mechanism is cut at this frame. Everything else attached there is beyond the
-    cut.
-    """
+    side and stay with the joint if the mechanism is cut at this frame. Everything else there is beyond the cut."""
 
     joint_index: int
     placement: Placement
@@ -130,9 +127,8 @@ class ArcLengthChain:
 class Mechanism(ReprMixin):
     """A kinematic tree of joints with bodies, named frames and parameters. Parents precede children.
 
-    Placements and inertias depend on `parameters`. For a chain NAME of `link_chains`, the frame `NAME:40%` is a point
-    by arc length.
-    """
+    Placements and inertias depend on `parameters`. For a chain NAME of `link_chains`, `NAME:40%` is a frame by arc
+    length."""
 
     name: str
     joints: tuple[Joint, ...]
@@ -160,7 +156,8 @@ class Mechanism(ReprMixin):
         """Return the index of a joint. Raises `ModelError`, with the nearest name, if there is no such joint."""
         names = self.joint_names
         if name not in names:
-            raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest_name_hint(name, names))
+            said = unknown_name_error_arguments(name, names)
+            raise ModelError(f"there is no joint '{name}'", where=f"model '{self.name}'", **said)
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:
@@ -171,14 +168,14 @@ class Mechanism(ReprMixin):
         """Return a frame by name. `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length.
 
         Such a point is fixed to the straight link that contains it. Raises `ModelError` if there is no such frame (with
-        the nearest name), or if the percentage is not from 0 to 100.
-        """
+        the nearest name), or if the percentage is not from 0 to 100."""
         if name in self.frames:
             return self.frames[name]
         line, _, said = name.partition(":")
         if not self.has_frame(name):
             known = (*self.frames, *(f"{entry}:{said}" for entry in self.link_chains if said))
-            raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest_name_hint(name, known))
+            choice = unknown_name_error_arguments(name, known)
+            raise ModelError(f"there is no frame '{name}'", where=f"model '{self.name}'", **choice)
         tip, part = self.link_chains[line]._locate(_fraction(name, said))
         end = self.frames[tip]
         return replace(end, placement=Placement(end.placement.rotation, part * end.placement.translation))
@@ -203,7 +200,10 @@ class Mechanism(ReprMixin):
         shift = len(self.joints)
         clash = sorted((set(self.joint_names) & set(other.joint_names)) | (set(self.frames) & set(other.frames)))
         if clash:
-            raise ModelError(f"two parts of the model use the name '{clash[0]}'", where=f"{self.name} + {other.name}")
+            what = f"two parts of the model use the name '{clash[0]}'"
+            where = f"models '{self.name}' and '{other.name}'"
+            hint = "rename the joint, frame or segment in one of them"
+            raise ModelError(what, where=where, allowed="a name of its own for every joint and frame", hint=hint)
 
         def moved(index: int, local: Placement) -> tuple[int, Placement]:
             return (index + shift, local) if index >= 0 else (at, root @ local)
@@ -223,7 +223,8 @@ class Mechanism(ReprMixin):
     def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
         """Return a copy with a frame `name` at a fixed pose (4, 4) in `frame` (None: world)."""
         if name in self.frames:
-            raise ModelError(f"there is a frame '{name}' already", where=self.name)
+            what, where = f"there is already a frame '{name}'", f"model '{self.name}'"
+            raise ModelError(what, where=where, allowed="a new name", hint="choose another name for the frame")
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
         added = replace(carrier, placement=carrier.placement @ Placement.from_matrix(placement))
         return replace(self, frames={**self.frames, name: added})
@@ -277,8 +278,9 @@ def _fraction(name: str, said: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value <= 100.0:
-        line, allowed = name.partition(":")[0], "a percentage of its length from 0% to 100%, base to tip"
-        raise ModelError(f"'{said}' is no place along '{line}'", where=name, allowed=allowed, hint=f"{line}:40%")
+        line, allowed = name.partition(":")[0], "a percentage of the length from 0% (base) to 100% (tip)"
+        what, hint = f"'{said}' is not a location along '{line}'", f"write a percentage, such as {line}:40%"
+        raise ModelError(what, where=name, allowed=allowed, hint=hint)
     return value / 100.0
 
 
@@ -291,7 +293,9 @@ def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
     if mass.is_zero():
         return None
     if not all(b.gravity_fraction is None or b.gravity_fraction.is_one() for b in entries):
-        raise ModelError("a body whose weight is not its mass times gravity cannot be merged or written to a file")
+        what = "the weight of a body is not its mass times gravity, so the body cannot be merged or written to a file"
+        hint = "leave out the effects that change weights without masses"
+        raise ModelError(what, where="effects of the model", allowed="bodies with weight = mass * gravity", hint=hint)
     com = sum((b.mass * b.center_of_mass for b in entries), ca.SX(ca.DM.zeros(3))) / mass
     inertia = ca.SX(ca.DM.zeros(3, 3))
     for body in entries:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ModelError
+from yid_ocp.errors import ModelError, missing_package_error
 from yid_ocp.files import check_input_file
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_axis_sin_cos
 
@@ -30,8 +30,7 @@ def parsed_mjcf(file: Path) -> SimpleNamespace:
     Each site becomes a frame. Coordinates are those of MuJoCo, including `ref`. A joint that a linear equality
     constraint couples to another joint is treated like a URDF `mimic` joint. A free body that a weld attaches to
     another body is fixed there. Raises `ModelError` if `mujoco` is not installed, if it cannot compile the file, or if
-    the file has a free or ball joint.
-    """
+    the file has a free or ball joint."""
     model = _compiled_file(file)
     links = [SimpleNamespace(name=_WORLD, inertial=None)]
     joints: list[SimpleNamespace] = []
@@ -53,8 +52,7 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     """Nonzero constants of an MJCF file's joints, by joint and name. For other files the result is empty.
 
     Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
-    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Raises the errors of `parsed_mjcf`.
-    """
+    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Raises the errors of `parsed_mjcf`."""
     if file.suffix.lower() != ".xml" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}
     model = _compiled_file(file)
@@ -94,13 +92,12 @@ def _compiled(file: Path, changed: int) -> Any:
     try:
         import mujoco
     except ImportError as error:
-        what, hint = "reading MJCF files needs mujoco", "pip install 'yid-ocp[blind]'"
-        raise ModelError(what, where=str(file), hint=hint) from error
+        raise missing_package_error(ModelError, f"reading {file} needs the package mujoco", "blind") from error
     try:
         model = mujoco.MjModel.from_xml_path(str(check_input_file(file)))
     except Exception as error:  # MuJoCo raises ValueError, and others for files that are missing
         what = f"MuJoCo cannot read the file: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        hint = "open it in MuJoCo's viewer; meshes have to lie where the file says"
+        hint = "open it in MuJoCo's viewer, and put meshes where the file refers to them"
         raise ModelError(what, where=str(file), allowed="MJCF that MuJoCo compiles", hint=hint) from error
     for sentence in _left_out(model):
         log.warning("%s: %s", file.name, sentence)
@@ -128,7 +125,7 @@ def _body(
         joint, kind = model.joint(j), _JOINT_TYPES.get(int(model.jnt_type[j]))
         label = joint.name or f"{name}_joint{j - first + 1 if count > 1 else ''}"
         if kind is None:
-            what, allowed = f"joint '{label}' is free or a ball", "hinge and slide joints"
+            what, allowed = f"joint '{label}' has the type free or ball", "hinge and slide joints"
             raise ModelError(what, where=where, allowed=allowed, hint="fix the base, or use several hinges")
         place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         origin = at @ _shift(place - last) @ _moved(axis, -ref, kind)

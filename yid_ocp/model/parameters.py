@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class Parameter:
         if self.symbol.is_empty():
             object.__setattr__(self, "symbol", ca.SX.sym(self.name))
         if not math.isfinite(self.value):
-            raise ConfigError(f"{self.name} = {self.value} is not a finite number", where=f"parameter {self.name}")
+            what, allowed = f"{self.name} = {self.value} is not a finite number", f"a finite number [{self.unit}]"
+            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed)
         if not self.lower <= self.value <= self.upper:
             side, bound = (
                 ("below its lower", self.lower) if self.value < self.lower else ("above its upper", self.upper)
@@ -51,8 +52,8 @@ class Parameters(ReprMixin):
         self._index = {entry.name: i for i, entry in enumerate(self._entries)}
         if len(self._index) != len(self._entries):
             twice = sorted(name for name, count in Counter(self.names).items() if count > 1)
-            hint = "give each part of the model its own name"
-            raise ConfigError(f"parameter named twice: {', '.join(twice)}", hint=hint)
+            what, hint = f"two parameters are called {twice[0]}", "give each part of the model its own name"
+            raise ConfigError(what, where="parameters of the model", allowed="unique names", hint=hint)
 
     def _summary(self) -> ReprLineAndTableRows:
         rows = [("parameter", "value", "unit", "lower", "upper")]
@@ -84,7 +85,8 @@ class Parameters(ReprMixin):
     def index(self, name: str) -> int:
         """Index of a parameter in `theta`. Raises `ConfigError`, which suggests the nearest name, if there is none."""
         if name not in self._index:
-            raise ConfigError(f"there is no parameter '{name}'", hint=nearest_name_hint(name, self._index))
+            said = unknown_name_error_arguments(name, self._index)
+            raise ConfigError(f"there is no parameter '{name}'", where="parameters of the model", **said)
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:
@@ -92,7 +94,8 @@ class Parameters(ReprMixin):
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):
-                raise ConfigError(f"{name} = {value} is not a finite number", where=f"parameter {name}")
+                what, allowed = f"{name} = {value} is not a finite number", "a finite number"
+                raise ConfigError(what, where=f"parameter {name}", allowed=allowed)
             theta[self.index(name)] = value
         return theta
 

@@ -51,8 +51,7 @@ class _DcMotorData:
     """Published data of a geared DC servo, used as initial values.
 
     From Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators,
-    arXiv:2410.08650, and the data published with it (Rhoban/bam, Apache-2.0).
-    """
+    arXiv:2410.08650, and the data published with it (Rhoban/bam, Apache-2.0)."""
 
     supply_voltage: float  # [V]
     duty_per_gain: float  # duty per unit of the firmware's proportional gain and per error of the angle [1/rad]
@@ -118,9 +117,10 @@ class MotorOptions:
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.kind != "dc":
-            what = f"the motor is {self.kind} and has the preset '{self.preset}'"
+            what = f"the motor has kind: {self.kind} and the preset '{self.preset}'"
             hint = "set model.arms.servo.motor.kind: dc, or leave the preset out"
-            raise ConfigError(what, allowed="preset with kind: dc", hint=hint)
+            where = "model.arms.servo.motor.preset"
+            raise ConfigError(what, where=where, allowed="preset with kind: dc", hint=hint)
 
 
 @dataclass(frozen=True)
@@ -157,9 +157,8 @@ class PositionServoOptions:
         if "derivative" in self.extra_controller_terms and self.motor.kind == "ideal":
             what = "an ideal motor has a derivative term already, JOINT.servo_damping"
             hint = "leave it out, or set model.arms.servo.motor.kind: dc"
-            raise ConfigError(
-                what, where="model.arms.servo.extra_controller_terms", allowed="derivative with kind: dc", hint=hint
-            )
+            where = "model.arms.servo.extra_controller_terms"
+            raise ConfigError(what, where=where, allowed="derivative with kind: dc", hint=hint)
 
 
 @dataclass(frozen=True)
@@ -172,8 +171,7 @@ class PositionServo:
     with the error e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p), p =
     `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p. Several limits add up in the tightness. For a DC motor the
     limit is that of the duty cycle, and the damping is the back-EMF (torque = kt/R (duty V - kt dq/dt)).
-    `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero.
-    """
+    `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero."""
 
     gain: ca.SX  # includes the firmware's gain if known [N m/rad or N/m]
     damping: ca.SX  # [N m s/rad or N s/m]
@@ -230,8 +228,7 @@ def build_joint_servos(
     """Build a servo for every named joint. Returns them and their parameters, such as `JOINT.servo_gain`.
 
     With the initial gain, an error of `_DEFAULT_FULL_TORQUE_ERROR` gives the joint's effort limit. For a DC motor
-    `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor (the gain set in the firmware).
-    """
+    `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor (the gain set in the firmware)."""
     servos, entries = {}, []
     for joint in joints:
         at = tree.joints[tree.joint_index(joint)]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ModelError, nearest_name_hint
+from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
@@ -94,8 +94,7 @@ class Grasp:
 class MidpointState:
     """Symbols at the midpoint of one step, on which energies and forces may depend.
 
-    q, z are the means of (internal) coordinates at both nodes; v, z_rate are their differences divided by h.
-    """
+    q, z are the means of (internal) coordinates at both nodes; v, z_rate are their differences divided by h."""
 
     system: System
     kinematics: Kinematics  # at q
@@ -116,8 +115,7 @@ class NodeState:
     `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; `a` is their
     difference over h, with an error of order h^2. At the first and last node, `v` is that of the adjacent step, and `a`
     is that of the neighbouring node (error of order h). `load` and `lam` belong to the next step (at the last node: the
-    last).
-    """
+    last)."""
 
     system: System
     kinematics: Kinematics  # at q
@@ -139,8 +137,7 @@ class ForceWithDerivativeFactors:
     S_j and D_j are as in `MultibodyLagrangianDerivatives`. A_j and T_j are the columns of A and T (6, n). For i an
     ancestor of joint j or j itself:
 
-        dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
-    """
+        dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j"""
 
     force: ca.SX
     A: ca.SX
@@ -168,8 +165,7 @@ class Effect:
 
     With neutral parameters a subclass leaves the nominal model unchanged. For recorded inputs (torques that drive the
     model, angles that are prescribed or followed) `corrected_reading` computes the true value from the reading. It is
-    the inverse of `distorted_reading`.
-    """
+    the inverse of `distorted_reading`."""
 
     kind: str  # name under which its class is registered
     location: str  # name of the location where it acts
@@ -290,11 +286,10 @@ class System(ReprMixin):
     ) -> System:
         """Build a system from a robot, effects and `SystemBuildArguments`. Without a robot it is the object alone.
 
-        Raises `ModelError` for an unknown or repeated name, no joints, or a joint both driven and prescribed.
-        """
+        Raises `ModelError` for an unknown or repeated name, no joints, or a joint both driven and prescribed."""
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
-            raise ModelError(f"gravity = {gravity}", allowed="three numbers [m/s^2]")
+            raise ModelError(f"gravity = {gravity}", where="gravity", allowed="three finite numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
@@ -379,7 +374,8 @@ class System(ReprMixin):
         """Return the layout of a segment. Raises `ModelError`, with the nearest name, if there is no such segment."""
         found = {layout.name: layout for layout in self.segment_layouts}
         if name not in found:
-            raise ModelError(f"there is no segment '{name}'", hint=nearest_name_hint(name, found))
+            where, said = "segments of the model", unknown_name_error_arguments(name, found)
+            raise ModelError(f"there is no segment '{name}'", where=where, **said)
         return found[name]
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> System:
@@ -448,15 +444,18 @@ def _check_names(
 ) -> None:
     """Raise `ModelError` for a name that does not exist or is used twice, or a tree without joints."""
     if not tree.joints:
-        raise ModelError("the system has no joint", hint="give a robot, an object, or both")
+        what, hint = "the model has no joint", "give a robot with movable joints, an object, or both"
+        raise ModelError(what, where=f"model '{tree.name}'", allowed="one joint or more", hint=hint)
     for joint in [*driven, *prescribed]:
         tree.joint_index(joint)
     named = {"driven joints": driven, "prescribed joints": prescribed, "grasps": [grasp.name for grasp in grasps]}
     for kind, names in named.items():
         if repeated := sorted({name for name in names if names.count(name) > 1}):
-            raise ModelError(f"'{repeated[0]}' is named twice among the {kind}", allowed="each name once")
+            what, allowed = f"'{repeated[0]}' is listed twice among the {kind}", "each name once"
+            raise ModelError(what, where=kind, allowed=allowed, hint="delete one of the two")
     if both := sorted(set(driven) & set(prescribed)):
-        raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
+        what, where = f"joint '{both[0]}' is both driven and prescribed", "driven and prescribed joints"
+        raise ModelError(what, where=where, allowed="one of the two", hint="leave the joint out of one of the lists")
     for frame in [*(name for grasp in grasps for name in (grasp.holder_frame, grasp.held_frame)), *points]:
         tree.frame(frame)
 

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ModelError, nearest_name_hint
+from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.files import MAX_TEXT_BYTES, check_input_file, is_file
 from yid_ocp.model.mechanism import (
     Frame,
@@ -56,7 +56,9 @@ def _example_robot_urdf(robot: str) -> Path:
     roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
     folder = next((root for root in roots if root.is_dir()), None)
     if folder is None:
-        raise ModelError("example-robot-data is not installed", hint="pip install example-robot-data")
+        what, allowed = "the package example-robot-data is not installed", "package:NAME if it is installed"
+        hint = "pip install example-robot-data"
+        raise ModelError(what, where=f"package:{robot}", allowed=allowed, hint=hint)
     files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.urdf"))}
     by_stem: dict[str, list[str]] = {}
     for name, path in files.items():
@@ -69,22 +71,19 @@ def _example_robot_urdf(robot: str) -> Path:
         return files[found[0]]
     where = f"package:{robot}"
     if found:
-        what, allowed = (
-            f"example-robot-data has {len(found)} robots '{robot}'",
-            ", ".join(f"package:{n}" for n in found),
-        )
+        what = f"example-robot-data has {len(found)} robots '{robot}'"
+        allowed = ", ".join(f"package:{n}" for n in found)
         raise ModelError(what, where=where, allowed=allowed, hint="name one of them by its folder")
-    allowed = "package:STEM of a URDF file there, such as package:xarm7, or package:FOLDER/FILE.urdf"
     what, stems = f"example-robot-data has no robot '{robot}'", sorted({path.stem for path in files.values()})
-    raise ModelError(what, where=where, allowed=allowed, hint=nearest_name_hint(robot, stems))
+    said = unknown_name_error_arguments(robot, stems, "write package:NAME, such as package:xarm7")
+    raise ModelError(what, where=where, **said)
 
 
 def resolve_urdf_path(robot: str | Path) -> Path:
     """Return the URDF path for a robot's name in the settings. The file need not exist.
 
     The name is a path, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
-    that ships with this package. Raises `ModelError` if there is no such robot.
-    """
+    that ships with this package. Raises `ModelError` if there is no such robot."""
     scheme, _, name = str(robot).partition(":")
     if scheme == "package":
         return _example_robot_urdf(name)
@@ -92,7 +91,8 @@ def resolve_urdf_path(robot: str | Path) -> Path:
         return Path(robot)
     known = _shipped()
     if name not in known:
-        raise ModelError(f"no URDF '{name}' ships with yid_ocp", where=str(robot), hint=nearest_name_hint(name, known))
+        said = unknown_name_error_arguments(name, known, "give the path of a file of your own, without `default:`")
+        raise ModelError(f"no URDF '{name}' ships with yid_ocp", where=str(robot), **said)
     return known[name]
 
 
@@ -133,21 +133,23 @@ def read_urdf(
     ------
     ModelError
         Missing or malformed file, MJCF without `mujoco`, unknown joint, or joint type that is not revolute, continuous,
-        prismatic or fixed.
-    """
+        prismatic or fixed."""
     file, locked = resolve_urdf_path(path), dict(locked or {})
     if not is_file(file):
         hint = "give a path, or package:NAME for example-robot-data"
         with contextlib.suppress(ModelError):
             _example_robot_urdf(str(path))
             hint = f"write package:{path} for that robot of example-robot-data"
-        raise ModelError(f"there is no URDF file '{file}'", hint=hint)
+        allowed = "the path of a URDF file, package:NAME, or default:NAME.urdf"
+        raise ModelError(f"there is no URDF file '{file}'", where=str(path), allowed=allowed, hint=hint)
     robot, where, named = _parsed(file), str(file), (*(joints or ()), *locked)
     root = _check_tree(robot, where, named)
     dropped = _with_all_below(exclude_links, robot, where)
     for joint in robot.joints:
         if joint.child in dropped and joint.name in named:
-            raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=where)
+            what = f"joint '{joint.name}' carries the excluded link '{joint.child}'"
+            hint = "exclude the joint or the link only"
+            raise ModelError(what, where=where, allowed="joints whose links are not excluded", hint=hint)
     following = _mimicked(robot, joints, locked, where)
     if joints is None:
         joints = [j.name for j in robot.joints if j.type in _MOVABLE_JOINT_TYPES and j.name not in following]
@@ -209,7 +211,7 @@ def _parsed(file: Path) -> SimpleNamespace:
     except Exception as error:  # a malformed file raises many kinds
         reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "what", error)
         what = f"the URDF cannot be read: {reason}"
-        allowed, hint = "a file of URDF with links and joints", "look at it with check_urdf, or export it again"
+        allowed, hint = "a URDF file with links and joints", "check it with check_urdf, or export it again"
         raise ModelError(what, where=str(file), allowed=allowed, hint=hint) from error
 
 
@@ -263,7 +265,8 @@ def _check_numbers(robot: ElementTree.Element, where: str) -> None:
         name = f"{owner.tag} '{owner.get('name')}'"
         inertials = owner.findall("inertial")
         if len(inertials) > 1:
-            raise ModelError(f"{name} has {len(inertials)} inertials", where=where, allowed="one, or none")
+            what, hint = f"{name} has {len(inertials)} elements <inertial>", "delete all but one"
+            raise ModelError(what, where=where, allowed="at most one <inertial>", hint=hint)
         for part in (*owner.findall("origin"), *owner.findall("axis"), *owner.findall("inertial/origin")):
             for key in {"xyz", "rpy"} & set(part.attrib):
                 _numbers(part.attrib[key], 3, f"{name}: {part.tag} {key}", where)
@@ -276,7 +279,7 @@ def _check_numbers(robot: ElementTree.Element, where: str) -> None:
             if mass is None or value < 0 or 0 < value < _MIN_MASS:
                 what = "an inertial without a mass" if mass is None else f"a mass of {value:g} kg"
                 allowed = f"a mass of zero, or of {_MIN_MASS:g} kg and more"
-                hint = "correct it, or leave the inertial out"
+                hint = "correct the mass, or delete the <inertial>"
                 raise ModelError(f"{name} has {what}", where=where, allowed=allowed, hint=hint)
             if tensor is not None:
                 for key in _TENSOR_KEYS:
@@ -290,9 +293,9 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
         numbers = []
     wrong = any(math.isnan(value) or (abs(value) > _MAX_NUMBER and not infinite) for value in numbers)
     if len(numbers) != count or wrong:
-        allowed = "one number" if count == 1 else f"{count} numbers"
-        allowed = f"{allowed}, at most {_MAX_NUMBER:g}, with blanks between"
-        raise ModelError(f"{what} is '{text[:60]}'", where=where, allowed=allowed)
+        allowed = "one number" if count == 1 else f"{count} numbers with blanks between"
+        allowed, hint = f"{allowed}, of at most {_MAX_NUMBER:g}", "correct the attribute in the URDF"
+        raise ModelError(f"{what} is '{text[:60]}'", where=where, allowed=allowed, hint=hint)
     return numbers
 
 
@@ -302,8 +305,8 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
     if least < -_PRINCIPAL_MOMENT_RTOL * max(most, -least):
         what = f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)"
-        hint = "correct the inertia, or leave the link out"
-        raise ModelError(what, where=where, allowed="three that are zero or more", hint=hint)
+        hint = "correct the <inertia> of the link"
+        raise ModelError(what, where=where, allowed="principal moments of 0 or more", hint=hint)
     if least + middle < (1 - _PRINCIPAL_MOMENT_RTOL) * most:
         what = "%s: link '%s' has principal moments of inertia of %s kg m^2, which no body has: the largest is at most "
         log.warning(what + "the sum of the others", where, link, values)
@@ -316,11 +319,12 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
     for name, mimic in following.items():
         if wanted is not None and name in wanted:
             what = f"joint '{name}' follows '{mimic.joint}' (mimic) and cannot move on its own"
-            hint = f"leave it out of the joints; it is locked then, at the place that belongs to '{mimic.joint}'"
-            raise ModelError(what, where=where, hint=hint)
+            allowed = "joints without <mimic>"
+            hint = f"leave it out of the joints; it is then locked where '{mimic.joint}' is locked"
+            raise ModelError(what, where=where, allowed=allowed, hint=hint)
         if mimic.joint not in joints:
-            what, hint = f"joint '{name}' follows a joint '{mimic.joint}' that is not there", str(mimic.joint)
-            raise ModelError(what, where=where, hint=nearest_name_hint(hint, joints))
+            what = f"joint '{name}' follows (mimic) a joint '{mimic.joint}' that does not exist"
+            raise ModelError(what, where=where, **unknown_name_error_arguments(str(mimic.joint), joints))
         if name in locked:
             continue
         if wanted is None or mimic.joint in wanted:
@@ -335,27 +339,33 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
     for joint in robot.joints:
         if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
             allowed = "revolute, continuous, prismatic, fixed"
-            raise ModelError(f"joint '{joint.name}' has type '{joint.type}'", where=where, allowed=allowed)
+            what, hint = f"joint '{joint.name}' has the type '{joint.type}'", "replace it by joints of these types"
+            raise ModelError(what, where=where, allowed=allowed, hint=hint)
         if joint.type in _MOVABLE_JOINT_TYPES and np.linalg.norm(joint.axis) < 1e-9:
-            allowed, hint = "an axis other than 0 0 0", "leave the axis out where it is x, or make the joint fixed"
+            allowed, hint = "an axis other than 0 0 0", "write the axis, or set the type of the joint to fixed"
             raise ModelError(f"joint '{joint.name}' has a zero axis", where=where, allowed=allowed, hint=hint)
     known = [joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES]
     for name in wanted:
         if name not in known:
-            raise ModelError(f"there is no movable joint '{name}'", where=where, hint=nearest_name_hint(name, known))
+            said = unknown_name_error_arguments(name, known)
+            raise ModelError(f"there is no movable joint '{name}'", where=where, **said)
     names, below = [link.name for link in robot.links], [joint.child for joint in robot.joints]
     for joint in robot.joints:
         for link in (joint.parent, joint.child):
             if link not in names:
-                what, hint = f"joint '{joint.name}' names a link '{link}' that is not there", str(link)
-                raise ModelError(what, where=where, hint=nearest_name_hint(hint, names))
+                what = f"joint '{joint.name}' has a link '{link}' that does not exist"
+                raise ModelError(what, where=where, **unknown_name_error_arguments(str(link), names))
     roots = [name for name in dict.fromkeys(names) if name not in below]
     if len(roots) != 1:
-        raise ModelError(f"the URDF has {len(roots)} root links", where=where, allowed="exactly one")
+        what = f"the URDF has {len(roots)} root links" + (f": {', '.join(map(str, roots[:4]))}" if roots else "")
+        hint = "connect them by a joint of type fixed" if roots else "delete the joint that closes a loop"
+        raise ModelError(what, where=where, allowed="exactly one link without a parent", hint=hint)
     kinds = {"links are called": names, "joints are called": [joint.name for joint in robot.joints]}
     for kind, entries in (kinds | {"joints carry the link": below}).items():
         if repeated := sorted({entry for entry in entries if entries.count(entry) > 1}):
-            raise ModelError(f"two {kind} '{repeated[0]}'", where=where, allowed="a tree with unique names")
+            hint = "delete one of the joints" if entries is below else "rename one of them"
+            allowed = "a tree in which every name is unique and every link has one parent"
+            raise ModelError(f"two {kind} '{repeated[0]}'", where=where, allowed=allowed, hint=hint)
     return str(roots[0])
 
 
@@ -387,7 +397,9 @@ def _walk(
                 stack.append((joint.child, carrier, at @ joint.origin @ _locked_motion(joint, locked), link))
     loose = sorted(set(links) - set(frames) - dropped)
     if loose:
-        raise ModelError(f"link '{loose[0]}' does not hang on '{root}'", where=where, allowed="one tree")
+        what = f"link '{loose[0]}' is not connected to the root link '{root}'"
+        hint = "connect it by a joint, or delete it"
+        raise ModelError(what, where=where, allowed="one tree of links", hint=hint)
     return joints, bodies, frames
 
 
@@ -429,8 +441,8 @@ def _with_all_below(excluded: Sequence[str], robot: Any, where: str) -> set[str]
     while waiting:
         link = waiting.pop()
         if link not in links:
-            what, hint = f"there is no link '{link}' to leave out", nearest_name_hint(link, links)
-            raise ModelError(what, where=where, hint=hint)
+            what, said = f"there is no link '{link}' to leave out", unknown_name_error_arguments(link, links)
+            raise ModelError(what, where=where, **said)
         found.add(link)
         waiting += [joint.child for joint in robot.joints if joint.parent == link]
     return found
@@ -443,8 +455,7 @@ def _unit_axis(joint: Any) -> Array:
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
     """Write a mechanism as URDF text. Each joint's bodies become one link, each frame a link on a fixed joint.
 
-    `read_urdf` reads the same numbers back to 1e-12.
-    """
+    `read_urdf` reads the same numbers back to 1e-12."""
     mechanism = mechanism.with_numeric_values(values)
     robot = ElementTree.Element("robot", name=mechanism.name)
 

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError, YidError
+from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError, YidError, missing_package_error
 from yid_ocp.files import file_sha256, json_sha256, make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel.threads_and_processes import InlineExecutor, available_processor_count, process_pool
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences
@@ -115,8 +115,7 @@ def run_tasks(
     Raises
     ------
     DataError, OutputError, WorkerError
-        A task's file cannot be read, the folder cannot be made, or a worker is unsuitable (see `WorkerConfig`).
-    """
+        A task's file cannot be read, the folder cannot be made, or a worker is unsuitable (see `WorkerConfig`)."""
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
     # paths are absolute, because a worker may run in another folder
     anywhere = [replace(task, arguments=_mapped(task.arguments, Path.absolute)) for task in tasks]
@@ -151,9 +150,9 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     ours = {kind.__name__ for kind in YidError.__subclasses__()}
     if first.partition(":")[0] in ours:
         told = "; ".join(line.strip() for line in rest.splitlines())
-        raise WorkerError(
-            f"{what}; {told}" if told else what, hint="correct this; the same command repeats the failed tasks"
-        )
+        what = f"{what}; {told}" if told else what
+        where, hint = f"task '{failed[0].name}'", "correct this, then run the same command: it repeats the failed tasks"
+        raise WorkerError(what, where=where, allowed="tasks without errors", hint=hint)
     raise RuntimeError(f"{what}; the same command tries them again")
 
 
@@ -339,18 +338,16 @@ def _dask_executor(
     try:
         distributed = importlib.import_module("distributed")
     except ImportError as error:
-        hint = "pip install 'yid-ocp[cluster]', or leave --scheduler out for processes on this machine"
-        what = "a scheduler needs Dask, which is not installed"
-        raise WorkerError(what, where="--scheduler", hint=hint) from error
+        raise missing_package_error(WorkerError, "the option --scheduler needs the package dask", "cluster") from error
     path = Path(scheduler).expanduser()
     where = {"scheduler_file": str(path)} if path.is_file() else {"address": scheduler}
     refusal: WorkerError | None = None
     try:
         client = _client(distributed, where)
     except AssertionError:
-        what = f"Dask's event loop did not start in {_MAX_CLIENT_STARTS} times ten seconds"
-        hint = "run it again once this machine is less busy"
-        refusal = WorkerError(what, where=scheduler, allowed="a machine that has time for it", hint=hint)
+        what = f"the event loop of Dask did not start within {10 * _MAX_CLIENT_STARTS} s"
+        hint = "run the command again when this machine is less busy"
+        refusal = WorkerError(what, where=scheduler, allowed="a machine with free processors", hint=hint)
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
         what = f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}"
         allowed = "HOST:PORT of a running `dask scheduler`, or the path of its scheduler file"
@@ -388,7 +385,7 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
     """Refuse workers with other versions, with several threads, or without this package or access to the same files."""
     for address, count in client.nthreads().items():
         if count > 1:
-            what = f"a worker would do {count} tasks at once in one process"
+            what = f"a worker runs {count} tasks at once in one process"
             allowed = "one task at a time in every process"
             hint = "start workers with --nthreads 1, and --nworkers for as many as the machine has processors"
             raise WorkerError(what, where=address, allowed=allowed, hint=hint)

@@ -48,7 +48,9 @@ def _max_threads() -> int:
     """Number of threads that the caller may use: the limit of the process, or a share within `map_in_threads`."""
     said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
-        raise ConfigError(f"{_THREADS_VARIABLE} is '{said}'", where="environment", allowed="a whole number from 1")
+        where, hint = f"the environment variable {_THREADS_VARIABLE}", "unset the variable, or set a number"
+        what = f"the number of threads is '{said}'"
+        raise ConfigError(what, where=where, allowed="a whole number from 1", hint=hint)
     own = int(said) if said else available_processor_count()
     return min(own, getattr(_THREAD_SHARE, "count", own))
 
@@ -170,8 +172,7 @@ def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[
     """Apply a function to items concurrently. Their calls of `call_merged_with_other_threads` are merged.
 
     At most as many items run as there are threads. Which calls are merged depends only on the items. An item must not
-    hold a lock during such a call.
-    """
+    hold a lock during such a call."""
     entries = list(items)
     if len(entries) < 2 or getattr(_THREAD_SHARE, "march", None) is not None:
         return [function(entry) for entry in entries]
@@ -231,8 +232,7 @@ class InlineExecutor(Executor):
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
     """Make a pool of processes that ignore interrupt signals, by default one per processor.
 
-    All processes together use at most the threads of this process.
-    """
+    All processes together use at most the threads of this process."""
     count = workers or available_processor_count()
     context = multiprocessing.get_context("spawn")  # a fork copies the locks of threads that it does not copy
     each = max(1, _max_threads() // count)

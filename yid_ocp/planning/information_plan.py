@@ -14,7 +14,7 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EffectBase, make_effect
-from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
+from yid_ocp.errors import ConfigError, SolverError, unknown_name_error_arguments
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_RELATIVE_STD_TAKEN_AS_INFINITE
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.options import check_option_bounds
@@ -83,8 +83,7 @@ def plan_informative_motion(
     ------
     ConfigError, ModelError, DataError, SolverError
         A parameter or effect does not exist or is unobservable; the limits leave no motion; there is no start
-        equilibrium; a sensor has no noise level; the rollout of a motion fails.
-    """
+        equilibrium; a sensor has no noise level; the rollout of a motion fails."""
     check_option_bounds(options, "plan")
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
     progress.begin_stage("building the experiment")
@@ -107,7 +106,8 @@ def plan_informative_motion(
     seeds = range(options.seed, options.seed + options.n_random_starts)
     begins = [_smooth(experiment, search.shrink_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
-        raise ConfigError("the limits leave no motion", where="plan.limits", hint="widen plan.limits")
+        what, allowed = "no motion keeps the limits", "limits within which the arms can move"
+        raise ConfigError(what, where="plan.limits", allowed=allowed, hint="widen plan.limits")
     unseen = _unseen(experiment, [rows for _, rows in begins])
     _check_seen(chosen, rivals, unseen, experiment)
     found = []
@@ -122,19 +122,20 @@ def _chosen(
 ) -> tuple[tuple[str, ...], tuple[EffectBase, ...]]:
     """Parameters to identify, or effects to discriminate."""
     if options.identify is not None and options.discriminate is not None:
-        what = "both parameters to identify and effects to discriminate are given"
-        raise ConfigError(what, where="plan.discriminate", allowed="one of the two")
+        what, hint = "plan.identify and plan.discriminate are both given", "set one of them to null"
+        raise ConfigError(what, where="plan.discriminate", allowed="one of the two", hint=hint)
     if options.discriminate is not None:
         return (), _effects(problem, options.discriminate, sizes)
     wanted = problem.free if options.identify is None else options.identify
     if not wanted:
-        raise ConfigError("no parameter to identify is given", where="plan.identify", allowed=", ".join(problem.free))
+        what, hint = "plan.identify is empty", "list the parameters, or set parameters.NAME.free: true"
+        raise ConfigError(what, where="plan.identify", allowed=", ".join(problem.free) or "free parameters", hint=hint)
     for name in wanted:
         if name not in problem.system.parameters:
-            hint = nearest_name_hint(name, problem.system.parameters.names)
-            raise ConfigError(f"there is no parameter '{name}'", where="plan.identify", hint=hint)
+            said = unknown_name_error_arguments(name, problem.system.parameters.names)
+            raise ConfigError(f"there is no parameter '{name}'", where="plan.identify", **said)
         if name not in problem.free:
-            what = f"'{name}' is not free: a recording would say nothing of it"
+            what = f"'{name}' is not a free parameter"
             hint, allowed = f"set parameters.{name}.free: true", ", ".join(problem.free)
             raise ConfigError(what, where="plan.identify", allowed=allowed, hint=hint)
     return wanted, ()
@@ -145,17 +146,18 @@ def _effects(
 ) -> tuple[EffectBase, ...]:
     where = "plan.discriminate"
     if len(set(labels)) < 2:
-        what = f"{len(set(labels))} effect is to be separated from others" if labels else "no effect is to be separated"
-        raise ConfigError(what, where=where, allowed="two effects or more, kind@location each")
+        what, hint = f"plan.discriminate has {len(set(labels))} effects", "list the effects to tell apart"
+        raise ConfigError(what, where=where, allowed="two effects or more, each KIND@LOCATION", hint=hint)
     there = {f"{effect.kind}@{effect.location}" for effect in problem.system.effects}
     found = []
     for label in dict.fromkeys(labels):
         kind, _, place = label.partition("@")
         if not place:
-            allowed = f"kind@location, such as {label}@PLACE"
-            raise ConfigError(f"'{label}' says nothing of where the effect is", where=where, allowed=allowed)
+            hint = f"write {label}@LOCATION, with the name of a joint, frame or segment"
+            raise ConfigError(f"the effect '{label}' has no location", where=where, allowed="KIND@LOCATION", hint=hint)
         if label in there:
-            raise ConfigError(f"{label} is part of the model", where=where, hint="free its parameters instead")
+            what, allowed = f"the effect {label} is already part of the model", "effects that the model does not have"
+            raise ConfigError(what, where=where, allowed=allowed, hint="leave it out, and free its parameters instead")
         found.append(make_effect(kind, place, problem.system, sizes.get(label)))
     return tuple(found)
 
@@ -191,14 +193,16 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
     for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
         if not low <= 0.0 <= high:
             what = f"{name} begins {max(low, -high):.3g} beyond the limit of the joint"
-            hint = "give a plan.start_joint_positions within the limits"
-            raise ConfigError(what, where="plan.start_joint_positions", hint=hint)
+            allowed = "positions within the limits of the joints"
+            hint = "set plan.start_joint_positions within the limits"
+            raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
     broken = limits.worst_violated_row_by_limit(limits.limited_quantity_values(mover.simulate_path(still), still)[0])
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
-        said = "; ".join(f"{name}: {x:.4g} where {bound:.4g} is allowed, {what}" for what, name, x, bound in parts)
-        hint = "widen plan.limits where the machine allows it, or give another plan.start_joint_positions"
-        raise ConfigError(f"the arms pass their limits before they move: {said}", where="plan.limits", hint=hint)
+        said = "; ".join(f"{name}: {x:.4g}, limit {bound:.4g}, {what}" for what, name, x, bound in parts)
+        hint = "widen plan.limits if the robot allows it, or set another plan.start_joint_positions"
+        what, allowed = f"the arms exceed their limits before they move: {said}", "a start within all limits"
+        raise ConfigError(what, where="plan.limits", allowed=allowed, hint=hint)
 
 
 def _random(experiment: ParameterizedExperiment, seed: int) -> Array:
@@ -240,14 +244,15 @@ def _check_seen(
     lost = [name for name in chosen if name in unseen]
     if chosen and len(lost) == len(chosen):
         worst = max(unseen[name] for name in lost)
-        what = f"no motion informs {', '.join(lost)}: no sensor sees it to first order, a change by its whole value "
-        what += f"moves all readings together by {worst:.1g} standard deviations"
+        what = f"no motion gives information about {', '.join(lost)}: a change by its whole value changes all readings "
+        what += f"together by {worst:.1g} standard deviations"
         hint = "; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost)
-        raise ConfigError(what, where="plan.identify", allowed="a parameter that a sensor sees", hint=hint)
+        raise ConfigError(what, where="plan.identify", allowed="a parameter that changes readings", hint=hint)
     for effect in rivals:
         if all(name in unseen for name in effect.amplitude_names):
             what = f"{effect.label} is unobservable: its first-order sensitivity is zero in every sensor"
-            raise ConfigError(what, where="plan.discriminate", hint="add a sensor that sees it")
+            allowed, hint = "effects that change readings", "add a sensor whose readings it changes, or leave it out"
+            raise ConfigError(what, where="plan.discriminate", allowed=allowed, hint=hint)
 
 
 def _would_see(experiment: ParameterizedExperiment, name: str, w: Array) -> str:
@@ -285,8 +290,8 @@ def _plan(
     best = int(np.argmax([one.configured_criterion for one in judged]))
     chosen = judged[best]
     if not np.isfinite(chosen.configured_criterion):
-        hint = "lower plan.limits.max_acceleration"
-        raise SolverError("no motion that was found can be followed by its torques", where="plan", hint=hint)
+        what, hint = "no motion of the search can be simulated with its torques", "lower plan.limits.max_acceleration"
+        raise SolverError(what, where="plan", allowed="a motion whose torques reproduce it", hint=hint)
     w, message = chosen.w, "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
         way = "lower plan.limits, or give another plan.start_joint_positions"

@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
+from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
@@ -119,8 +119,8 @@ class FramePositionEvaluator:
     def __init__(self, system: System, names: Sequence[str]) -> None:
         for name in names:
             if not system.mechanism.has_frame(name):
-                hint = nearest_name_hint(name, system.point_frames)
-                raise ConfigError(f"there is no frame '{name}'", where="plan", hint=hint)
+                said = unknown_name_error_arguments(name, system.point_frames)
+                raise ConfigError(f"there is no frame '{name}'", where="plan", **said)
         self.names = tuple(names)
         with CASADI_LOCK:
             q, theta = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*(entry.symbol for entry in system.parameters))
@@ -320,19 +320,19 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
-            hint = nearest_name_hint(name, system.prescribed)
-            raise ConfigError(f"'{name}' is no joint that moves", where=where, hint=hint)
+            said = unknown_name_error_arguments(name, system.prescribed)
+            raise ConfigError(f"'{name}' is not a joint that moves", where=where, **said)
     missing = [name for name in system.prescribed if name not in posture]
     if missing:
-        what, allowed = f"the posture says nothing of {', '.join(missing)}", "every joint that moves"
-        hint = f"leave {where} out to begin where the arms first grasp the undeformed object"
+        what, allowed = f"the position of {', '.join(missing)} is missing", "every joint that moves"
+        hint = "add them, or set the whole key to null to begin where the arms grasp the undeformed object"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     chosen = np.array([float(posture[name]) for name in system.prescribed])
     for name, value, low, high in zip(system.prescribed, chosen, *_position_limits(system), strict=True):
         if not low - 1e-9 <= value <= high + 1e-9:
             over = low - value if value < low else value - high
             what = f"{name} starts at {value:.4g}, {over:.3g} beyond its limit"
-            raise ConfigError(what, where=where, allowed=f"{low:.4g} to {high:.4g}")
+            raise ConfigError(what, where=f"{where}.{name}", allowed=f"{low:.4g} to {high:.4g} rad or m")
     return chosen
 
 
@@ -343,7 +343,7 @@ def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, gues
     rest = EquilibriumSolver(step).solve(configuration, theta, guess=guess)
     if not rest.is_converged:
         allowed, where = "joint positions at which every grasp holds the object at rest", "plan.start_joint_positions"
-        hint = f"give {where} or a recording, which begins where the object is held; or correct model.grasp"
+        hint = f"set {where}, or add a recording that begins with the grasped object; or correct model.grasp"
         raise ModelError(f"the motion cannot begin: {rest.message}", where=where, allowed=allowed, hint=hint)
     return rest
 
@@ -360,8 +360,8 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
     for i, which, unit, value, limit in rows:
         if not abs(value) <= limit * (1 + 1e-9):
             over = f"{value:.4g} {unit}, {abs(value) - limit:.3g} beyond its limit"
-            what, where = f"{joints[i].name} at rest {when} takes {over}", f"plan.limits.{which}"
-            hint = f"raise {where} where the machine allows it, or take another posture or place"
+            what, where = f"{joints[i].name} at rest {when} needs {over}", f"plan.limits.{which}"
+            hint = f"raise {where} if the robot allows it, or choose another posture or target"
             raise ConfigError(what, where=where, allowed=f"up to {limit:.4g} {unit}", hint=hint)
 
 
@@ -379,8 +379,8 @@ def solve_equilibrium_at_point_target(
         return where[0, :3], by_q[0, :3] @ rest.state_by_known_coordinates[:n]
 
     if np.abs(point_and_slope(start)[1]).max(initial=0.0) < _MIN_POINT_MOBILITY:
-        what, allowed = f"no arm moves '{point.names[0]}'", "a point of what an arm holds or carries"
-        raise ConfigError(what, where="plan.point", allowed=allowed, hint="set model.grasp, or name another point")
+        what, allowed = f"no arm moves '{point.names[0]}'", "a frame of a moving link or of a grasped object"
+        raise ConfigError(what, where="plan.point", allowed=allowed, hint="set model.grasp, or choose another point")
     guess = [start.state[:n]]
 
     @memoize_last_call
@@ -407,8 +407,8 @@ def solve_equilibrium_at_point_target(
         limits = f", with {names} at the joint's limit" if names else ""
         what = f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
         where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)"
-        hint = "take a nearer place, a smaller plan.target_offset_from_start, or other plan.start_joint_positions"
-        raise ConfigError(what, where=where, allowed="a place at which the point can rest", hint=hint)
+        hint = "choose a nearer target, a smaller plan.target_offset_from_start, or other plan.start_joint_positions"
+        raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, copy_of_step_with_time_step
 from yid_ocp.model.system import System
 from yid_ocp.options import check_option_bounds
@@ -72,13 +72,12 @@ def plan_motion_to_target(
 
     `theta` defaults to the parameter values of the system; `known` is the covariance of uncertain parameters. If no
     motion keeps the limits, the result is still a plan, and its `message` names the violated limit and the excess.
-    Raises `ConfigError` or `ModelError` if the goal is out of reach, a name does not exist, or there is no
-    equilibrium."""
+    Raises `ConfigError` or `ModelError` if the goal is out of reach, or a name or an equilibrium does not exist."""
     check_option_bounds(options, "plan")
     system = step.system
     if system.driven or not system.prescribed:
-        allowed, hint = "a robot whose arms move", "set model.robot and model.arms"
-        raise ConfigError("no joint is prescribed", where="plan", allowed=allowed, hint=hint)
+        what, hint = "the model has no prescribed joint", "set model.robot, and model.arms.mode: prescribed"
+        raise ConfigError(what, where="plan", allowed="a robot whose arms are prescribed", hint=hint)
     known = ParameterCovariance() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
     progress.begin_stage("finding where the motion begins and ends")
@@ -111,9 +110,9 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     if options.start_joint_positions is not None:
         return start_joint_positions_as_array(system, options.start_joint_positions)
     if not system.grasps:
-        what, where = "nothing says where the motion begins", "plan.start_joint_positions"
-        hint = "only where a gripper holds the object do the angles follow from that"
-        raise ConfigError(what, where=where, allowed="every joint that moves", hint=hint)
+        what, where = "the start of the motion is not given", "plan.start_joint_positions"
+        hint = "set it, or model.grasp: the positions then follow from the grasp"
+        raise ConfigError(what, where=where, allowed="the position of every joint that moves", hint=hint)
     by_name = dict(zip(system.parameters.names, map(float, theta), strict=True))
     angles = grasping_joint_angles(system, by_name)
     return start_joint_positions_as_array(system, {name: angles[name] for name in angles if name in system.prescribed})
@@ -121,8 +120,8 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
 
 def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
     if options.point is None:
-        hint = nearest_name_hint("", system.point_frames)
-        raise ConfigError("no point is named", where="plan.point", allowed="a frame of the model", hint=hint)
+        allowed, hint = unknown_name_error_arguments("", system.point_frames)["allowed"], "set plan.point"
+        raise ConfigError("plan.point is missing", where="plan.point", allowed=allowed, hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
     inside = FramePositionEvaluator(system, boxed) if options.goal == "box" else None
@@ -131,14 +130,15 @@ def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluato
 
 def _place(options: PlanOptions, begin: Array) -> Array:
     if (options.target_position is None) == (options.target_offset_from_start is None):
-        said, hint = "nothing says", "set plan.target_position, or plan.target_offset_from_start from where it rests"
+        what, hint = "the target of the point is not given", "set one of the two"
         if options.target_position is not None:
-            said, hint = "it is said twice", "set the other one to null"
-        allowed, where = "one of place and shift", "plan.target_position"
-        raise ConfigError(f"{said} where the point is to arrive", where=where, allowed=allowed, hint=hint)
+            what, hint = "the target of the point is given twice", "set one of the two to null"
+        allowed, where = "either plan.target_position or plan.target_offset_from_start", "plan.target_position"
+        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if options.goal == "path" and not options.waypoint_offsets_from_start:
         what, where = "the path has no waypoints", "plan.waypoint_offsets_from_start"
-        raise ConfigError(what, where=where, allowed="one or more offsets from the start [m]")
+        hint = "list waypoints, such as [[0, 0, 0.1]]"
+        raise ConfigError(what, where=where, allowed="one or more offsets from the start [m]", hint=hint)
     if options.target_position is not None:
         return np.array(options.target_position, float)
     return begin + np.array(options.target_offset_from_start, float)
@@ -147,12 +147,13 @@ def _place(options: PlanOptions, begin: Array) -> Array:
 def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, place: Array) -> None:
     """Raise `ConfigError` if frames start outside the box, at `places` (frames, 3) [m], or if the target is outside."""
     if options.box is None:
-        raise ConfigError("there is no box", where="plan.box", allowed="two corners [m]", hint="goal: place needs none")
+        what, hint = "plan.goal: box needs plan.box", "set plan.box, or plan.goal: place"
+        raise ConfigError(what, where="plan.box", allowed="the lowest and the highest corner [m]", hint=hint)
     low, high = np.array(options.box)
     if np.any(low >= high):
         worst = int(np.argmin(high - low))
         what = f"the box is empty along {'xyz'[worst]}: it goes from {low[worst]:.4g} up to {high[worst]:.4g} m"
-        raise ConfigError(what, where="plan.box", allowed="lowest corner first")
+        raise ConfigError(what, where="plan.box", allowed="the lowest corner first", hint="exchange the two numbers")
     places = [(name, x, "starts") for name, x in zip(inside.names, at, strict=True)]
     if options.point in inside.names:
         places.append((str(options.point), place, "is to arrive"))
@@ -161,8 +162,9 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
         if np.any(over > 0):
             row = int(np.argmax(over))
             what = f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}"
-            allowed = f"{low[row]:.4g} to {high[row]:.4g} m, it is at {where[row]:.4g} m"
-            hint = "enlarge the box, or name the frames to keep in it under plan.frames_in_box"
+            what += f", at {where[row]:.4g} m"
+            allowed = f"{low[row]:.4g} to {high[row]:.4g} m"
+            hint = "enlarge the box, or list the frames to keep in it under plan.frames_in_box"
             raise ConfigError(what, where="plan.box", allowed=allowed, hint=hint)
 
 
@@ -207,7 +209,7 @@ def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) 
     """The same motion with parameters off by one std, along the axes that move the point's equilibrium most."""
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
-        what, where = "the parameters' uncertainty is not known", "plan.minimize_parameter_sensitivity"
+        what, where = "the uncertainty of the parameters is not known", "plan.minimize_parameter_sensitivity"
         raise ConfigError(what, where=where, allowed="plan.parameter_run: FOLDER of `solve`")
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -109,8 +109,7 @@ class PlanResidualAndLimitFunctions:
     def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
         """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
-        Also returns their Jacobian (rows, K nc) with respect to the coefficients, or None if `rollout` has no
-        sensitivities."""
+        Also returns their Jacobian (rows, K nc) with respect to the coefficients, None if `rollout` has none."""
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
@@ -223,7 +222,7 @@ class TargetMotionSearch:
         """Optimise the spline coefficients of a motion. `start`, `lower` and `upper` have shape (K, nc).
 
         An augmented Lagrangian keeps the limits (Rockafellar 1973, doi:10.1007/BF01580138). An interior trust-region
-        method keeps the bounds (Branch, Coleman and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations`
+        method keeps the bounds (Branch, Coleman, Li 1999, doi:10.1137/S1064827595289108), with `iterations`
         evaluations."""
         low, high = lower.ravel(), upper.ravel()
         x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)

@@ -18,7 +18,7 @@ from scipy.interpolate import BSpline
 from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.errors import ConfigError, DataError, SolverError
+from yid_ocp.errors import ConfigError, failed_rollout_error
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
@@ -60,16 +60,13 @@ class ParameterizedExperiment:
     ) -> ParameterizedExperiment:
         """Make a planned experiment from a plan's options, at parameter `values` and with the free parameters `names`.
 
-        Raises `ConfigError` if no joint moves or clamps follow measured points, `ModelError` if there is no
-        equilibrium."""
+        Raises `ConfigError` if no joint moves or clamps follow points, `ModelError` without equilibrium."""
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_definitions_from_points or not (system.driven or system.prescribed):
-            said, allowed = "no joint moves whose motion could be planned", "a robot whose arms move"
-            if problem.options.clamp_pose_definitions_from_points:
-                said = "the ends of a cable follow measured points: there is no joint whose motion could be planned"
+            said, allowed = "the model has no joint whose motion could be planned", "a robot whose arms move"
             raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
-            what = "motions are not planned for arms of servos, whose commands are not their motion"
+            what = "motions cannot be planned for servos, whose commands differ from their motion"
             hint = "set model.arms.mode: prescribed for the plan"
             raise ConfigError(what, where="model.arms.mode", allowed="driven, prescribed", hint=hint)
         moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
@@ -89,7 +86,7 @@ class ParameterizedExperiment:
         mover, base = self.simulator, self.configured_problem.episodes[0]
         rollout, system = mover.simulate_path(w), mover.step.system
         if not rollout.status.is_converged:
-            raise DataError(f"the motion cannot be carried out: {rollout.status.message}", where="plan")
+            raise failed_rollout_error(rollout.status.message, "planned motion")
         joints, duration = base.recording.joints, float(mover.node_times[-1])
         assert joints is not None
         period = float(np.median(np.diff(joints.t)))
@@ -186,7 +183,7 @@ class ParameterizedExperiment:
         problem = problem_whitened_at(problem, problem.initial_unknowns)
         evaluation = problem.evaluate(problem.initial_unknowns)
         if not evaluation.ok:
-            raise SolverError(f"the motion cannot be followed by its torques: {evaluation.message}")
+            raise failed_rollout_error(evaluation.message, "planned motion, with its torques")
         return self._relative(problem, evaluation)
 
     def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
@@ -287,7 +284,7 @@ class ParameterizedExperiment:
                 moved[:, i % nc] += _PATH_DIFFERENCE_STEP * waves[:, i // nc]
             _, evaluation = self._evaluated(moved, False)
             if not evaluation.ok:
-                raise DataError(f"the motion cannot be carried out: {evaluation.message}", where="plan")
+                raise failed_rollout_error(evaluation.message, "planned motion")
             return evaluation.residual[problem.residual_rows.data]
 
         still = residual(-1)
@@ -320,9 +317,11 @@ def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:
-        what = f"{duration:g} s are too short to measure efforts that are smoothed at {low_pass.cutoff:g} Hz"
-        allowed = f"more than {least:.2g} s together with plan.hold_duration"
-        hint = "take a longer plan.duration, or raise problem.path_cutoff"
+        what = (
+            f"a motion of {duration:g} s is too short for efforts that are low-pass filtered at {low_pass.cutoff:g} Hz"
+        )
+        allowed = f"plan.duration + plan.hold_duration above {least:.2g} s"
+        hint = "set a longer plan.duration, or raise problem.path_cutoff"
         raise ConfigError(what, where="plan.duration", allowed=allowed, hint=hint)
 
 

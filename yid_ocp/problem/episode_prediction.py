@@ -114,8 +114,7 @@ class EpisodePredictor:
         """Initial state of an episode's rollout, with derivatives with respect to the parameters `wanted` and `offset`.
 
         `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `guess`
-        (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else that of least
-        energy)."""
+        (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy)."""
         nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0
@@ -391,8 +390,7 @@ class EpisodePredictor:
                 total += by_load @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
         if read.by_lam.shape[2]:
             if along.by_multipliers is None:
-                what = f"'{samples.sensor.group_name}' depends on constraint forces, which node states do not carry"
-                raise SolverError(what, hint="use gauss_newton")
+                raise node_state_sensor_error(samples.sensor.group_name)
             last = np.minimum(nodes, len(along.by_multipliers) - 1)
             total += read.by_lam @ along.by_multipliers[last] / self.integrator_step.time_step
         total[:, :, : len(wanted)] += read.by_theta
@@ -403,8 +401,7 @@ class EpisodePredictor:
     ) -> Array:
         """Gradient of a cost of one episode's predictions, with respect to its (shared, local, initial state) unknowns.
 
-        `result` is the prediction at these unknowns. `pulls` (M, k) are the derivatives of the cost by each
-        prediction."""
+        `result` is their prediction. `pulls` (M, k) are the derivatives of the cost by each prediction."""
         wanted, rollout = self.unknowns.free_parameters, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
         pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}
@@ -557,3 +554,11 @@ def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epis
         cutoff = predictor.options.path_cutoff
         load[:, at] = denoised_gear_loads(load[:, at], own[:, column], samples.node, episode.grid.node_times, cutoff)
     return replace(episode, joint_loads=load)
+
+
+def node_state_sensor_error(group: str) -> SolverError:
+    """Make the `SolverError` for a sensor whose readings do not follow from the states at nodes."""
+    what = f"multiple shooting cannot use '{group}', which measures velocities, accelerations or constraint forces"
+    hint = f"set solver.name: gauss_newton, or sensors.{group}.use: false"
+    allowed = "sensors whose readings follow from the states at nodes"
+    return SolverError(what, where=f"sensors.{group}", allowed=allowed, hint=hint)

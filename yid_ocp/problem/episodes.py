@@ -228,7 +228,10 @@ def prepare_episode(
     )
     grid = recording_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
-        raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
+        what = "the arms of the model are driven, but the recording has no joints"
+        where = f"recording '{recording.name}'"
+        hint = "import the joints too, or set model.arms.mode: prescribed"
+        raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
     low_pass = LowPassFilter(options.path_cutoff)
     path = prescribed_coordinates_at_nodes(
         recording, system, grid, low_pass, options.clamp_pose_definitions_from_points
@@ -342,6 +345,8 @@ def _samples(
     found.sort(key=lambda data: bool(data.sensor.effort_joints))
     samples = tuple(measurements_located_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
-        what = "the recording has no measurement of the model"
-        raise DataError(what, where=recording.name, hint="check `sensors` and the names of the recorded points")
+        what, where = "no sensor of the model has a measurement in the recording", f"recording '{recording.name}'"
+        allowed = "points on frames of the model, or channels of its joints"
+        hint = "check `sensors` and the names of the recorded points"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples

@@ -89,8 +89,7 @@ class EstimationProblem(ReprMixin):
     ConfigError
         A parameter is unknown, listed twice, or outside its bounds.
     DataError
-        A recording lacks joints, points or a noise level, or is too short.
-    """
+        A recording lacks joints, points or a noise level, or is too short."""
 
     def __init__(
         self,
@@ -105,7 +104,8 @@ class EstimationProblem(ReprMixin):
         options = options or ProblemOptions()
         check_free_parameters(step.system, free, options)
         if not recordings:
-            raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
+            what, hint = "there is no recording to estimate on", "add one under recordings.estimate"
+            raise DataError(what, where="recordings.estimate", allowed="one recording or more", hint=hint)
         theta = step.system.parameters.vector(values)
         names = (*free, *(name for name in may_free if name not in free))
         functions = ModelFunctions(step, names, options.initial_state_fit_parameters)
@@ -272,8 +272,7 @@ class EstimationProblem(ReprMixin):
     ) -> tuple[float, Array, Evaluation]:
         """Compute cost, gradient and evaluation. With process noise, the gradient uses sensitivities, else the adjoint.
 
-        A known `evaluation` at `x` saves the rollout, which is most of the work. The returned evaluation has no
-        Jacobian."""
+        A known `evaluation` at `x` saves the rollout. The returned evaluation has no Jacobian."""
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
         weighted |= any(episode.has_uncertain_sensor_biases for episode in self.episodes)
@@ -365,8 +364,7 @@ class EstimationProblem(ReprMixin):
         Raises
         ------
         ConfigError, SolverError
-            A parameter does not exist; the rollout fails.
-        """
+            A parameter does not exist; the rollout fails."""
         theta = self.with_parameter_values(values or {}).theta
         return synthesize_recording(self.predictor, self.episodes[recording], theta, seed)
 

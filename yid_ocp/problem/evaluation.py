@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import EffectBase
-from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.measurements import (
@@ -273,14 +273,14 @@ def check_free_parameters(system: System, free: Sequence[str], options: ProblemO
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)
     if len(set(free)) != len(free):
-        raise ConfigError("a free parameter is listed twice", where=", ".join(free))
+        twice = next(name for name in free if list(free).count(name) > 1)
+        what, hint = f"the free parameter '{twice}' is listed twice", "delete one of the two"
+        raise ConfigError(what, where="free parameters", allowed="every name once", hint=hint)
     for name in (*options.local_parameters, *options.prior_stds):
         if name not in free:
-            raise ConfigError(
-                f"the parameter '{name}' has a prior or is local, but is not free",
-                hint=nearest_name_hint(name, free),
-                where="local or priors",
-            )
+            what = f"the parameter '{name}' has a prior or differs per recording, but is not free"
+            where = f"parameters.{name}"
+            raise ConfigError(what, where=where, **unknown_name_error_arguments(name, free, "set its `free: true`"))
 
 
 def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:
@@ -289,8 +289,8 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
         entry, value = system.parameters[name], theta[system.parameters.index(name)]
         replace(entry, value=float(value))  # it checks its bounds
         if not entry.lower < entry.upper:
-            what, hint = f"the bounds of {name} leave no room", "fix the parameter instead of closing its bounds"
-            raise ConfigError(what, where=f"parameters.{name}", allowed="lower below upper", hint=hint)
+            what, hint = f"the bounds of {name} are equal: {entry.lower:g}", f"set parameters.{name}.free: false"
+            raise ConfigError(what, where=f"parameters.{name}.bounds", allowed="lower below upper", hint=hint)
 
 
 def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:

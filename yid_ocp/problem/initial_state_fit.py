@@ -126,8 +126,10 @@ class InitialStateFitter:
                     if near <= last and np.any(group.weight[row] > 0):
                         frames.setdefault(near, []).append((group, row))
         if not frames:
-            what = f"no point is seen in the first {window:g} s, so the start state cannot be fitted"
-            raise DataError(what, hint="widen problem.initial_state_fit_window, or start from equilibrium")
+            what = f"no point is seen in the first {window:g} s, so the initial state cannot be fitted"
+            where, allowed = "problem.initial_state_fit_window", "a window in which a point is seen [s]"
+            hint = "widen the window, or set problem.initial_state: equilibrium"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
         nodes = sorted(frames)
         first, then = nodes[0], nodes[-1]
         index = [system.parameters.index(name) for name in self.fitted_parameters]
@@ -167,8 +169,7 @@ class InitialStateFitter:
         return PrecomputedInitialState(state, own)
 
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
-        """Angle of each joint with a preset, and the torque that its spring holds there if the object is at
-        equilibrium.
+        """Angle of each joint with a preset, and the torque of its spring there if the object is in equilibrium.
 
         The clamps' unknown reactions f have least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa."""
         if not self._presets:

@@ -47,19 +47,20 @@ class TimeGrid:
 def recording_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
     """Make a time grid over the span of the joint samples, or of the first point group without joints.
 
-    Raises `DataError` if it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its
-    length."""
+    Raises `DataError` if it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples."""
     t = recording.all_groups[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
     if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):
-        what = f"{span:.3g} s of data, {len(t)} samples, are {steps:.3g} time steps of {time_step:g} s"
-        allowed = f"at most {_MAX_STEPS}, and {_MAX_STEPS_PER_SAMPLE} from one sample to the next"
+        what = f"{span:.3g} s of data with {len(t)} samples are {steps:.3g} time steps of {time_step:g} s"
+        allowed = f"at most {_MAX_STEPS} time steps, and {_MAX_STEPS_PER_SAMPLE} per sample"
         hint = "check that times are in seconds and the clock does not jump, or cut the recording"
-        raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
+        raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if steps < 2:
-        what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"
-        raise DataError(what, where=recording.name, hint="record longer, or choose a smaller time step")
+        what = f"{span:.3g} s of data are shorter than two time steps"
+        hint = "record longer, or set a smaller time step"
+        allowed = f"at least {2 * time_step:g} s of data"
+        raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     return TimeGrid(float(t[0]), time_step, steps)
 
 
@@ -187,8 +188,7 @@ class SensorMeasurements:
     def prediction_change_per_step(self, at_nodes: Array, unmoved: SensorMeasurements, steps: Array) -> Array:
         """Change of a prediction per step at delayed samples, (M, k). At a node it is the mean of adjacent steps.
 
-        `at_nodes` (len(nodes), k) is the prediction. `unmoved` are the measurements before the delay of `steps`
-        (k,)."""
+        `at_nodes` (len(nodes), k) is the prediction. `unmoved` are measurements before the delay of `steps` (k,)."""
         nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short part may hold no sample of a slow sensor
             return np.zeros((0, at_nodes.shape[1]))
@@ -233,8 +233,8 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
     """Locate a sensor's samples between rollout nodes. Raises `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
-        what, allowed = "a noise level is zero or missing", "a positive standard deviation"
-        place, hint = f"{where}: {data.sensor.group_name}", "set it under `sensors`"
+        what, allowed = "a noise level is zero or missing", "a standard deviation above 0"
+        place, hint = f"recording '{where}': {data.sensor.group_name}", f"set sensors.{data.sensor.group_name}.std"
         raise DataError(what, where=place, allowed=allowed, hint=hint)
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
     node, fraction = grid.node_and_fraction(data.t)

@@ -91,8 +91,7 @@ class ProblemOptions:
     divided_links_model : DividedLinksModel, optional
         Required for `links`.
     cable_topology : CableTopology, optional
-        Topology of a cable held by clamps, for its baselines.
-    """
+        Topology of a cable held by clamps, for its baselines."""
 
     initial_state: Annotated[
         _InitialStateKind,

@@ -11,7 +11,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin
-from yid_ocp.errors import DataError, SolverError, nearest_name_hint
+from yid_ocp.errors import DataError, failed_rollout_error, unknown_name_error_arguments
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -32,10 +32,12 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
     for group in recording.points:
         if set(points) <= set(group.names):
             return group
-    what, hint = "the points stand in several groups", "put points of one object in one group"
+    what, where = "the points are in several groups", f"recording '{recording.name}'"
+    said = {"allowed": "points of one group", "hint": "put the points of one object in one group"}
     if missing := [point for point in points if point not in recording.point_names]:
-        what, hint = f"point '{missing[0]}' is not recorded", nearest_name_hint(missing[0], recording.point_names)
-    raise DataError(what, where=recording.name, hint=hint)
+        what = f"point '{missing[0]}' is not recorded"
+        said = unknown_name_error_arguments(missing[0], recording.point_names)
+    raise DataError(what, where=where, **said)
 
 
 def constant_position_baseline(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
@@ -80,7 +82,8 @@ def interpolated_displacement_position_baseline(
     def weights(point: str) -> Array:
         carrier = leaves.get(point, point)
         if carrier not in place:
-            raise DataError(f"point '{point}' belongs to no branch", hint=nearest_name_hint(point, [*place, *leaves]))
+            said = unknown_name_error_arguments(point, [*place, *leaves])
+            raise DataError(f"point '{point}' belongs to no branch", where="branches of the object", **said)
         return np.array([np.interp(place[carrier], positions, row) for row in np.eye(len(knots))])
 
     share = np.array([weights(point) for point in points])
@@ -90,10 +93,10 @@ def interpolated_displacement_position_baseline(
 def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
     """Root mean square of the Euclidean error over points and frames [m]. NaN if there is nothing to compare.
 
-    Shapes are (M, np, 3); different shapes raise `DataError`. The first `given` frames and missing points do not
-    count."""
+    Shapes are (M, np, 3), or `DataError` is raised. The first `given` frames and missing points do not count."""
     if predicted.shape != measured.shape:
-        raise DataError(f"prediction {predicted.shape} and measurement {measured.shape} differ in shape")
+        what = f"the prediction has the shape {predicted.shape}, the measurement {measured.shape}"
+        raise DataError(what, where="predicted", allowed="equal shapes (M, np, 3)", hint="predict the measured frames")
     square = np.sum((predicted - measured)[given:] ** 2, axis=2)
     seen = np.isfinite(measured[given:]).all(axis=2)
     return float(np.sqrt(np.mean(square[seen]))) if np.any(seen) else float("nan")
@@ -108,10 +111,16 @@ def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Arr
 def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Array:
     at = recorded_point_positions(recording, points)
     if not 1 <= given < len(at):
-        raise DataError(f"given = {given} frames", where=recording.name, allowed=f"1 to {len(at) - 1}")
+        raise DataError(
+            f"given = {given} frames of the recording",
+            where=f"recording '{recording.name}'",
+            allowed=f"1 to {len(at) - 1}",
+        )
     if not np.all(np.isfinite(at[given - 1])):
         hidden = points[int(np.argmin(np.isfinite(at[given - 1]).all(axis=1)))]
-        raise DataError(f"point '{hidden}' is not seen in the last given frame", where=recording.name)
+        what, allowed = f"point '{hidden}' is not seen in the last given frame, {given - 1}", "a frame with all points"
+        hint = "choose another count of given frames, or leave the point out"
+        raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     return np.asarray(at[given - 1])
 
 
@@ -239,7 +248,7 @@ def synthesize_recording(
     )
     found = predictor.predict_episode(fresh, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
     if isinstance(found, str):
-        raise SolverError(f"the model cannot be rolled out: {found}", where=episode.name, hint="take other values")
+        raise failed_rollout_error(found, f"recording '{episode.name}'")
     return recording_from_prediction(predictor, fresh, found, theta, seed)
 
 

@@ -11,7 +11,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
-from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR_PARAMETER, PositionServo
 from yid_ocp.model.system import System
@@ -84,8 +84,7 @@ def _motor_off_steps(
 def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
     """Firmware gains stated in recordings, as `JOINT.servo_gain_factor` values by recording name.
 
-    Raises `DataError` if only some of the recordings with motors on state gains, because gains could not be
-    compared."""
+    Raises `DataError` if only some of the recordings with motors on state gains."""
     wanted = {name: f"{name}.{SERVO_GAIN_FACTOR_PARAMETER}" for name in system.servos}
     wanted = {name: parameter for name, parameter in wanted.items() if parameter in system.parameters}
     found: dict[str, dict[str, float]] = {}
@@ -101,9 +100,12 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
         columns = {name: joints.names.index(name) for name in wanted if name in joints.names}
         found[recording.name] = {wanted[name]: float(gains[column]) for name, column in columns.items()}
     if found and silent:
-        what = "the recording does not state the proportional gain of its servos, and others do"
-        hint = 'state it in all of them, or set parameters: {"*.servo_gain_factor": {initial: GAIN}}'
-        raise DataError(what, where=f"{silent[0]}: joints, attribute proportional_gain", hint=hint)
+        what = "the recording has no proportional gain of its servos, but others have it"
+        hint = 'write it in all recordings, or set parameters: {"*.servo_gain_factor": {initial: GAIN}}'
+        allowed = "the gain in all recordings, or in none"
+        raise DataError(
+            what, allowed=allowed, where=f"recording '{silent[0]}': joints, attribute proportional_gain", hint=hint
+        )
     return found
 
 
@@ -118,21 +120,18 @@ def _courses(
         if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):
             return [_held(np.zeros(len(t)), edges)] * len(driven)  # motors are off
         if joints.position_command is None:
-            what = "the recording has no commanded positions, which the arms' servos follow"
-            allowed = "the commanded position of every joint beside the measured one"
-            hint = (
-                "import them (the action of a LeRobot dataset, --command-topic of a bag), "
-                "or prescribe the arms' motion instead (model.arms.mode: prescribed); "
-                "with motors off an effort that is zero throughout says so"
-            )
-            raise DataError(what, where=f"{where}: joints/position_command", allowed=allowed, hint=hint)
+            what = "the servos of the model follow commanded positions, but the recording has none"
+            allowed = "the commanded position of every joint; or efforts of zero throughout if the motors are off"
+            hint = "import the commands (action of a LeRobot dataset, --command-topic of a bag), "
+            hint += "or set model.arms.mode: prescribed"
+            raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
         rows = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)].T
         held = [servos[name].command_interpolation == "held" for name in driven]
         return [_held(row, edges) if jumps else _straight(row, t) for row, jumps in zip(rows, held, strict=True)]
     if joints.effort is None:
-        what = "the recording has no joint effort, which drives the model"
-        hint = "prescribe the arms' motion instead (model.arms.mode: prescribed)"
-        raise DataError(what, where=f"{where}: joints/effort", hint=hint)
+        what, allowed = "joint efforts drive the model, but the recording has none", "the effort of every driven joint"
+        hint = "import the efforts, or set model.arms.mode: prescribed"
+        raise DataError(what, where=f"recording '{where}': joints/effort", allowed=allowed, hint=hint)
     effort = joints.effort[:, recorded_joint_column_indices(joints, driven, where)]
     if joints.effort_sampling_kind_or_default == "sample":
         return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
@@ -186,9 +185,9 @@ def smoothed_joint_efforts(
     """Low-pass filtered joint efforts (steps + 1, len(names)) [N m] at every node. `DataError` without efforts."""
     joints = recording.joints
     if joints is None or joints.effort is None:
-        what = "the model's gears give way under an effort that the recording does not have"
-        hint = "leave series_elasticity and backlash out"
-        raise DataError(what, where=f"{recording.name}: joints/effort", hint=hint)
+        what = "the elastic gears of the model need joint efforts, but the recording has none"
+        where, allowed = f"recording '{recording.name}': joints/effort", "the effort of every joint"
+        raise DataError(what, where=where, allowed=allowed, hint="leave series_elasticity and backlash out")
     effort = low_pass(joints.t, joints.effort[:, recorded_joint_column_indices(joints, names, recording.name)])
     return np.stack([np.interp(grid.node_times, joints.t, column) for column in effort.T], axis=1)
 
@@ -255,9 +254,9 @@ def prescribed_coordinates_at_nodes(
     remaining = tuple(name for name in system.prescribed if name not in course)
     if remaining:
         if recording.joints is None:
-            what = f"joint '{remaining[0]}' is prescribed but the recording has no joints"
-            allowed, hint = "a recording with the group `joints`", "record the joints too, or give another recording"
-            raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
+            what = f"joint '{remaining[0]}' is prescribed, but the recording has no joints"
+            allowed, hint = "a recording with the group `joints`", "import the joints too, or give another recording"
+            raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
         joints = recording.joints
         sampled = smoothed_joint_angles_at_nodes(joints, remaining, grid, recording.name, low_pass)
         course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
@@ -271,9 +270,9 @@ def _clamp_course(
     direction = _smoothed_point_path(recording, clamp.z_axis_point_name, grid, low_pass) - origin
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if np.any(length < 1e-6):
-        raise DataError(
-            f"points '{clamp.origin_point_name}' and '{clamp.z_axis_point_name}' coincide", where=recording.name
-        )
+        what = f"points '{clamp.origin_point_name}' and '{clamp.z_axis_point_name}' coincide"
+        allowed, hint = "two points at least 1e-6 m apart", "choose two other points for the pose of the clamp"
+        raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     d = direction / length
     about_y = np.arcsin(np.clip(d[:, 0], -1, 1))
     about_x = np.unwrap(np.arctan2(-d[:, 1], d[:, 2]))
@@ -293,8 +292,8 @@ def _smoothed_point_path(recording: Recording, point: str, grid: TimeGrid, low_p
             seen = group.position[:, group.names.index(point)]
             good = np.all(np.isfinite(seen), axis=1)
             if good.sum() < 4:
-                what = f"point '{point}' is seen {good.sum()} times"
-                raise DataError(what, where=recording.name, allowed="4 or more")
+                what, hint = f"point '{point}' is seen in {good.sum()} frames", "choose a point that is seen more often"
+                raise DataError(what, where=f"recording '{recording.name}'", allowed="4 frames or more", hint=hint)
             return _smoothed_at_nodes(group.t[good], seen[good], grid, low_pass)
-    hint = nearest_name_hint(point, recording.point_names)
-    raise DataError(f"point '{point}' is not recorded", where=recording.name, hint=hint)
+    said = unknown_name_error_arguments(point, recording.point_names)
+    raise DataError(f"point '{point}' is not recorded", where=f"recording '{recording.name}'", **said)

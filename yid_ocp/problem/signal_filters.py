@@ -90,7 +90,7 @@ class LowPassFilter:
         least = _MIN_CUTOFF_FRACTION * nyquist
         if not least < self.cutoff < nyquist:
             allowed = f"above {least:.2g} and below {nyquist:g} Hz for this recording"
-            raise DataError(f"path_cutoff = {self.cutoff:g} Hz", allowed=allowed)
+            raise DataError(f"path_cutoff = {self.cutoff:g} Hz", where="problem.path_cutoff", allowed=allowed)
         warped = math.tan(math.pi / 2 * self.cutoff / nyquist)
         damping = 2 * warped * np.sin(np.pi / (2 * _FILTER_ORDER) * np.arange(1, _FILTER_ORDER, 2))
         scale = 1 + damping + warped**2

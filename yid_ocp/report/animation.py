@@ -102,8 +102,7 @@ def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dic
 def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[list[int]]]:
     """Vertices and faces of a robot's thinned meshes by the joint that carries them, "" for what does not move.
 
-    Reading and thinning takes a second: the user's cache keeps them for the same files, mounted in the same way.
-    """
+    Reading and thinning takes a second: the user's cache keeps them for the same files, mounted in the same way."""
     with contextlib.suppress(OSError, YidError, SyntaxError):  # the last of a damaged URDF
         if robot is None or "<visual" not in read_input_text(resolve_urdf_path(robot)):
             return {}

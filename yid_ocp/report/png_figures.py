@@ -92,7 +92,8 @@ def _save(figure: Figure, path: Path, dpi: int = 120) -> None:
     try:
         figure.savefig(path, dpi=dpi, format="png")
     except OSError as error:
-        raise OutputError(f"the picture cannot be written: {error.strerror}", where=str(path)) from error
+        what, hint = f"the picture cannot be written: {error.strerror}", "choose another folder, or free disk space"
+        raise OutputError(what, where=str(path), hint=hint) from error
 
 
 _STRUCTURAL_COLOR, _NONZERO_COLOR, _BLOCK_EDGE_COLOR = "#a9cfe0", LINE_COLORS[0], LINE_COLORS[1]

@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState, System
@@ -180,12 +180,19 @@ class _RecordingData(Protocol):
     def channel_groups(self) -> Sequence[RecordedChannelGroup]: ...
 
 
+def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> DataError:
+    """Make the error for a channel whose standard deviation is neither recorded nor in the settings."""
+    what, hint = f"the noise level of {noun} is neither recorded nor given", f"set sensors.{key}.std"
+    return DataError(what, where=where, allowed=f"a standard deviation above 0 [{unit}]", hint=hint)
+
+
 def recorded_joint_column_indices(joints: RecordedJointGroup, names: tuple[str, ...], where: str) -> list[int]:
     """Column indices of the named joints in the recorded arrays. Raises `DataError` if one is not recorded."""
     for name in names:
         if name not in joints.names:
-            what, hint = f"joint '{name}' of the model is not recorded", nearest_name_hint(name, joints.names)
-            raise DataError(what, where=f"{where}: joints", hint=hint)
+            what = f"joint '{name}' of the model is not recorded"
+            said = unknown_name_error_arguments(name, joints.names)
+            raise DataError(what, where=f"recording '{where}': joints", **said)
     return [joints.names.index(name) for name in names]
 
 
@@ -196,7 +203,8 @@ def expand_to_joint_values(
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
-                raise ConfigError(f"joint '{name}' has no value", where=key, hint=nearest_name_hint(name, given))
+                allowed, hint = f"a value for each of {', '.join(names)}", f"add '{name}'"
+                raise ConfigError(f"joint '{name}' has no value", where=key, allowed=allowed, hint=hint)
         return np.array([float(given[name]) for name in names])
     wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
     return wide[[list(recorded).index(name) for name in names]]

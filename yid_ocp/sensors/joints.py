@@ -25,6 +25,7 @@ from yid_ocp.sensors.base import (
     SensorDataInputs,
     SensorOptions,
     expand_to_joint_values,
+    missing_noise_level_error,
     recorded_joint_column_indices,
 )
 
@@ -97,9 +98,11 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
     if arm:
-        what = f"the encoders and the arm's points '{arm[0]}' are both to be measurements: one follows from the other"
-        hint = f"set sensors.{arm[0]}.use: false, or leave the encoders out"
-        raise ConfigError(what, where="sensors.joints.position.use", hint=hint)
+        what = (
+            f"the encoders and the points '{arm[0]}' on the arm are both used, but the points follow from the encoders"
+        )
+        allowed, hint = "one of the two", f"set sensors.{arm[0]}.use: false, or leave the encoders out"
+        raise ConfigError(what, where="sensors.joints.position.use", allowed=allowed, hint=hint)
     where = around.recording.name
     later = joints.t > around.node_times[0] + 1e-9
     later &= joints.t <= around.node_times[-1] + 1e-9
@@ -120,9 +123,8 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     effort = joints.effort[:, recorded_joint_column_indices(joints, names, around.recording.name)]
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
-        what = "the noise level of the joint efforts is neither recorded nor given"
-        hint = f"set sensors.{JOINT_EFFORT_GROUP_NAME}.std [N m], from a stretch at rest or the data sheet"
-        raise DataError(what, where=around.recording.name, hint=hint)
+        where = f"recording '{around.recording.name}': joints, attribute effort_std"
+        raise missing_noise_level_error("the joint efforts", where, JOINT_EFFORT_GROUP_NAME, "N m")
     std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
     is_sample = joints.effort_sampling_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
@@ -162,8 +164,7 @@ def nodes_and_decorrelated_values(
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
 
     `values` (M, k) belong to the times `t` + `late` [s]. `like_path` selects the path filter; the default is the effort
-    filter, which is also applied to predictions. Raises `DataError`, with the name `noun`, if the recording is too
-    short."""
+    filter, which is also applied to predictions. Raises `DataError`, with `noun`, if the recording is too short."""
     low_pass = around.path_filter if like_path else around.effort_filter
     times, smooth = around.node_times, low_pass(t, values)
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
@@ -177,9 +178,9 @@ def nodes_and_decorrelated_values(
     span = t[[0, -1]] + low_pass.settling_time * np.array([1, -1])
     kept = kept[(times[kept] > span[0] - step) & (times[kept] < span[1] + step)]
     if not len(kept):
-        what = f"{steps * step:.3g} s of {noun} are too short for a filter of {low_pass.cutoff:g} Hz"
+        what = f"{steps * step:.3g} s of {noun} are too short for a low-pass filter of {low_pass.cutoff:g} Hz"
         allowed, hint = f"more than {2 * ends * step:.3g} s", "use a longer recording, or raise problem.path_cutoff"
-        raise DataError(what, where=around.recording.name, allowed=allowed, hint=hint)
+        raise DataError(what, where=f"recording '{around.recording.name}'", allowed=allowed, hint=hint)
     return kept, measured[kept]
 
 
@@ -249,7 +250,7 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
     """Noise (k,) of channels (N, k) from high-order differences; any change as fast as the sampling counts as noise."""
     order = NOISE_DIFFERENCE_ORDER
     if len(values) <= order:
-        what, allowed = f"{len(values)} samples are too few to see the noise of {group}", f"more than {order}"
+        what, allowed = f"{len(values)} samples are too few to estimate the noise of {group}", f"more than {order}"
         raise DataError(what, where=where, allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
     mean_square = np.mean(np.diff(values, order, axis=0) ** 2, axis=0)
     return np.asarray(np.sqrt(mean_square / scipy.special.comb(2 * order, order)))
@@ -261,8 +262,7 @@ def _smoothed_effort_noise(
     """Noise std (M, k) and correlation (M, k, k) of filtered efforts at `times` (M,).
 
     An error of the acceleration of one joint, from encoder noise, changes the torques of all inertially coupled joints.
-    With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. The correlation is None if encoder noise is
-    unknown."""
+    With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. It is None if encoder noise is unknown."""
     value_gain, _, second_gain = around.effort_filter.noise_gains_of_value_and_rates(period)
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None

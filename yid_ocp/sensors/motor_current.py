@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
@@ -18,6 +18,7 @@ from yid_ocp.sensors.base import (
     SensorData,
     SensorDataInputs,
     expand_to_joint_values,
+    missing_noise_level_error,
 )
 from yid_ocp.sensors.joints import JointSensor, smoothed_effort_data
 
@@ -55,29 +56,30 @@ def _read_motor_currents(around: SensorDataInputs) -> list[SensorData]:
 
 
 def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorData | None:
-    key, where = f"{group.name}.{_CURRENT.quantity}", f"{around.recording.name}: {group.name}"
+    key, where = f"{group.name}.{_CURRENT.quantity}", f"recording '{around.recording.name}': {group.name}"
     choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
     if choice.use is False or not names or around.recording.joints is None:
         return None
     for name in group.names:
         if name not in around.system.mechanism.joint_names:
-            hint = nearest_name_hint(name, around.system.mechanism.joint_names)
-            raise DataError(f"the model has no joint '{name}'", where=where, hint=hint)
+            said = unknown_name_error_arguments(name, around.system.mechanism.joint_names)
+            raise DataError(f"the model has no joint '{name}'", where=where, **said)
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
     if constants is None:
-        what, hint = "the motors' torque constants are not given", "[N m/A], torque at the joint over current"
-        raise DataError(what, where=where, hint=f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}} {hint}")
+        what, allowed = "the torque constants of the motors are not given", "torque at the joint per current [N m/A]"
+        hint = f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}}"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     if std is None:
-        what = "the noise level of the motor currents is neither recorded nor given"
-        raise DataError(what, where=where, hint=f"set sensors.{key}.std [A]")
+        raise missing_noise_level_error("the motor currents", where, key, "A")
     by_joint = [
         expand_to_joint_values(given, group.names, names, f"sensors.{key}.{setting}")
         for given, setting in ((constants, "constants"), (std, "std"), (bias, "bias_std"))
     ]
     if not np.all(by_joint[0] != 0):
-        raise DataError("a torque constant is zero", where=where, allowed="a number that is not zero [N m/A]")
+        where, allowed = f"sensors.{key}.constants", "a number that is not zero [N m/A]"
+        raise DataError("a torque constant is zero", where=where, allowed=allowed)
     sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
     values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
     return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)

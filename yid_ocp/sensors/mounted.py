@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
@@ -21,6 +21,7 @@ from yid_ocp.sensors.base import (
     SensorData,
     SensorDataInputs,
     expand_to_joint_values,
+    missing_noise_level_error,
     sensor_reading_function,
 )
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, nodes_and_decorrelated_values
@@ -77,15 +78,14 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
             is_known = tree.has_frame(frame)
             moving = [known for known, entry in tree.frames.items() if entry.joint_index >= 0]
             what = (
-                f"sensor '{name}' sits on the frame '{frame}', which {'does not move' if is_known else 'is not there'}"
+                f"sensor '{name}' is on the frame '{frame}', which {'does not move' if is_known else 'does not exist'}"
             )
-            hint = f"{nearest_name_hint(frame, moving)} (sensors.{key}.frames: {{{name}: FRAME}}, or use: false)"
-            raise DataError(what, where=where, allowed="a frame that moves with a joint of the model", hint=hint)
+            hint = f"set sensors.{key}.frames: {{{name}: FRAME}}, or sensors.{key}.use: false"
+            raise DataError(what, where=where, **(unknown_name_error_arguments(frame, moving) | {"hint": hint}))
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in channel.std_attribute_names]
     std = stated[0] if choice.std is None else choice.std
     if std is None:
-        what = f"the noise level of {channel.quantity} is neither recorded nor given"
-        raise DataError(what, where=where, hint=f"set sensors.{key}.std [{channel.unit}]")
+        raise missing_noise_level_error(channel.quantity, where, key, channel.unit)
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
     by_output = [
         np.repeat(expand_to_joint_values(given, names, names, f"sensors.{key}.{setting}"), 3)
@@ -93,7 +93,8 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
     ]
     signs = expand_to_joint_values(choice.constants.get("sign", 1.0), names, names, f"sensors.{key}.constants")
     if not np.all(np.abs(signs) == 1):
-        raise DataError(f"the sign of {key} is {signs}", where=where, allowed="1 or -1")
+        what = f"the sign of {key} is {', '.join(f'{sign:g}' for sign in signs)}"
+        raise DataError(what, where=f"sensors.{key}.constants.sign", allowed="1 or -1")
     sensor = kind(names, tuple(signs.tolist()), frames, key)
     values = group.values_by_quantity[channel.quantity].reshape(len(group.t), -1)
     steps = len(around.node_times) - 1

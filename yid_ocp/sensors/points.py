@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
@@ -21,6 +21,7 @@ from yid_ocp.sensors.base import (
     SensorData,
     SensorDataInputs,
     SensorOptions,
+    missing_noise_level_error,
 )
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
@@ -56,7 +57,7 @@ def _read_point_groups(around: SensorDataInputs) -> list[SensorData]:
 
 
 def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorOptions) -> SensorData:
-    where = around.recording.name
+    where = f"recording '{around.recording.name}': {group.name}"
     wanted = choice.points if choice.points is not None else group.names
     frames = {p: choice.frames.get(p, p) for p in wanted}
     mechanism = around.system.mechanism
@@ -64,29 +65,31 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
     for point in wanted:
         # points listed by name are used
         if point not in known and (choice.points is not None or point in choice.frames):
-            what = f"point '{point}' of '{group.name}' marks the frame '{frames[point]}', which the model does not have"
-            hint = f"{nearest_name_hint(frames[point], mechanism.frames)} (see sensors.{group.name})"
-            raise DataError(what, where=where, hint=hint)
+            what = f"point '{point}' marks the frame '{frames[point]}', which the model does not have"
+            said = unknown_name_error_arguments(frames[point], mechanism.frames)
+            raise DataError(what, where=f"sensors.{group.name}", **said)
     if not known:
-        what = f"none of the points of group '{group.name}' is a frame of the model"
-        hint = f"name their frames (or T1:40%) under sensors.{group.name}.frames, or switch the group off"
-        raise DataError(what, where=where, allowed=", ".join(around.system.point_frames), hint=hint)
+        what = f"no point of the group is a frame of the model: {', '.join(wanted)}"
+        hint = f"set sensors.{group.name}.frames: {{POINT: FRAME}}, or sensors.{group.name}.use: false"
+        listed = unknown_name_error_arguments("", around.system.point_frames)["allowed"]
+        allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     for point in known:
         if point not in group.names:
-            hint = nearest_name_hint(point, group.names)
-            raise DataError(f"point '{point}' is not in group '{group.name}'", where=where, hint=hint)
+            said = unknown_name_error_arguments(point, group.names)
+            raise DataError(f"point '{point}' is not in group '{group.name}'", where=where, **said)
     columns = [group.names.index(point) for point in known]
     inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
     if isinstance(choice.std, Mapping):
-        raise ConfigError("a group of points takes one std", where=f"sensors.{group.name}.std")
+        what, hint = "the group of points has several standard deviations", "give one number for all points"
+        raise ConfigError(what, where=f"sensors.{group.name}.std", allowed="one number above 0 [m]", hint=hint)
     if choice.std is not None:
         std = np.full(value.shape, float(choice.std))
     elif group.std is not None:
         std = group.std[inside][:, columns].reshape(value.shape)
     else:
-        what = f"the noise level of group '{group.name}' is neither recorded nor given"
-        raise DataError(what, where=where, hint=f"set sensors.{group.name}.std [m]")
+        raise missing_noise_level_error(f"group '{group.name}'", where, group.name, "m")
     sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), recorded_camera_pose(group))
     change = _clock_offset_std(around, sensor, group, choice) * _rates(group.t[inside], value)
     return SensorData(sensor, group.t[inside], value, std, change_by_clock=change if np.any(change) else None)

@@ -18,7 +18,7 @@ import threadpoolctl
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ConfigError, YidError
+from yid_ocp.errors import ConfigError, YidError, missing_package_error
 from yid_ocp.inference.linearized_residual import is_stationary_point
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
@@ -90,8 +90,7 @@ class EstimateChecks:
     expected_prediction_errors : mapping of recording to mapping of channel to float
         Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
     step_stability : mapping
-        Growth of alternating errors at the `start` of the search and at the `estimate`.
-    """
+        Growth of alternating errors at the `start` of the search and at the `estimate`."""
 
     data_std: Mapping[str, float] = field(default_factory=dict)
     discretisation_shifts: Mapping[str, EstimateShiftByLinksAndTimeStep] = field(default_factory=dict)
@@ -133,8 +132,7 @@ class Solution(ReprMixin):
     problem : EstimationProblem, optional
         The problem, whitened at `x`.
     checks : EstimateChecks, optional
-        Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only.
-    """
+        Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only."""
 
     status: Status
     message: str
@@ -199,12 +197,12 @@ class Solution(ReprMixin):
     def to_dataframe(self) -> pandas.DataFrame:
         """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
-        `lower` and `upper` are the 95 % interval, infinite at an open or unknown end. Raises `ConfigError` if pandas is
-        not installed."""
+        `lower` and `upper` are the 95 % interval, infinite at an open end. Raises `ConfigError` if pandas is not
+        installed."""
         try:
             pandas = importlib.import_module("pandas")
         except ImportError as error:
-            raise ConfigError("pandas is not installed", hint="pip install 'yid-ocp[pandas]'") from error
+            raise missing_package_error(ConfigError, "a data frame needs the package pandas", "pandas") from error
         columns, rows = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"], {}
         for name, e in sorted(self.parameters.items(), key=lambda entry: not entry[1].free):
             rows[name] = (e.value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)

@@ -78,8 +78,7 @@ class MultipleShooting(SolverWithCheckedSettings):
     ----------
     Bock and Plitt (1984), IFAC Proc. 17(2):1603, doi:10.1016/S1474-6670(17)61205-9.
     Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
-    Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885 (condensing).
-    """
+    Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885 (condensing)."""
 
     condensing: Annotated[
         bool,
@@ -121,13 +120,18 @@ class MultipleShooting(SolverWithCheckedSettings):
             return self._by_condensing(problem, start, AcceptedIterateRecorder(callback))
         told: tuple[str, ...] = ()
         if self.hessian not in ("gauss_newton", "exact"):
-            hint = "limited-memory updates cannot learn thousands of node states in a few dozen iterations"
+            hint = "use hessian: gauss_newton"
             told = f"hessian = '{self.hessian}'", "hessian", "gauss_newton, exact", hint
         elif str(self.ipopt.get("hessian_approximation", "exact")) != "exact":
-            hint = "the node states number in the thousands; use hessian: gauss_newton"
-            told = "limited-memory Hessians are refused", "ipopt.hessian_approximation", "exact", hint
+            hint = "leave the option out, and use hessian: gauss_newton"
+            told = (
+                "a limited-memory Hessian is too slow for thousands of node states",
+                "ipopt.hessian_approximation",
+                "exact",
+                hint,
+            )
         elif self.node_interval not in (None, 1):
-            hint = "condensing: true eliminates the steps between nodes"
+            hint = "set condensing: true, or node_interval: 1"
             told = f"node_interval = {self.node_interval} without condensing", "node_interval", "1", hint
         if told:
             raise SolverError(told[0], where=f"solver.{told[1]}", allowed=told[2], hint=told[3])
@@ -358,11 +362,15 @@ class _ShootingIntervals:
         for episode in problem.episodes:
             steps = episode.grid.steps
             if steps < node_interval:
-                message = f"the recording has {steps} steps, fewer than one node interval of {node_interval}"
-                raise SolverError(message, where=episode.name, allowed=f"solver.node_interval from 1 to {steps}")
+                message = (
+                    f"the recording '{episode.name}' has {steps} steps, fewer than a node interval of {node_interval}"
+                )
+                raise SolverError(message, where="solver.node_interval", allowed=f"1 to {steps}")
             if any(s.sensor.effort_joints for s in episode.measurements):
-                message = "effort channels depend on whole steps, which node states do not carry"
-                raise SolverError(message, where=episode.name, hint="use gauss_newton")
+                message = "multiple shooting without condensing cannot use measured efforts of prescribed joints"
+                where, allowed = f"recording '{episode.name}': joints/effort", "measurements that depend on node states"
+                hint = "set solver.name: gauss_newton, or sensors.joints.effort.use: false"
+                raise SolverError(message, where=where, allowed=allowed, hint=hint)
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are searched near those of the problem's initial values, at any point
         x = problem.initial_unknowns

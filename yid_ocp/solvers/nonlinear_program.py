@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import SolverError, nearest_name_hint
+from yid_ocp.errors import SolverError, unknown_name_error_arguments
 from yid_ocp.integrator.compiler import compiled_casadi_function
 from yid_ocp.parallel import CASADI_LOCK
 
@@ -334,7 +334,8 @@ class NonlinearProgram(ReprMixin):
         if len(alike) == 1:
             return blocks[alike[0]]
         message = f"the program has {len(alike)} blocks '{name}'"
-        raise SolverError(message, hint=nearest_name_hint(name, alike or blocks))
+        said = unknown_name_error_arguments(name, alike or blocks)
+        raise SolverError(message, where=f"nlp['{name}']", **said)
 
     def __getitem__(self, name: str) -> ca.MX:
         """Block of variables or parameters as an MX matrix of its shape."""
@@ -512,12 +513,13 @@ class NonlinearProgram(ReprMixin):
         for symbol in ca.symvar(ca.vertcat(scalar, column)):
             if not any(ca.is_equal(symbol, vector) for vector in (self.w, self.p)):
                 message = f"the symbol '{symbol.name()}' is neither an unknown nor a parameter of the program"
-                raise SolverError(message, where=where, allowed="expressions of nlp.w, nlp.p and of nlp[NAME]")
+                allowed, hint = "expressions of nlp.w, nlp.p and of nlp[NAME]", "use nlp[NAME] in place of the symbol"
+                raise SolverError(message, where=where, allowed=allowed, hint=hint)
         for name, side in (("lower", lower), ("upper", upper)):
             given = np.asarray(side, float).ravel()
             if given.size not in (1, column.numel()):
                 message = f"{given.size} {name} bounds for {column.numel()} constraints"
-                raise SolverError(message, where=where, allowed=f"one for all, or {column.numel()}")
+                raise SolverError(message, where=f"{where}: {name}", allowed=f"1 or {column.numel()} bounds")
             bounds.append(np.broadcast_to(given, (column.numel(),)).copy())
         return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)))
 
@@ -535,7 +537,8 @@ class NonlinearProgram(ReprMixin):
                 return ca.nlpsol("program", plugin, self.nlp, {**options, "cache": cache})
             except RuntimeError as error:
                 message = f"CasADi cannot make the solver '{plugin}': {str(error).strip().splitlines()[-1]}"
-                raise SolverError(message, hint="see casadi.doc_nlpsol for its options") from error
+                allowed, hint = "a plug-in of casadi.nlpsol and its options", f"see casadi.doc_nlpsol('{plugin}')"
+                raise SolverError(message, where=f"solver '{plugin}'", allowed=allowed, hint=hint) from error
 
     def _derivatives(
         self, name: str, inputs: list[str], outputs: list[str], hessian: HessianKind

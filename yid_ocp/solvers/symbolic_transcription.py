@@ -28,6 +28,7 @@ from yid_ocp.errors import SolverError
 from yid_ocp.integrator.discrete import NlpStepConstraints, nlp_step_constraints
 from yid_ocp.integrator.statics import measured_angle_holding_stiffness
 from yid_ocp.parallel import CASADI_LOCK
+from yid_ocp.problem.episode_prediction import node_state_sensor_error
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import SOFT_LOGARITHM_MIN_RATIO
@@ -76,8 +77,7 @@ def transcribe(
     ------
     SolverError
         An effect changes recorded inputs or times, a free parameter has a known value in a recording, or two recordings
-        have the same name.
-    """
+        have the same name."""
     problem = _about_zero(problem)
     _check_transcribable(problem)
     compiled = problem.step.is_compiled if use_compiler is None else use_compiler
@@ -99,9 +99,9 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
     """Raise `SolverError` if an effect changes recorded inputs or times, which node-state solvers do not support."""
     if not problem.has_no_input_corrections:
-        message = "an effect changes recorded inputs, times or what the tracking filter follows"
-        allowed = "effects of the mechanics and of what sensors read"
-        raise SolverError(message, where=where, allowed=allowed, hint="use gauss_newton")
+        message = "an effect changes recorded inputs, times or the reference of the tracking feedback"
+        allowed = "effects that change the mechanics or the readings of sensors"
+        raise SolverError(message, where=where, allowed=allowed, hint="set solver.name: gauss_newton")
 
 
 def _check_transcribable(problem: EstimationProblem) -> None:
@@ -110,13 +110,15 @@ def _check_transcribable(problem: EstimationProblem) -> None:
     names = [episode.name for episode in problem.episodes]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        hint = "rename one of the files: blocks have their names"
-        raise SolverError(f"two recordings are called '{twice[0]}'", where=where, hint=hint)
+        allowed, hint = "a name of its own for every recording", "rename one of the files"
+        raise SolverError(f"two recordings are called '{twice[0]}'", where=where, allowed=allowed, hint=hint)
     for episode in problem.episodes:
         start = episode.fixed_initial_state
         known = {*episode.known_parameters, *(() if start is None else start.fitted_parameters)}
         for name in (name for name in problem.free if name in known):
-            raise SolverError(f"{name} is free and has a known value in a recording", where=f"{where}: {episode.name}")
+            what, where = f"{name} is free, but this recording has a known value of it", f"recording '{episode.name}'"
+            allowed, hint = "parameters that are free or known", f"set parameters.{name}.free: false"
+            raise SolverError(what, where=where, allowed=allowed, hint=hint)
 
 
 def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
@@ -465,9 +467,7 @@ class _Maker:
         if key not in self._sensors:
             function = sensor_reading_function(self._problem.system, sensor, self._names)
             if any(function.size2_out(name) for name in ("by_v", "by_a", "by_lam")):
-                what = f"'{sensor.group_name}' depends on velocities, accelerations or constraint forces"
-                message = f"{what}, which node states do not carry"
-                raise SolverError(message, where=episode.name, hint="use gauss_newton")
+                raise node_state_sensor_error(sensor.group_name)
             loaded = function.nnz_out("by_load") > 0
             made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function)
             self._sensors[key] = made, loaded

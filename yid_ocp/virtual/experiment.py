@@ -52,7 +52,7 @@ def baxter_foam_y_system(arms: int) -> System:
     The left arm holds the tip of T2 (43 coordinates), the right arm that of T3 (50). Every arm joint is driven, and
     every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms."""
     if arms not in (1, 2):
-        raise ConfigError(f"arms = {arms}", where="paper_system", allowed="1 or 2")
+        raise ConfigError(f"arms = {arms}", where="arms", allowed="1 or 2")
     sides = ("left", "right")[:arms]
     names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINT_NAMES_WITHOUT_SIDE]
     robot = read_urdf("package:baxter", joints=names)
@@ -105,8 +105,7 @@ class VirtualArmOptions:
 class PointCamera:
     """A slow camera that measures positions of the object's points that no arm holds.
 
-    `pose` (4, 4) is in the world (x right, y down, z forward). By default it is 2 m from the object, opposite the
-    robot."""
+    `pose` (4, 4) is in the world (x right, y down, z forward). By default 2 m from the object, opposite the robot."""
 
     point_std: float = 5e-3  # std of the white noise on each coordinate of a point [m]
     frame_rate: float = 3.0  # mean rate; periods vary by up to a quarter [Hz]
@@ -212,7 +211,8 @@ def _joints(
 
 def _by_joint(std: float | tuple[float, ...], joints: int, where: str) -> Array:
     if np.ndim(std) and np.size(std) != joints:
-        raise ConfigError(f"{np.size(std)} standard deviations for {joints} joints", where=where, allowed="one or each")
+        what, allowed = f"{np.size(std)} standard deviations for {joints} joints", f"1 or {joints} standard deviations"
+        raise ConfigError(what, where=where, allowed=allowed)
     return np.asarray(std, dtype=float)
 
 
@@ -305,7 +305,8 @@ def recording_with_sensor_error(
     joints = recording.joints
     assert joints is not None
     if joints.effort is None:
-        raise ModelError("the recording has no efforts", where=f"{kind}@{place}", allowed="arms that torques move")
+        allowed, hint = "arms that are driven by torques", "leave the effect out"
+        raise ModelError("the recording has no efforts", where=f"{kind}@{place}", allowed=allowed, hint=hint)
     if kind == "effort_delay":
         effort = joints.effort.copy()
         # the presently recorded effort acts only after the delay

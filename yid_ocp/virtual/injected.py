@@ -327,8 +327,8 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     turn = value(frame.placement.rotation).reshape(3, 3, order="F")
     mass = size["mass"]
     if not np.linalg.norm(reach) <= _MAX_PAYLOAD_DISTANCE * abs(mass):
-        allowed = f"within {_MAX_PAYLOAD_DISTANCE:g} m"
-        raise ModelError("its mass sits too far from its frame", where=where, allowed=allowed)
+        what = f"the added mass is {np.linalg.norm(reach) / max(abs(mass), 1e-300):.3g} m from its frame"
+        raise ModelError(what, where=where, allowed=f"at most {_MAX_PAYLOAD_DISTANCE:g} m")
     point = value(frame.placement.translation) + turn @ reach / mass
     own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])
     axes = Rotation.from_quat(np.roll(model.body_iquat[body], -1)).as_matrix()
@@ -337,7 +337,9 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     tensor += own * mass / (own + mass) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
     moments, axes = np.linalg.eigh(tensor)
     if own + mass <= 0 or moments[0] <= 0:
-        raise ModelError("more is taken away than the link has there", where=where, hint="less mass, or nearer by")
+        what = "the effect removes more mass or inertia than the link has"
+        hint = "remove less mass, or nearer to the link"
+        raise ModelError(what, where=where, allowed="a positive mass and inertia of the link", hint=hint)
     axes[:, 2] *= np.linalg.det(axes)
     model.body_mass[body] = own + mass
     model.body_ipos[body] = (own * centre + mass * point) / (own + mass)
@@ -508,7 +510,7 @@ def run_experiment_with_effects(
     known = known if ordinary_friction is None else tuple(dict.fromkeys((*known, *_ORDINARY_FRICTION)))
     for effect in (*effects, *(ordinary_friction or ())):
         if effect.kind not in known:
-            what = f"{effect.kind} cannot be done in MuJoCo here"
+            what = f"the effect {effect.kind} cannot be simulated in MuJoCo"
             details = unknown_name_error_arguments(effect.kind, known)
             raise ConfigError(what, where=effect.label, **details)
     described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in _DESCRIPTION_KINDS]

@@ -202,8 +202,7 @@ def grasping_joint_angles(
         zero if the joint is unlimited.
     offsets : mapping of grasp to array_like, shape (3,), optional
         Position of each gripper relative to the undeformed tube end, in the world [m]. Two arms that hold a straight Y
-        are fully stretched, a singular posture; offsets towards each other make the start well defined.
-    """
+        are fully stretched, a singular posture; offsets towards each other make the start well defined."""
     tree = system.numeric_mechanism(values)
     value = ParameterEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.errors import ConfigError, DataError, ModelError, missing_package_error
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
@@ -75,8 +75,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 class JointDynamicsTerms:
     """Stiffness, damping, dry friction, armature and constant force of one joint, in SI units.
 
-    Force = constant - stiffness q - cubic q^3 - damping v - friction.
-    """
+    Force = constant - stiffness q - cubic q^3 - damping v - friction."""
 
     stiffness: float = 0.0
     constant_force: float = 0.0
@@ -193,8 +192,7 @@ def _actuation(
 ) -> tuple[float, float, float, float]:
     """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
 
-    The true value is gain x recorded - offset, delayed and with a first-order lag. The last effect acts on the
-    reading."""
+    The true value is gain x recorded - offset, delayed and with a first-order lag. The last acts on the reading."""
     true = reading = ca.SX.sym("reading")
     channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
     for effect in reversed(effects):
@@ -291,7 +289,7 @@ def mujoco_xml(
         frame on one of them, a compliant grasp, a cubic spring with a rest angle, an effect beyond `_NATIVE_ASPECTS`.
     """
     if not time_step > 0:
-        raise ConfigError(f"time_step = {time_step}", where="mujoco_xml", allowed="a positive number of seconds")
+        raise ConfigError(f"time_step = {time_step}", where="mujoco_xml: time_step", allowed="a number above 0 [s]")
     tree, weights = _weighed(system.numeric_mechanism(values))
     value = ParameterEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
@@ -336,8 +334,9 @@ def _bodies(
         if _shares_body(tree, j):
             elements[j] = elements[joint.parent_index]
             if joint.parent_index in carried:
-                what = f"frame '{carried[joint.parent_index]}' sits on a joint that carries no mass"
-                raise ModelError(what, where=f"joint {joint.name}")
+                what = f"the frame '{carried[joint.parent_index]}' is on a joint without mass"
+                where, hint = f"joint '{joint.name}'", "give the link of the frame a mass"
+                raise ModelError(what, where=where, allowed="frames on links with mass", hint=hint)
         else:
             place = {"name": f"{joint.name}_body", **_pose(joint.placement)}
             elements[j] = SubElement(elements[joint.parent_index], "body", place)
@@ -352,18 +351,19 @@ def _bodies(
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
             SubElement(elements[j], "joint", {**kind, **gears[name]})
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
-            what = "more than six joints without mass sit at one place"
-            allowed = "up to six; a body with mass on the last of them"
-            raise ModelError(what, where=f"joint {joint.name}", allowed=allowed)
+            what = "more than six joints without mass are in one series"
+            hint = "give one of the links between them a mass"
+            allowed = "up to six, with a mass on the link of the last one"
+            raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         body = merge_bodies(joint.bodies)
         if body is not None:
             if joint.name in weights:
                 elements[j].set("gravcomp", format_xml_numbers([1 - weights[joint.name]]))
             SubElement(elements[j], "inertial", _inertial(body))
         elif not any(_shares_body(tree, k) and tree.joints[k].parent_index == j for k in range(len(tree.joints))):
-            allowed = "a body with mass on every joint, or several joints at one place with a body on the last"
-            what = f"nothing that '{joint.name}' moves has a mass"
-            raise ModelError(what, where=f"joint {joint.name}", allowed=allowed)
+            allowed = "joints that move a mass"
+            what, hint = f"nothing that '{joint.name}' moves has a mass", "give its link a mass, or lock the joint"
+            raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
     return elements
 
 
@@ -373,8 +373,9 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
     for joint in tree.joints:
         shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
         if len(shares) > 1:
-            what = f"bodies on '{joint.name}' have different parts of their weight"
-            raise ModelError(what, where="mujoco_xml", allowed="one part of its weight for all that a joint carries")
+            what, where = "the ratio of weight to mass differs between bodies of one joint", f"joint '{joint.name}'"
+            hint = "leave out one of the effects that change weights"
+            raise ModelError(what, where=where, allowed="one ratio for all bodies of a joint", hint=hint)
         weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
     joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
     return replace(tree, joints=joints), weights
@@ -391,7 +392,8 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
         if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
             what = f"the spring at '{joint.name}' has a cubic part"
             allowed = "no cubic part with a rest angle; otherwise MuJoCo 3.6 or newer (polynomial stiffness)"
-            raise ModelError(what, where="mujoco_xml", allowed=allowed)
+            hint = "leave the cubic part or the rest angle out"
+            raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         numbers["stiffness"] = [terms.stiffness, 0.0, terms.cubic_stiffness]
     others = {"armature": [terms.armature], "frictionloss": [terms.dry_friction]}
     numbers |= {name: size for name, size in others.items() if any(size)}
@@ -442,8 +444,8 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
             attributes |= {"dyntype": "filterexact", "dynprm": format_xml_numbers([lag])}
         if delay > 0:
             if not hasattr(import_mujoco().MjModel, "actuator_delay"):
-                what, allowed = f"the torque of '{joint}' acts late", "MuJoCo with delays of actuators (3.5 or newer)"
-                raise ModelError(what, where="mujoco_xml", allowed=allowed)
+                what, allowed = f"the torque of '{joint}' is delayed", "MuJoCo 3.5 or newer, which has actuator delays"
+                raise ModelError(what, where=f"joint '{joint}'", allowed=allowed, hint="pip install -U mujoco")
             samples = math.ceil(delay / time_step) + 1
             attributes |= {"delay": format_xml_numbers([delay]), "nsample": str(samples), "interp": between}
         SubElement(actuator, "general", attributes)
@@ -454,8 +456,7 @@ def import_mujoco() -> ModuleType:
     try:
         import mujoco
     except ImportError as error:
-        what = "virtual experiments need MuJoCo, which is not installed"
-        raise DataError(what, hint="pip install 'yid-ocp[blind]'") from error
+        raise missing_package_error(DataError, "virtual experiments need MuJoCo", "blind") from error
     return mujoco
 
 
@@ -464,7 +465,8 @@ def mujoco_model_from_mjcf(text: str) -> Any:
     try:
         return import_mujoco().MjModel.from_xml_string(text)
     except ValueError as error:
-        raise ModelError(f"MuJoCo does not accept the model: {error}", where="mujoco_xml") from error
+        what, hint = f"MuJoCo does not accept the model: {error}", "correct the named element of the model"
+        raise ModelError(what, where="MJCF text", allowed="MJCF that MuJoCo compiles", hint=hint) from error
 
 
 def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bool) -> None:
@@ -473,23 +475,28 @@ def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bo
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
         if aspects:
             changed = MODEL_ASPECT_DESCRIPTIONS[min(aspects)]
-            what = f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {changed}"
+            what = f"MuJoCo cannot express what the effect changes: {changed}"
             allowed = ", ".join(words for name, words in MODEL_ASPECT_DESCRIPTIONS.items() if name in able)
-            raise ModelError(what, where="mujoco_xml", allowed=f"effects that change {allowed}")
+            where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out"
+            raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
-            raise ModelError(f"grasp '{grasp.name}' is compliant", where="mujoco_xml", allowed=allowed)
+            what, hint = f"grasp '{grasp.name}' is compliant", "set its compliance to 0"
+            raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():
         if value._is_zero_at_parameter_values(compliance):
             allowed, hint = "a compliance above zero", "leave the effect out"
-            raise ModelError(f"joint '{joint}' is rigid", where="mujoco_xml", allowed=allowed, hint=hint)
+            what = f"the compliance of joint '{joint}' is zero"
+            raise ModelError(what, where=f"joint '{joint}'", allowed=allowed, hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):
             allowed = f"{joint}.servo_dead_band: 0"
-            raise ModelError(f"the servo of '{joint}' has a dead band", where="mujoco_xml", allowed=allowed)
+            what, hint = f"the servo of '{joint}' has a dead band", f"set {joint}.servo_dead_band to 0"
+            raise ModelError(what, where=f"joint '{joint}'", allowed=allowed, hint=hint)
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
-        raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock without offset")
+        what, allowed, hint = "the recorded time is scaled", "a time scale of 1", "leave the effect on the clock out"
+        raise ModelError(what, where="effects of the model", allowed=allowed, hint=hint)
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:

@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
@@ -67,17 +67,17 @@ class SimulationOptions:
         controller, periods = self._controller_rate, self.controller_periods_per_sample
         inner = self._steps_per_period
         if periods < 1 or abs(periods * self.sample_rate / controller - 1.0) > 1e-9:
-            what = f"controller_rate = {controller:g} Hz is no multiple of the recording's {self.sample_rate:g} Hz"
-            raise ConfigError(what, allowed="rate k, k whole")
+            what = f"controller_rate = {controller:g} Hz is not a multiple of sample_rate = {self.sample_rate:g} Hz"
+            raise ConfigError(what, where="controller_rate", allowed="k * sample_rate with a whole number k from 1")
         if inner < 1 or abs(inner * self.time_step * controller - 1.0) > 1e-9:
             what = f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz"
-            raise ConfigError(what, allowed="1/(controller's rate k), k whole")
+            raise ConfigError(what, where="time_step", allowed="1 / (k * controller_rate) with a whole number k from 1")
         if self.effort_kind not in get_args(EffortSamplingKind):
-            raise ConfigError(f"effort_kind = '{self.effort_kind}'", allowed=", ".join(get_args(EffortSamplingKind)))
+            said = unknown_name_error_arguments(self.effort_kind, get_args(EffortSamplingKind))
+            raise ConfigError(f"effort_kind = '{self.effort_kind}'", where="effort_kind", **said)
         if self.effort_kind == "command" and periods > 1:
-            what = f"a command of a controller at {controller:g} Hz"
-            what += f" is not held over a sample of {self.sample_rate:g} Hz"
-            allowed = "sample or mean, or a controller as fast as the recording"
+            what = f"effort_kind = 'command', but the controller ({controller:g} Hz) changes commands within a sample"
+            allowed = f"sample or mean; command with controller_rate = {self.sample_rate:g} Hz"
             raise ConfigError(what, where="effort_kind", allowed=allowed)
 
     @property
@@ -157,7 +157,8 @@ def simulate_in_mujoco(
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
         allowed = f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
         where = f"motion of {', '.join(motion.joints) or 'nothing'}"
-        raise ModelError("the motion is not one of the driven joints", where=where, allowed=allowed)
+        what, hint = "the motion has other joints than the driven ones", "give a motion of the driven joints"
+        raise ModelError(what, where=where, allowed=allowed, hint=hint)
     mujoco = import_mujoco()
     model = mujoco_model_from_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
@@ -178,7 +179,8 @@ def simulate_in_mujoco(
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
-        raise ModelError("the simulation diverged", where="MuJoCo", hint="take a shorter time_step or a calmer motion")
+        hint = "set a shorter time_step, or give a slower motion"
+        raise ModelError("the simulation diverged", where="MuJoCo", allowed="finite positions and efforts", hint=hint)
     return result
 
 
@@ -339,13 +341,15 @@ def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
         held.eq_solref[:] = firm
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
         if _lost(scene):
-            hint = "take a shorter time_step, or a posture whose grippers are nearer to what they hold"
-            raise ModelError("the simulation diverged before the motion began", where="MuJoCo", hint=hint)
+            what = "the simulation diverged before the motion began"
+            hint = "set a shorter time_step, or start nearer to the grasp"
+            raise ModelError(what, where="MuJoCo", allowed="finite positions and velocities", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)
     what = f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)"
-    hint = "give every coordinate some damping and enough stiffness to stand"
-    raise ModelError(what, where="settling before the motion", hint=hint)
+    hint = "give every coordinate more damping, and enough stiffness to carry the weight"
+    allowed = "an object that comes to rest"
+    raise ModelError(what, where="settling before the motion", allowed=allowed, hint=hint)
 
 
 def _play(
@@ -425,13 +429,16 @@ def replay_mismatch_by_channel(
     moved = system.driven or system.prescribed
     joints = recording.joints
     if joints is None or not moved or not set(moved) <= set(joints.names):
-        what = f"'{recording.name}' does not say how the joints moved"
-        raise ModelError(what, where="replay", allowed="recorded angles of all driven or prescribed joints")
+        what, hint = "the recording lacks angles of driven or prescribed joints", "import them too"
+        allowed = f"the angles of {', '.join(moved) or 'one joint or more'}"
+        raise ModelError(what, where=f"recording '{recording.name}': joints", allowed=allowed, hint=hint)
     columns = [joints.names.index(name) for name in moved]
     if system.servos and joints.position_command is None:
-        raise ModelError(f"'{recording.name}' has no commands", where="replay", allowed="recorded commanded positions")
+        what, where = "servos need commanded positions", f"recording '{recording.name}': joints/position_command"
+        raise ModelError(what, where=where, allowed="recorded commanded positions", hint="import them too")
     if system.driven and not system.servos and joints.effort is None:
-        raise ModelError(f"'{recording.name}' has no torques", where="replay", allowed="recorded torques")
+        what, where = "driven joints need efforts", f"recording '{recording.name}': joints/effort"
+        raise ModelError(what, where=where, allowed="recorded efforts", hint="import them too")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
     effort = None if joints.effort is None else joints.effort[:, columns]
     scene = MujocoScene.from_compiled_model(system, mujoco, model)
@@ -543,7 +550,8 @@ def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
 ) -> dict[str, ReplayErrorAgainstRecording]:
     if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
-        raise ModelError("the replay diverged", where=recording.name, hint="take a shorter time step")
+        where, allowed = f"recording '{recording.name}'", "finite positions and efforts"
+        raise ModelError("the replay diverged", where=where, allowed=allowed, hint="set a shorter time step")
     found: dict[str, ReplayErrorAgainstRecording] = {}
     t = joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9

@@ -93,8 +93,8 @@ def stamp_delay_beyond_clock_offset(
 ) -> _StampDelay | None:
     """Estimate the delay [s] of a frame's stamp beyond the common clock offset, from its world points (N, 3) [m].
 
-    None if the arm is not in view. If the misfit is close to the `usual` misfit of other frames [m^2], only nearby
-    delays are searched."""
+    None if the arm is not in view. If the misfit is close to the `usual` one of other frames [m^2], only nearby delays
+    are searched."""
     t, origin = float(state.stamps_to_joint_clock(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_MAX_START_POINTS]]
     chosen = points[arm.is_near_moving_surface_off_grasps(points, t, 2 * _OFF_ARM_DISTANCE)][:_MAX_ARM_POINTS]
@@ -259,8 +259,7 @@ def calibrate_camera(
     """Estimate a camera's pose, depth and clock from frames that show the arm, starting at a pose (4, 4).
 
     `glimpses` are thinned frames that include the robot and its surroundings; `source` names their origin in messages.
-    Raises `DataError` if the arm is not in view, does not match the clouds, or moves too little to determine the
-    clock."""
+    Raises `DataError` if the arm is not in view, does not match the clouds, or moves too little."""
     about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
     told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:
@@ -270,7 +269,8 @@ def calibrate_camera(
             return calibration_without_estimation(pose, clock, str(reason))
         known = "track.options.calibration.fix_pose: true and track.options.clock.search_half_width: 0"
         hint = f"{reason.hint}; with pose and clock known, set {known}"
-        raise DataError(f"the camera cannot be calibrated by the arm: {reason}", where=source, hint=hint) from None
+        what, allowed = f"the camera cannot be calibrated by the arm: {reason}", "frames that show the moving arm"
+        raise DataError(what, where=source, allowed=allowed, hint=hint) from None
 
 
 class _UntoldError(Exception):

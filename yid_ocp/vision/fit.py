@@ -98,7 +98,8 @@ class ShapeFitOptions:
     def __post_init__(self) -> None:
         check_option_bounds(self, "fit options")
         if not self.node_loss_scales and not self.surface_loss_scales:
-            raise ConfigError("there is no pass to fit in", where="fit options: scales", allowed="one scale or more")
+            what, where = "node_loss_scales and surface_loss_scales are both empty", "track.options.shape_fit"
+            raise ConfigError(what, where=where, allowed="one scale or more [m]", hint="add a scale to one of them")
 
 
 class ShapeFitter:
@@ -117,7 +118,8 @@ class ShapeFitter:
         self.system = system
         self.options = options or ShapeFitOptions()
         if not system.segment_layouts:
-            raise DataError("the model has no object whose shape could be fitted", hint="give it segments")
+            what, hint = "the model has no object whose shape could be fitted", "set model.object with segments"
+            raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
         tree = self._tree = system.numeric_mechanism(values)
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
 
@@ -182,10 +184,11 @@ class ShapeFitter:
         """Fit the object's shape in one frame, from the guesses `starts` and the robot's configuration `q_known` (n,).
 
         The fit has two stages. The cheap passes on skeleton nodes run from every guess (default: the undeformed shape).
-        The passes on points run from the best result. `sight` is the filtered cloud. Raises `DataError` if it has no
-        points."""
+        The passes on points run from the best result. `sight` is the filtered cloud. Raises `DataError` if it is
+        empty."""
         if not len(sight.points) or not len(sight.skeleton_nodes):
-            raise DataError("there is no point to fit to", where="fit")
+            what, allowed = "the cloud has no points or no skeleton nodes", "one point and one node or more"
+            raise DataError(what, where="sight", allowed=allowed, hint="check the filters, or give another cloud")
         free = list(self.free_joints)
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]

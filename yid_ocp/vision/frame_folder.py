@@ -1,7 +1,6 @@
 """Read and write folders of clouds or depth images with time stamps and a camera (`yid-frames/1`).
 
-PLY files (Turk 1994, The PLY polygon file format) are read in Python, because a damaged file must not end the
-process."""
+PLY files (Turk 1994, The PLY polygon file format) are read in Python: a damaged file must not end the process."""
 
 from __future__ import annotations
 
@@ -37,7 +36,6 @@ _POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"  # arrays of an NPZ file
 _PCD_HEADER_BYTES = 10_000  # [bytes]; contain the number of points of a PCD file
 _PCD_POINT_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
 _MAX_FRAME_BYTES = 1 << 28  # largest size of one cloud or image
-_COPY_AGAIN_HINT = "copy or record it again"
 
 
 _Cloud = tuple[Array, PointColourArray | None]
@@ -52,7 +50,7 @@ def _read_cloud(path: Path, coloured: bool = False) -> _Cloud:
     readers = {".npz": _read_npz, ".xyz": _read_xyz, ".pcd": _read_pcd}
     points, colours = readers[path.suffix.lower()](path)
     if not len(points):
-        raise DataError("the cloud is empty or cannot be read", where=str(path))
+        raise _damaged(path, "it has no points")
     return points, colours
 
 
@@ -65,14 +63,14 @@ def _read_npz(path: Path) -> _Cloud:
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
-        raise DataError(
-            f"the cloud is damaged ({error})", where=str(path), allowed=allowed, hint=_COPY_AGAIN_HINT
-        ) from error
+        raise _damaged(path, "it is damaged, or not an NPZ file") from error
     points, colours = arrays.get(_POINTS_ARRAY), arrays.get(_COLOURS_ARRAY)
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        raise DataError(f"the file has no array `{_POINTS_ARRAY}` of points", where=str(path), allowed=allowed)
+        what, hint = f"the file has no array `{_POINTS_ARRAY}` of points", "write the points as this array"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
-        raise DataError(f"the array `{_COLOURS_ARRAY}` is no colour for every point", where=str(path), allowed=allowed)
+        what, hint = f"the array `{_COLOURS_ARRAY}` does not have one colour per point", "correct it, or leave it out"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     return points.astype(np.float64), colours
 
 
@@ -82,9 +80,9 @@ def _read_xyz(path: Path) -> _Cloud:
             warnings.simplefilter("ignore", UserWarning)
             rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
     except (OSError, ValueError, UnicodeDecodeError) as error:
-        raise DataError(f"the cloud cannot be read ({error})", where=str(path), allowed="x y z in every row") from error
+        raise _damaged(path, "it is not a table with x y z in every row") from error
     if rows.shape[0] and rows.shape[1] < 3:
-        raise DataError(f"the cloud has {rows.shape[1]} columns", where=str(path), allowed="x y z in every row")
+        raise _damaged(path, f"it has {rows.shape[1]} columns instead of x y z")
     seen = rows[:, 3:6]
     coloured = seen.shape[1] == 3 and bool(((seen >= 0) & (seen <= 255) & (seen == np.rint(seen))).all())
     return rows[:, :3].copy(), seen.astype(np.uint8) if coloured else None
@@ -95,15 +93,13 @@ def _read_pcd(path: Path) -> _Cloud:
     with path.open("rb") as file:
         declared = _PCD_POINT_COUNT.search(file.read(_PCD_HEADER_BYTES))
     if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
-        what = f"the cloud is damaged: it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes"
-        raise DataError(what, where=str(path), hint=_COPY_AGAIN_HINT)
+        raise _damaged(path, f"it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes")
     # Open3D prints errors to standard output and returns an empty cloud
     try:
         with files.limited_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
     except (MemoryError, RuntimeError) as error:
-        what = f"the cloud is damaged: it declares more points than fit into memory ({error})"
-        raise DataError(what, where=str(path), hint=_COPY_AGAIN_HINT) from error
+        raise _damaged(path, "it declares more points than fit into memory") from error
     colours = np.rint(255 * np.asarray(cloud.colors)).astype(np.uint8) if cloud.has_colors() else None
     return np.asarray(cloud.points, dtype=np.float64), colours
 
@@ -117,8 +113,8 @@ def _read_depth_image(path: Path) -> Array:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
-        what = "the depth image is empty, damaged or not one channel of 16 bits"
-        raise DataError(what, where=str(path), allowed="16-bit grey PNG")
+        what, hint = "the depth image is empty, damaged or not one channel of 16 bits", "write it as 16-bit grey PNG"
+        raise DataError(what, where=str(path), allowed="16-bit grey PNG", hint=hint)
     return image.astype(np.float64)
 
 
@@ -154,7 +150,8 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
 
 
 def _damaged(path: Path, why: str) -> DataError:
-    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), hint=_COPY_AGAIN_HINT)
+    allowed, hint = f"a whole {path.suffix} file of points with x, y and z", "copy the file again, or export it again"
+    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), allowed=allowed, hint=hint)
 
 
 def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
@@ -174,9 +171,9 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
             case ["property", kind, name] if found and kind in _NUMPY_TYPES:
                 found[-1][2].append((name, _NUMPY_TYPES[kind]))
             case _:
-                raise _damaged(path, f"its head says {line[:60]!r}")
+                raise _damaged(path, f"its header has the line {line[:60]!r}")
     if order is None:
-        raise _damaged(path, "its head does not say the format")
+        raise _damaged(path, "its header has no format")
     return order, found
 
 
@@ -188,8 +185,7 @@ def _vertices(
         raise _damaged(path, "its vertices have no x, y and z, or lists")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if count * size > len(body) + (not order):  # the last line of a text may end without a newline
-        what = f"the cloud is damaged: it declares {count:.3g} points in {len(body)} bytes"
-        raise DataError(what, where=str(path), hint=_COPY_AGAIN_HINT)
+        raise _damaged(path, f"it declares {count:.3g} points in {len(body)} bytes")
     if not count:
         raise _damaged(path, "it has no vertices")
     wanted = [*_AXIS_PROPERTIES, *(_COLOUR_PROPERTIES if coloured and set(_COLOUR_PROPERTIES) <= set(names) else ())]
@@ -225,14 +221,16 @@ def read_frame_folder(
     missing, a key or unit is unknown, or depth images have no intrinsics."""
     path = Path(folder)
     if not path.is_dir():
-        raise DataError("there is no such folder of frames", where=str(path), hint="check the path")
+        allowed = f"a folder with {STAMP_FILE} and clouds or depth images"
+        raise DataError("there is no such folder", where=str(path), allowed=allowed, hint="check the path")
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
     camera = validated_camera_pose(head.get("pose") if pose is None else pose, where)
     scale = metres_per_unit(str(unit or head.get("unit", "m")), where)
     frame = head.get("frame", "camera")
     if frame not in ("camera", "world"):
-        raise DataError(f"the frame of the clouds is '{frame}'", where=where, allowed="camera, world")
+        said = unknown_name_error_arguments(str(frame), ("camera", "world"))
+        raise DataError(f"the frame of the clouds is '{frame}'", where=f"{where}: frame", **said)
     intrinsics = _intrinsics(head.get("intrinsics"), where)
     names, times = _read_stamps(path / STAMP_FILE)
     _check_kinds(names, path, intrinsics)
@@ -262,7 +260,8 @@ def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) 
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             made = o3d.t.io.write_point_cloud(str(path / name), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
         if not made:
-            raise OutputError("the cloud cannot be written", where=str(path / name))
+            hint = "choose another folder, or free disk space"
+            raise OutputError("the cloud cannot be written", where=str(path / name), hint=hint)
     pose = sequence.camera_pose.tolist()
     head: dict[str, Any] = {"format": _FRAMES_FORMAT, "pose": pose, "frame": "camera", "unit": "m"}
     if sequence.intrinsics is not None:
@@ -286,11 +285,13 @@ def _read_camera(path: Path) -> dict[str, Any]:
         return {}
     head = files.read_input_json(path)
     if not isinstance(head, dict):
-        raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')
+        what, hint = "the file is not a JSON object", 'write {"pose": [[...], ...], "unit": "m"}'
+        raise DataError(what, where=str(path), allowed=f"an object with {', '.join(_CAMERA_FILE_KEYS)}", hint=hint)
     for key in (key for key in head if key not in _CAMERA_FILE_KEYS):
         raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_error_arguments(key, _CAMERA_FILE_KEYS))
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
-        raise DataError(f"the format of the frames is '{head['format']}'", where=str(path), allowed=_FRAMES_FORMAT)
+        what, hint = f"the format of the frames is '{head['format']}'", "update yid_ocp, or leave `format` out"
+        raise DataError(what, where=f"{path}: format", allowed=_FRAMES_FORMAT, hint=hint)
     return head
 
 
@@ -300,11 +301,12 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: CameraIntrinsic
         kind = Path(name).suffix.lower()
         if kind not in known:
             what = f"'{name}' is neither a cloud nor a depth image"
-            raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known))
+            hint = "remove the row, or convert the file"
+            raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known), hint=hint)
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
-            hint = "add `intrinsics` with width, height, fx, fy, cx, cy [pixels]"
-            what = "there are depth images but the camera's intrinsics are missing"
-            raise DataError(what, where=str(folder / _CAMERA_FILE), hint=hint)
+            what, hint = "the intrinsics of the camera are missing, which depth images need", "add `intrinsics`"
+            allowed = "intrinsics with width, height, fx, fy, cx, cy [pixels]"
+            raise DataError(what, where=str(folder / _CAMERA_FILE), allowed=allowed, hint=hint)
 
 
 def _intrinsics(entry: object, where: str) -> CameraIntrinsics | None:
@@ -314,7 +316,8 @@ def _intrinsics(entry: object, where: str) -> CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        raise DataError("the intrinsics are not complete", where=where, allowed=allowed)
+        what, hint = "the intrinsics lack keys, or have unknown ones", "correct the keys"
+        raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
     if not isinstance(coefficients, (list, tuple)) or not all(type(k) in (int, float) for k in coefficients):
@@ -325,27 +328,31 @@ def _intrinsics(entry: object, where: str) -> CameraIntrinsics | None:
 
 def _number(value: object, name: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
-        raise DataError(f"{name} is {value!r}", where=where, allowed="a positive number")
+        raise DataError(f"{name} is {value!r}", where=where, allowed="a finite number above 0")
     return float(value)
 
 
 def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
     allowed = "CSV with the columns file, t [s]"
     if not path.exists():
-        raise DataError("the frames have no time stamps", where=str(path), allowed=allowed)
+        what, hint = "the file of time stamps does not exist", "write it, with one row per frame"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     try:
         rows = list(csv.DictReader(files.read_input_text(path).splitlines()))
     except csv.Error as error:
-        raise DataError(f"the time stamps cannot be read ({error})", where=str(path), allowed=allowed) from error
+        what, hint = f"the time stamps are not CSV ({error})", "write the file again as CSV"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
     if not rows:
-        raise DataError("there is no frame", where=str(path), allowed=allowed)
+        what, hint = "the table of time stamps has no rows", "add one row per frame"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     if not {"file", "t"} <= set(rows[0]):
-        raise DataError(f"the columns are {', '.join(map(str, rows[0]))}", where=str(path), allowed=allowed)
+        what, hint = f"the columns are {', '.join(map(str, rows[0]))}", "rename the columns to file and t"
+        raise DataError(what, where=f"{path}, line 1", allowed=allowed, hint=hint)
     times = []
     for number, row in enumerate(rows, start=2):
         try:
             times.append(float(row["t"]))
         except (TypeError, ValueError) as error:
-            where = f"{path}, line {number}"
-            raise DataError(f"the time is {row['t']!r}", where=where, allowed="seconds, as a number") from error
+            where, hint = f"{path}, line {number}", "correct the time, or remove the row"
+            raise DataError(f"the time is {row['t']!r}", where=where, allowed="a number [s]", hint=hint) from error
     return tuple(str(row["file"]) for row in rows), np.array(times)

@@ -1,6 +1,6 @@
 """Read frame sequences from a folder, a ROS bag, an MCAP file, or a RealSense or Azure Kinect recording.
 
-Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`. Messages are
+Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`. They are
 read on demand."""
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str |
     name = _topic(bag, topic)
     messages, stamps = _frames(bag, name)
     if not messages:
-        raise DataError(f"there is no message on the topic '{name}'", where=str(path))
+        raise _empty_topic(bag, name)
     is_cloud = name in bag.topic_names_of_types(_CLOUD_MESSAGE)
     lens, per_metre = (None, 1.0) if is_cloud else (_lens(bag, name), _depth_unit(bag, name))
     where = f"{path}: {name}"
@@ -89,14 +89,20 @@ def _decoded(bag: OpenBag, message: BagMessage) -> Any:
         for number, (_, _, data) in enumerate(found):
             if number == before:
                 return bag.reader.deserialize(data, connection.msgtype)
-    raise DataError("the bag has changed since it was opened", where=str(bag.path))
+    what, allowed = "the bag has changed since it was opened", "a bag that is not being written"
+    raise DataError(what, where=str(bag.path), allowed=allowed, hint="run the command again once it is complete")
 
 
 def _first(bag: OpenBag, topic: str) -> Any:
     with bag.read_errors_as_data_errors():
         for connection, _, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
             return bag.reader.deserialize(data, connection.msgtype)
-    raise DataError(f"there is no message on the topic '{topic}'", where=str(bag.path))
+    raise _empty_topic(bag, topic)
+
+
+def _empty_topic(bag: OpenBag, topic: str) -> DataError:
+    what, allowed = f"there is no message on the topic '{topic}'", "a topic with one message or more"
+    return DataError(what, where=str(bag.path), allowed=allowed, hint="choose another topic with track.frame_topic")
 
 
 def _depth_unit(bag: OpenBag, topic: str) -> float:
@@ -117,7 +123,7 @@ def _topic(bag: OpenBag, wanted: str | None) -> str:
     if len(deep) == 1:
         return deep[0]
     if deep:
-        what, hint = f"the bag has {len(deep)} topics of clouds or depth images", "say which one with track.frame_topic"
+        what, hint = f"the bag has {len(deep)} topics of clouds or depth images", "choose one with track.frame_topic"
         raise DataError(what, where=str(bag.path), allowed=", ".join(deep), hint=hint)
     encoded = f"{_IMAGE_MESSAGE} with the encoding {' or '.join(_DEPTH_ENCODINGS)}, not compressed"
     raise bag.no_usable_topics_error("the bag has no clouds and no depth images", f"{_CLOUD_MESSAGE}, or {encoded}")
@@ -136,7 +142,7 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
-        what = f"the camera's intrinsics are not known: the bag has {len(nearest)} topics that may hold them"
+        what = f"the intrinsics of the camera are not known: the bag has {len(nearest)} topics that may have them"
         allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
         raise DataError(what, where=str(bag.path), allowed=allowed, hint=f"record {beside_it}/camera_info as well")
     info = _first(bag, nearest[0])
@@ -150,7 +156,8 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     fx, _, cx, _, fy, cy = matrix[:6]
     if not (fx > 0 and fy > 0):
         hint = "calibrate the camera, or write a folder of frames with camera.json"
-        raise DataError("the camera is not calibrated: its focal length is 0", where=nearest[0], hint=hint)
+        what, allowed = "the camera is not calibrated: its focal length is 0", "a focal length above 0 [pixels]"
+        raise DataError(what, where=f"{bag.path}: {nearest[0]}", allowed=allowed, hint=hint)
     model = {"": "plumb_bob", "fisheye": "equidistant"}.get(str(info.distortion_model), str(info.distortion_model))
     return CameraIntrinsics(*size, fx, fy, cx, cy, model, tuple(bent))
 
@@ -158,13 +165,17 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
 def _depth(content: Any, per_metre: float, where: str) -> Array:
     encoding = str(content.encoding)
     if encoding not in _DEPTH_ENCODINGS:
-        raise DataError(f"the image is encoded as '{encoding}'", where=where, allowed=", ".join(_DEPTH_ENCODINGS))
+        what, hint = f"the image has the encoding '{encoding}'", "choose a topic of depth images with track.frame_topic"
+        raise DataError(what, where=where, allowed=", ".join(_DEPTH_ENCODINGS), hint=hint)
     kind, size = _DEPTH_ENCODINGS[encoding]
     pixel = np.dtype((">" if content.is_bigendian else "<") + kind)
     height, width, step = int(content.height), int(content.width), int(content.step)
     data = np.asarray(content.data, np.uint8).tobytes()
     if step < width * pixel.itemsize or len(data) < height * step:
-        raise DataError(f"the image has {len(data)} bytes for {width} x {height} pixels", where=where)
+        what = f"the image has {len(data)} bytes for {width} x {height} pixels"
+        allowed = f"at least {height * max(step, width * pixel.itemsize)} bytes"
+        hint = "record the bag again, or leave this frame out"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     image = np.ndarray((height, width), pixel, data, strides=(step, pixel.itemsize))
     return image.astype(np.float64) * (size * per_metre)
 
@@ -181,7 +192,9 @@ def _cloud_columns(content: Any, names: Iterable[str], where: str) -> list[NDArr
         kind = np.dtype(order + _POINT_FIELD_TYPES.get(int(fields[name].datatype), "u1"))
         offset = int(fields[name].offset)
         if offset + kind.itemsize > step or row < width * step or len(data) < height * row:
-            raise DataError(f"the cloud has {len(data)} bytes for {width} x {height} points of {step}", where=where)
+            what = f"the cloud has {len(data)} bytes for {width} x {height} points of {step} bytes"
+            allowed, hint = "all bytes of all points", "record the bag again, or leave this frame out"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
         found.append(np.ndarray((height, width), kind, data, offset, (row, step)).ravel())
     return found
 
@@ -190,7 +203,8 @@ def _points(content: Any, where: str) -> Array:
     axes = _cloud_columns(content, "xyz", where)
     if axes is None:
         names = ", ".join(str(field.name) for field in content.fields)
-        raise DataError(f"the cloud has the fields {names}", where=where, allowed="x, y, z among them")
+        hint = "choose another topic with track.frame_topic"
+        raise DataError(f"the cloud has the fields {names}", where=where, allowed="the fields x, y and z", hint=hint)
     return np.stack([axis.astype(np.float64) for axis in axes], axis=1)
 
 
@@ -228,8 +242,10 @@ def read_frames(
     if place.exists():
         bags = ", ".join(_BAG_SUFFIXES)
         allowed = f"a folder with {STAMP_FILE}, a bag ({bags}) or an Azure Kinect's {_AZURE_KINECT_SUFFIX}"
-        raise DataError("this is no sequence of frames", where=str(place), allowed=allowed)
-    raise DataError("there is no such folder of frames, and no such file", where=str(place), hint="check the path")
+        what, hint = "this is not a sequence of frames", "check the path"
+        raise DataError(what, where=str(place), allowed=allowed, hint=hint)
+    allowed = "a folder of frames, a bag or a video"
+    raise DataError("there is no such file or folder", where=str(place), allowed=allowed, hint="check the path")
 
 
 _FILM_HINT = "write its depth images as 16-bit PNG into a folder with camera.json and timestamps.csv"
@@ -243,13 +259,13 @@ class _Film:
 
     def __init__(self, path: Path) -> None:
         self.path, self._kind = path, getattr(import_open3d().io, "AzureKinectMKVReader", None)
-        what = "this build of Open3D cannot read the videos of Azure Kinects"
+        what, allowed = "this build of Open3D cannot read the videos of Azure Kinects", "a folder of frames"
         if self._kind is None:
-            raise DataError(what, where=str(path), hint=_FILM_HINT)
+            raise DataError(what, where=str(path), allowed=allowed, hint=_FILM_HINT)
         try:
             self._rewind()
         except RuntimeError as error:  # Open3D loads the camera's own library on demand
-            raise DataError(f"{what} here ({error})", where=str(path), hint=_FILM_HINT) from error
+            raise DataError(f"{what} ({error})", where=str(path), allowed=allowed, hint=_FILM_HINT) from error
         if not self.reader.is_opened():
             allowed = "an Azure Kinect's .mkv"
             raise DataError("the video cannot be read", where=str(path), allowed=allowed, hint=_FILM_HINT)
@@ -277,10 +293,12 @@ class _Film:
         while self._index < index:
             self._last = self.reader.next_frame()
             if self.reader.is_eof():
-                raise DataError("the video ends before this frame", where=str(self.path))
+                what, where = "the video ends before this frame", f"{self.path}, frame {self._index}"
+                raise DataError(what, where=where, allowed="a complete video", hint="copy the video again")
             self._index += 1
         if self._last is None:
-            raise DataError("the video has no image there", where=f"{self.path}, frame {index}")
+            what, where = "the video has no image in this frame", f"{self.path}, frame {index}"
+            raise DataError(what, where=where, allowed="a complete video", hint="copy the video again")
         return self._last
 
 
@@ -293,7 +311,8 @@ def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
     lens = CameraIntrinsics(int(inner.width), int(inner.height), matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     count = film.count()
     if not count:
-        raise DataError("the video has no frame", where=str(path))
+        what, allowed = "the video has no frame", "one frame or more"
+        raise DataError(what, where=str(path), allowed=allowed, hint="copy the video again, or record it again")
     times = 1e-6 * float(metadata.stream_length_usec) * np.arange(count) / count
 
     def depth(index: int) -> Array:

@@ -210,7 +210,8 @@ def tracked_states_and_points(
         limit = f"the best within {best:.0f} mm, max_seen_point_std is {1e3 * options.max_seen_point_std:g} mm"
         what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
         check = f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame"
-        raise DataError(what, where=source, hint=_hint(sizes, things, check))
+        allowed = f"a frame with a point known within {1e3 * options.max_seen_point_std:g} mm"
+        raise DataError(what, where=source, allowed=allowed, hint=_hint(sizes, things, check))
     position, std, shared = (np.where(unseen[..., None], np.nan, entry) for entry in (position, std, shared))
     return t, np.array([fit.q for fit in fits]), position, std, shared
 
@@ -228,8 +229,9 @@ def _none_good(
     )
     cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFIT_REASONS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
-    hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(sizes, things, hint)
-    return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
+    hint = "set unit: mm in camera.json" if "metres" in listed else _hint(sizes, things, hint)
+    what, allowed = f"{cause}no frame could be used: {listed}", "one usable frame or more"
+    return DataError(what, where=source, allowed=allowed, hint=hint)
 
 
 def _because(sizes: TubeDimensionEstimates, matters: bool) -> str:

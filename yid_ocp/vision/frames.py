@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, missing_package_error, unknown_name_error_arguments
 from yid_ocp.model.mechanism import homogeneous_transform
 
 PointColourArray = NDArray[np.uint8]
@@ -42,8 +42,8 @@ _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 class CameraIntrinsics:
     """Intrinsics of a camera with axes x right, y down, z forward. `DataError` for an unknown distortion model.
 
-    Focal lengths fx, fy and principal point (cx, cy) are in pixels; without distortion u = fx x/z + cx, v = fy y/z +
-    cy."""
+    fx, fy (focal lengths) and (cx, cy) (principal point) are in pixels; without distortion u = fx x/z + cx, v = fy y/z
+    + cy."""
 
     width: int
     height: int
@@ -57,11 +57,12 @@ class CameraIntrinsics:
     def __post_init__(self) -> None:
         if self.has_distortion and self.model not in _DISTORTION_COEFFICIENT_COUNTS:
             known = unknown_name_error_arguments(self.model, _DISTORTION_COEFFICIENT_COUNTS)
-            raise DataError(f"the distortion is '{self.model}'", where="intrinsics", **known)
+            raise DataError(f"the distortion model is '{self.model}'", where="intrinsics", **known)
         count = _DISTORTION_COEFFICIENT_COUNTS.get(self.model, ())
         if self.has_distortion and (len(self.coefficients) not in count or not np.isfinite(self.coefficients).all()):
             what = f"the distortion '{self.model}' has the coefficients {self.coefficients}"
-            raise DataError(what, where="intrinsics", allowed=f"{' or '.join(map(str, count))} numbers")
+            allowed = f"{' or '.join(map(str, count))} finite numbers"
+            raise DataError(what, where="intrinsics: coefficients", allowed=allowed)
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal: float) -> CameraIntrinsics:
@@ -93,7 +94,9 @@ class CameraIntrinsics:
     def measured_depth_mask(self, depth: Array) -> BoolArray:
         """Mask (height, width) of measured pixels in a depth image. Raises `DataError` for another size."""
         if depth.shape != (self.height, self.width):
-            raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
+            allowed = f"({self.height}, {self.width}), as the intrinsics say"
+            hint = "correct the intrinsics, or the image"
+            raise DataError(f"the image has shape {depth.shape}", where="depth image", allowed=allowed, hint=hint)
         return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays_at_unit_depth[..., 0]))
 
     def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
@@ -149,7 +152,6 @@ XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58
 @cache
 def import_open3d() -> ModuleType:
     """Import the open3d package. Raises `DataError` if it is not installed or cannot be loaded."""
-    hint = "pip install 'yid-ocp[vision]'"
     with contextlib.suppress(ImportError, OSError):  # the system may have its own
         # the wheel of open3d wants the system's libusb, which a bare machine does not have
         import libusb_package
@@ -158,7 +160,9 @@ def import_open3d() -> ModuleType:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        raise DataError(f"vision needs Open3D, which cannot be loaded ({error})", hint=hint) from error
+        raise missing_package_error(
+            DataError, f"vision needs Open3D, which cannot be loaded ({error})", "vision"
+        ) from error
     return open3d
 
 
@@ -205,17 +209,20 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
     """Camera pose (4, 4) after checks. Raises `DataError` if it is missing or not a rigid transform."""
-    hint = "give the camera in the world as a 4x4 matrix, x right, y down, z ahead, translation in metres"
+    allowed = "a 4x4 matrix from camera to world coordinates: x right, y down, z forward, translation in metres"
+    hint = "set track.camera_pose, or `pose` in camera.json"
     if pose is None:
-        raise DataError("the pose of the camera is missing", where=where, hint=hint)
+        raise DataError("the pose of the camera is missing", where=where, allowed=allowed, hint=hint)
     try:
         matrix = np.asarray(pose, float)
     except (TypeError, ValueError) as error:
-        raise DataError("the pose of the camera is not a matrix of numbers", where=where, hint=hint) from error
+        what = "the pose of the camera is not a matrix of numbers"
+        raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     good = matrix.shape == (4, 4) and np.isfinite(matrix).all() and np.allclose(matrix[3], [0, 0, 0, 1])
     turn = matrix[:3, :3] if good else -np.eye(3)
     if not (np.allclose(turn.T @ turn, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0):
-        raise DataError("the pose of the camera is not a rigid transform", where=where, allowed="4x4", hint=hint)
+        what, hint = "the pose of the camera is not a rigid transform", "make the axes orthonormal and right-handed"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     return matrix
 
 

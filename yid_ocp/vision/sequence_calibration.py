@@ -102,8 +102,7 @@ def group_foreign_clusters(
     """Group the foreign clusters of all frames, each with its time [s], into foreign objects with advice.
 
     `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
-    `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already
-    removed."""
+    `links` gives the poses (4, 4) of the robot's links at a time. `background`: static points are already removed."""
     groups: list[list[tuple[float, ForeignCluster]]] = []
     for t, thing in ((t, thing) for t, seen in things for thing in seen):
         home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)

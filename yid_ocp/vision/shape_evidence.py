@@ -327,8 +327,8 @@ def nearest_surface_residuals(
 ) -> _SurfaceResiduals:
     """Residuals e = |p - c| - f r of points p (N, 3); c is the nearest axis point, f = `share` of the radius r.
 
-    Links `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest to a tube's far side is assigned to
-    the near side."""
+    Links `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest to a tube's far side is given to the
+    near side."""
     link, along, normal, distance = tube_link_projections(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
     error = sign * distance - share * radius[link]

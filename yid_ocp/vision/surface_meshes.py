@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, ModelError, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, is_file, json_sha256, read_input_text
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism, homogeneous_transform, rotation_from_rpy
@@ -204,8 +204,7 @@ class ArticulatedSurfaces:
     ) -> tuple[Array, Array, IntArray]:
         """Render noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
 
-        All have shape (height, width), with inf, 0 and -1 for pixels without a surface. `pose` (4, 4) is in the
-        world."""
+        All have shape (height, width), with inf, 0 and -1 where there is no surface. `pose` (4, 4) is in the world."""
         rays, camera = pinhole.pixel_rays_at_unit_depth, np.asarray(pose, float)
         size = rays.shape[:2]
         depth, cosine, owner = np.full(size, np.inf), np.zeros(size), np.full(size, -1)
@@ -224,8 +223,7 @@ class ArticulatedSurfaces:
         return depth, cosine, owner
 
     def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, IntArray]:
-        """Find the first intersection of rays, from `origin` (3,) in the world along `directions` (N, 3), with any
-        surface.
+        """Find where rays, from `origin` (3,) in the world along `directions` (N, 3), first meet a surface.
 
         Returns distances (N,) in multiples of the direction vectors, unit normals (N, 3) that face the origin, and part
         indices (N,). A ray without intersection has distance inf, normal zero and part -1."""
@@ -276,12 +274,14 @@ def load_robot_meshes_by_joint(
 
     path = resolve_urdf_path(urdf)
     if not is_file(path):
-        raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME")
+        what, allowed = f"there is no URDF file '{path}'", "the path of a URDF file, or package:NAME"
+        raise ModelError(what, where=str(urdf), allowed=allowed, hint="check the path")
     bare = {"build_scene_graph": False, "load_meshes": False, "load_collision_meshes": False}
     try:
         robot = yourdfpy.URDF.load(str(check_input_file(path)), **bare)
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
-        raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
+        what, hint = f"the URDF cannot be read: {error}", "check it with check_urdf, or export it again"
+        raise ModelError(what, where=str(path), allowed="a URDF file with links and joints", hint=hint) from error
     parts: dict[int, list[TriangleMesh]] = {}
     for link in robot.robot.links:
         for shape in (link.visuals if kind == "visual" else link.collisions) if link.name in mechanism.frames else ():
@@ -296,7 +296,8 @@ def load_robot_meshes_by_joint(
                 joint, placement = _carrier(mechanism, link.name)
                 parts.setdefault(joint, []).append(mesh.transformed(placement @ origin))
     if not parts:
-        raise ModelError(f"the URDF has no {kind} meshes", where=str(path), hint="choose the other kind")
+        what, hint = f"the URDF has no {kind} meshes", "choose the other kind: track.options.robot_mesh_kind"
+        raise ModelError(what, where=str(path), allowed="a URDF with meshes or primitive shapes", hint=hint)
     return {joint: TriangleMesh.concatenate(entries) for joint, entries in parts.items()}
 
 
@@ -329,7 +330,7 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
 def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
     """Load meshes missing from the URDF, by joint index (-1: the world).
 
-    Raises `ConfigError` if a link does not exist or an entry has not exactly one shape, `ModelError` if a file is
+    Raises `ConfigError` if a link does not exist or an entry has not one shape, `ModelError` if a file is
     unreadable."""
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
@@ -340,24 +341,21 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
             if getattr(entry, kind) is not None
         ]
         if len(given) != 1:
-            found = " and ".join(given) or "no shape"
-            raise ConfigError(
-                f"there is {found}",
-                where=where,
-                allowed="one of mesh, box_size, cylinder_radius_and_length, sphere_radius",
-            )
+            what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "keep or add one shape"
+            allowed = "one of mesh, box_size, cylinder_radius_and_length, sphere_radius"
+            raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         mesh = _solid(entry.box_size, entry.cylinder_radius_and_length, entry.sphere_radius)
         if entry.mesh is not None:
             if not is_file(Path(entry.mesh)):
-                hint = "give a file that trimesh reads: STL, OBJ, DAE"
-                raise ModelError(f"there is no mesh '{entry.mesh}'", where=where, hint=hint)
+                what, allowed = f"there is no mesh file '{entry.mesh}'", "an STL, OBJ or DAE file"
+                raise ModelError(what, where=where, allowed=allowed, hint="check the path")
             mesh = _load_mesh_file(Path(entry.mesh))
         assert mesh is not None
         joint, placement = -1, np.eye(4)
         if entry.parent_frame is not None:
             if entry.parent_frame not in mechanism.frames:
-                hint = nearest_name_hint(entry.parent_frame, list(mechanism.frames))
-                raise ConfigError(f"there is no link '{entry.parent_frame}'", where=where, hint=hint)
+                said = unknown_name_error_arguments(entry.parent_frame, mechanism.frames)
+                raise ConfigError(f"there is no link '{entry.parent_frame}'", where=where, **said)
             joint, placement = _carrier(mechanism, entry.parent_frame)
         pose = placement @ homogeneous_transform(rotation_from_rpy(*entry.rpy), entry.xyz)
         made.setdefault(joint, []).append(mesh.transformed(pose))
@@ -376,7 +374,8 @@ def _mesh_of_file(file: Path, changed: int) -> TriangleMesh:
     try:
         return TriangleMesh._of(trimesh.load(check_input_file(file, _MAX_MESH_BYTES), force="mesh"))
     except Exception as error:  # trimesh's readers raise many kinds
-        raise ModelError(f"the mesh cannot be read: {error}", where=str(file)) from error
+        what, hint = f"the mesh cannot be read: {error}", "export it again as STL or OBJ"
+        raise ModelError(what, where=str(file), allowed="an STL, OBJ or DAE file", hint=hint) from error
 
 
 def _resolve_mesh_path(name: str, urdf: Path) -> Path:
@@ -390,7 +389,8 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
         candidates = [above / Path(*rest) for above in urdf.parents for rest in (parts, parts[1:]) if rest]
     if found := next((candidate for candidate in candidates if candidate.is_file()), None):
         return found
-    raise ModelError(f"the mesh '{name}' is not there", where=str(urdf), hint="keep meshes beside the URDF's package")
+    what, allowed = f"the mesh file '{name}' does not exist", "meshes where the URDF refers to them"
+    raise ModelError(what, where=str(urdf), allowed=allowed, hint="put the meshes into the package of the URDF")
 
 
 def tube_link_lengths_and_radii(
@@ -408,7 +408,8 @@ def tube_link_lengths_and_radii(
 def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
     """Cylinders along the object's links, joined by balls, in joint frames by joint. `DataError` without tubes."""
     if not system.segment_layouts:
-        raise DataError("the model has no object to see", hint="give it segments")
+        what, hint = "the model has no object to see", "set model.object with segments"
+        raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
     meshes, sizes = dict[int, TriangleMesh](), tube_link_lengths_and_radii(system, values)
     for segment in system.segment_layouts:
         lengths, radius = sizes[segment.name]
@@ -503,7 +504,7 @@ class CameraTimingModel:
     def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
         if not self.mean_rate > 0:
-            raise ConfigError(f"mean_rate = {self.mean_rate}", allowed="mean_rate > 0")
+            raise ConfigError(f"mean_rate = {self.mean_rate}", where="mean_rate", allowed="a number above 0 [Hz]")
         count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
         taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
         taken = taken[taken < stop]

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.vision import frame_selection, point_cloud, sequence_calibration, surface_meshes
 from yid_ocp.vision.calibration import (
@@ -71,8 +71,7 @@ def track_object(
     DataError
         Joint angles are missing, time stamps come from another clock, or no frame is good (with the reasons).
     ConfigError, ModelError
-        A point does not exist in the system; meshes cannot be read.
-    """
+        A point does not exist in the system; meshes cannot be read."""
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_sequence_calibration()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
@@ -117,7 +116,8 @@ class FrameTracker:
         anywhere = options.root_placement != "model"
         if anywhere and scene.robot_urdf is not None:
             hint = "set track.options.root_placement to model, or model.robot to null"
-            raise ConfigError("a robot holds the object: its root is where the model has it", where="root", hint=hint)
+            what, where = "a robot holds the object, so the model determines its root", "track.options.root_placement"
+            raise ConfigError(what, where=where, allowed="model", hint=hint)
         if anywhere:
             system, self._loose = system_with_free_root(system, values)
         self.system, self.parameter_values = system, values
@@ -134,7 +134,9 @@ class FrameTracker:
         if scene.robot_urdf is not None:
             robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in robot):
-                raise ModelError("no link of the robot moves with the model's joints", where=str(scene.robot_urdf))
+                what, where = "no joint of the model moves a link of the robot", str(scene.robot_urdf)
+                allowed, hint = "the URDF of the model's robot", "check model.robot and model.arms.joints"
+                raise ModelError(what, where=where, allowed=allowed, hint=hint)
             meshes |= {joint: [mesh, *meshes.get(joint, ())] for joint, mesh in robot.items()}
         whole = {joint: TriangleMesh.concatenate(parts) for joint, parts in meshes.items()}
         self.robot_surfaces = ArticulatedSurfaces(tree, whole) if whole else None
@@ -148,7 +150,8 @@ class FrameTracker:
         self._check_clock(usable)
         if options.filters.object_colours and sequence.load_colours is None:
             hint = "leave track.options.filters.object_colours out, or record clouds with colours"
-            raise DataError("the clouds have no colours", where=sequence.source, hint=hint)
+            allowed = "clouds with colours"
+            raise DataError("the clouds have no colours", where=sequence.source, allowed=allowed, hint=hint)
         self._asked = _spread(usable, _MAX_SIZED_FRAMES)
         self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
@@ -221,9 +224,9 @@ class FrameTracker:
         (begin, end), reach = self.joint_time_span, self.options.clock.search_half_width
         if first > end + reach or last < begin - reach:
             spans = f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {begin:.3f} s to {end:.3f} s"
-            hint = f"give the clock offset (stamp minus joint time): {first + offset - begin:.3f} s if both started"
-            where = self.sequence.source
-            raise DataError(f"{spans}: their clocks are not the same", where=where, hint=f"{hint} together")
+            hint = f"set track.options.clock.initial_offset, {first + offset - begin:.3f} s if both started together"
+            what, where = f"the clocks differ: {spans}", self.sequence.source
+            raise DataError(what, where=where, allowed="times that overlap", hint=hint)
 
     def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
         """The shape fitter with the estimated dimensions of the object."""
@@ -457,8 +460,8 @@ def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str,
     held = {grasp.held_frame for grasp in system.grasps}
     for name in wanted or ():
         if name not in system.point_frames:
-            hint = nearest_name_hint(name, system.point_frames)
-            raise ConfigError(f"there is no point '{name}'", where="track options: points", hint=hint)
+            said = unknown_name_error_arguments(name, system.point_frames)
+            raise ConfigError(f"there is no point '{name}'", where="track.options.points", **said)
     free = tuple(name for name in system.point_frames if name not in held) or system.point_frames
     return free if wanted is None else wanted
 
@@ -471,15 +474,18 @@ def _joint_angles(
         return None, None
     need = "which the self-filter and the grasps need"
     if recording is None:
-        hint = "list the recording that was made with the frames under recordings.estimate, or set model.robot to null"
-        raise DataError(f"there is no recording with the joint angles, {need}", where="track", hint=hint)
+        hint = "list the recording of the same time under recordings.estimate, or set model.robot to null"
+        what, allowed = f"there is no recording with the joint angles, {need}", "the joint angles during the frames"
+        raise DataError(what, where="recordings.estimate", allowed=allowed, hint=hint)
     joints = recording.joints
     if joints is None:
-        raise DataError(f"the recording has no joint angles, {need}", where=recording.name)
+        what, where = f"the recording has no joint angles, {need}", f"recording '{recording.name}'"
+        hint = "give the recording with the joints, or set model.robot to null"
+        raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
     for name in known:
         if name not in joints.names:
-            where, hint = f"{recording.name}: joints", nearest_name_hint(name, joints.names)
-            raise DataError(f"joint '{name}' of the model is not recorded", where=where, hint=hint)
+            where, said = f"recording '{recording.name}': joints", unknown_name_error_arguments(name, joints.names)
+            raise DataError(f"joint '{name}' of the model is not recorded", where=where, **said)
     t, position = joints.t, joints.position[:, [joints.names.index(name) for name in known]]
     return (float(t[0]), float(t[-1])), lambda at: np.array([np.interp(at, t, column) for column in position.T])
 

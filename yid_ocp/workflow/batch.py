@@ -19,7 +19,7 @@ from typing import Any
 from yid_ocp.analysis.estimate_history import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
+from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_question
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_strict_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.html import write_report, write_shared_plotly_script
@@ -71,10 +71,12 @@ def batch_runs_from_configs(
     for i, path in enumerate(paths):
         if not path.is_file():
             near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            hint = nearest_name_hint(path.name, near) if near else "check the path"
-            raise ConfigError("there is no such configuration file", where=str(path), hint=hint)
+            what = "there is no such configuration file"
+            hint = nearest_name_question(path.name, near) or "check the path"
+            raise ConfigError(what, where=str(path), allowed="a YAML file", hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
-            raise ConfigError("a configuration is given twice", where=str(path), hint="list every one once")
+            what, allowed = "the configuration is given twice", "every configuration once"
+            raise ConfigError(what, where=str(path), allowed=allowed, hint="leave one of them out")
     entries = [(path.stem, path, tuple(overrides)) for path in paths]
     if recordings is not None:
         files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
@@ -107,8 +109,8 @@ def run_batch(
 
     The batch is successful if all runs are; a failed run states its reason. The folder `out` contains `runs/NAME/` (run
     folders), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which
-    shows `command_line`. Raises `OutputError` if `out` holds something else or cannot be created, and `WorkerError` as
-    in `run_tasks`."""
+    shows `command_line`. Raises `OutputError` if `out` holds something else or cannot be created; `WorkerError` as in
+    `run_tasks`."""
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)
     results: dict[str, TaskResult] = {}
@@ -208,5 +210,6 @@ def _folder(path: Path) -> Path:
             raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another name with --out")
         (folder / _RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"the folder cannot be made: {os_error_reason(error)}", where=str(folder)) from error
+        what, hint = f"the folder cannot be made: {os_error_reason(error)}", "choose another --out in a writable folder"
+        raise OutputError(what, where=str(folder), hint=hint) from error
     return folder

@@ -72,7 +72,8 @@ def _slice_numbers(text: str) -> tuple[int, int]:
     """K and N of `K/N`. Raises `ConfigError` for any other text."""
     own, _, of = text.partition("/")
     if not (own.isdigit() and of.isdigit() and 1 <= int(own) <= int(of)):
-        raise ConfigError(f"'{text}' is no slice", where="--slice", allowed="K/N, K from 1 to N")
+        hint = "write for example --slice 1/4"
+        raise ConfigError(f"'{text}' is not a slice", where="--slice", allowed="K/N, with K from 1 to N", hint=hint)
     return int(own), int(of)
 
 
@@ -99,7 +100,7 @@ def run_blind(
     and pictures. A calibration ensemble also has `thresholds.json` (`yid-calibration/1`). Raises `OutputError` if the
     folder holds another ensemble."""
     if count < 1:
-        raise runs[0].config_error(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
+        raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
     if seed < 0:
         raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
     for entry in runs:
@@ -107,8 +108,8 @@ def run_blind(
     names = [entry.name for entry in runs]
     for i, name in enumerate(names):
         if name in names[:i]:
-            what, hint = f"two configurations are called {name}", "give each a name of its own"
-            raise ConfigError(what, where="blind", hint=hint)
+            what, where = f"two configurations are called {name}", str(runs[i].config_file)
+            raise ConfigError(what, where=where, allowed="a name of its own for each", hint="rename one of the files")
     proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers, part)
     try:
         commitment, cases = proof.commit()
@@ -172,8 +173,10 @@ class _Proof:
         asked["slice"] = "/".join(map(str, self.part))
         if {key: said[key] for key in asked} != asked:
             holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
-            hint = "choose another folder, or the same configurations, --cases, --seed and --calibration"
-            raise OutputError(f"'{self.folder}' holds another ensemble ({holds})", where="--out", hint=hint)
+            hint = "choose another --out, or the same configurations, --cases, --seed and --calibration"
+            what = f"the folder holds another ensemble ({holds})"
+            allowed = "a new folder, or the same ensemble to complete"
+            raise OutputError(what, where=str(self.folder), allowed=allowed, hint=hint)
         tasks = []
         for entry in read_input_json(self.folder / "cases" / "cases.json"):
             config, _, variation = str(entry["experiment"]).rpartition(".")
@@ -190,7 +193,9 @@ class _Proof:
             for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
                 part.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"the folder cannot be made: {error}", where=str(self.folder)) from error
+            what = f"the folder cannot be made: {error.strerror}"
+            hint = "choose another --out in a writable folder"
+            raise OutputError(what, where=str(self.folder), hint=hint) from error
         for name, text in configs.items():
             write_text(self.config_file(name), text)
         files = {name: self.config_file(name) for name in configs}
@@ -201,7 +206,7 @@ class _Proof:
         plan = [entry for entry in whole if entry.number % of == own - 1]
         if not plan:
             what, allowed = f"slice {own}/{of} of {self.count} cases is empty", f"at most {self.count} slices"
-            raise ConfigError(what, where="--slice", allowed=allowed)
+            raise ConfigError(what, where="--slice", allowed=allowed, hint="use fewer slices, or more --cases")
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
         self.progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
         told = {name: {"experiment": vars(experiments[name])} for name in used}
@@ -410,8 +415,8 @@ class _BlindExperiment:
         varied, run = EXPERIMENT_VARIATIONS[self.variation], load_config(self.config_file)
         first = read_recordings_of_role(run, count=1)
         if not first:
-            what = "there is no recording with the start of the arms"
-            raise run.config_error(what, "recordings", "estimate", hint="list one")
+            what, allowed = "there is no recording with the start of the arms", "one recording or more"
+            raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
         system = build_system(self.simulation_settings())
         vision = not varied.is_without_object and any(group.pose is not None for group in first[0].points)
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
@@ -425,9 +430,9 @@ class _BlindExperiment:
                 continue  # the motion throws the object about; draw another
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
-        hint = "give the object more damping, or start the arms where it hangs at rest"
-        what = f"none of {blind.MAX_CASE_DRAWS} motions can be simulated"
-        raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
+        hint = "give the object more damping, or start the arms where it hangs in equilibrium"
+        what, allowed = f"none of {blind.MAX_CASE_DRAWS} motions can be simulated", "a motion that MuJoCo can simulate"
+        raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", allowed=allowed, hint=hint)
 
     def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.BlindCaseGenerator]:
         return _ensemble(self, first, first.stat().st_mtime_ns)
@@ -456,12 +461,13 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
 
 def _require_compatible(run: RunSettings) -> None:
     if run.diagnosis.noise_fraction_of_std < 1 or any(entry.std is not None for entry in run.sensors.values()):
-        what = "virtual recordings have the noise of `run_virtual_experiment`, not that of these settings"
-        raise run.config_error(what, "sensors", hint="leave sensors.*.std and diagnosis.noise_fraction_of_std out")
+        what = "the settings have noise levels, but virtual recordings have the noise of `run_virtual_experiment`"
+        allowed, hint = "settings without noise levels", "leave sensors.*.std and diagnosis.noise_fraction_of_std out"
+        raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:
-        allowed = "a robot whose arms are driven by torques, nothing prescribed"
-        raise run.config_error("a blind proof moves driven arms", "model", "arms", "mode", allowed=allowed)
+        what, hint = "a blind proof needs arms that are driven by torques", "set model.arms.mode: driven"
+        raise run.config_error(what, "model", "arms", "mode", allowed="driven, without servos", hint=hint)
 
 
 def _blind_experiments_and_refinable_subset(

@@ -53,15 +53,18 @@ def join_slices(
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
         part = read_input_json(path)
         if part.get("format") != _SLICE_FORMAT:
-            raise DataError("this is no slice of an ensemble", where=str(path), allowed=f"a file {_SLICE_FORMAT}")
+            what, hint = "this is not a slice of an ensemble", "give a folder of `yid-ocp blind`, or its slice.json"
+            raise DataError(what, where=str(path), allowed=f"the format {_SLICE_FORMAT}", hint=hint)
         _, digest = blind.labels_json_and_sha256(_labels(part))
         if digest != part["labels_sha256"] or _ensemble_sha256(part) != part["ensemble_sha256"]:
-            raise DataError("labels or settings are not those that were committed to", where=str(path))
+            what, hint = "labels or settings differ from the commitment", "copy the slice again from where it was made"
+            raise DataError(what, where=str(path), allowed="the hashes in the file", hint=hint)
         if found and part["ensemble_sha256"] != found[0]["ensemble_sha256"]:
-            what, hint = "the slice is of another ensemble", "slices count together that have one ensemble_sha256"
+            what, hint = "the slice is of another ensemble", "join only slices with the same ensemble_sha256"
             raise DataError(what, where=str(path), allowed=str(found[0]["ensemble_sha256"]), hint=hint)
         if part["slice"] in [own["slice"] for own in found]:
-            raise DataError(f"slice {part['slice']} is given twice", where=str(path), hint="leave one of them out")
+            what, allowed = f"slice {part['slice']} is given twice", "every slice once"
+            raise DataError(what, where=str(path), allowed=allowed, hint="leave one of them out")
         found.append(part)
     folder, first = make_folder(out), found[0]
     for name in ("configs", "sealed", "answers", "best"):

@@ -20,7 +20,7 @@ from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.effects.bodies import with_link_mass_parameters
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, with_sign_smoothing_speed
 from yid_ocp.effects.law import make_law, read_law_tables
-from yid_ocp.errors import ConfigError, DataError, YidError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
@@ -69,8 +69,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             raise unknown_name_error(run, "joint", name, joints, "model", "arms", "passive_joints", i)
     moved = tuple(name for name in joints if name not in arms.passive_joints)
     if robot is None and not objects:
-        hint = "set model.robot or model.object"
-        raise run.config_error("the model has neither a robot nor an object", "model", hint=hint)
+        what, allowed = "the model has neither a robot nor an object", "a robot, an object or both"
+        raise run.config_error(what, "model", allowed=allowed, hint="set model.robot or model.object")
     with add_setting_location_to_errors(run, "model", "frames"):
         carrier, items = _with_extra_frames(run, robot if clamps is None else clamps, [item for item, *_ in objects])
     with add_setting_location_to_errors(run, "model"):
@@ -166,12 +166,12 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
     for key in ("robot", "grasp", "springs", "moving_clamps", "frames"):
         if getattr(run.model, key):
-            what = f"a {kind} takes no {key}: its clamps hold it"
-            raise run.config_error(what, "model", key, hint=f"remove {key}")
+            what, allowed = f"model.{key} is not possible with object.kind: {kind}, which clamps hold", f"no {key}"
+            raise run.config_error(what, "model", key, allowed=allowed, hint=f"remove model.{key}")
     recordings = read_recordings_of_role(run)
     if not recordings:
-        what = f"a {kind}'s lengths come from recordings"
-        raise run.config_error(what, "recordings", "estimate", hint="list at least one")
+        what = f"the lengths of a {kind} are computed from recordings, but none is listed"
+        raise run.config_error(what, "recordings", "estimate", allowed="one or more", hint="add a recording")
     with add_setting_location_to_errors(run, "model", "object"):
         return item.build_system_with_clamps(
             typical_point_pair_distances(item.topology().edges, recordings), run.model.gravity
@@ -201,7 +201,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
                 what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible"
-                allowed = f"within {entry.lower:g} to {entry.upper:g} {entry.unit}, lower first"
+                allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
             with add_setting_location_to_errors(run, "parameters", key, "initial"):
                 entry = replace(entry, value=value, lower=lower, upper=upper)
@@ -212,11 +212,14 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
 def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
     if said.kind != "law":
         if said.table is not None or said.depends_on is not None:
-            raise ConfigError(f"{said.kind} has no table", hint="only a law has it; its kind is law")
+            what, where = f"the effect {said.kind} has `table` or `depends_on`", f"{said.kind}@{said.location}"
+            allowed, hint = "`table` and `depends_on` with kind: law", "leave them out, or set kind: law"
+            raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         return make_effect(said.kind, said.location, system, dict(said.values))
     if said.table is None or said.depends_on is None or said.values:
-        hint = "state depends_on and table, and no values"
-        raise ConfigError("a law needs table and depends_on", hint=hint)
+        what, hint = "the law lacks `table` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
+        allowed = "`table` and `depends_on`, without `values`"
+        raise ConfigError(what, where=f"law@{said.location}", allowed=allowed, hint=hint)
     return make_law(said.location, system, read_law_tables(Path(said.table), said.depends_on))
 
 
@@ -257,8 +260,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
     for key, given in run.parameters.items():
         matches = [name for name in parameters.names if _matches(name, key)]
         if not matches:
-            hint = nearest_name_hint(key, parameters.names) + "; all of them are listed by `yid-ocp inspect`"
-            raise run.config_error(f"there is no parameter '{key}'", "parameters", key, hint=hint)
+            raise unknown_name_error(run, "parameter", key, parameters.names, "parameters", key)
         said = {name: value for name, value in vars(given).items() if value is not None}
         result |= {name: replace(result.get(name, ParameterSettings()), **said) for name in matches}
     # a published figure is the value of what is fixed
@@ -359,20 +361,20 @@ def _clamp_mechanism(run: RunSettings) -> Mechanism | None:
     model, arms = run.model, run.model.arms
     if model.robot is not None:
         if model.moving_clamps:
-            hint = "remove model.moving_clamps, or set model.robot: null; a robot holds by model.grasp or by the mount"
-            what = "clamps hold an object without a robot, and the model has one"
-            raise run.config_error(what, "model", "moving_clamps", hint=hint)
+            hint = "remove model.moving_clamps and set model.grasp, or set model.robot: null"
+            what, allowed = "the model has both a robot and moving clamps", "one of the two"
+            raise run.config_error(what, "model", "moving_clamps", allowed=allowed, hint=hint)
         return None
     for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
         if given:
-            hint = "set model.robot to its URDF file, or remove model.arms; the world or moving_clamps hold an object"
-            what = "the settings name joints, but the model has no robot"
-            raise run.config_error(what, "model", "arms", key, hint=hint)
+            hint = "set model.robot to a URDF file, or remove model.arms"
+            what, allowed = "model.arms names joints, but the model has no robot", "joints of a robot"
+            raise run.config_error(what, "model", "arms", key, allowed=allowed, hint=hint)
     found: Mechanism | None = None
     for name, clamp in model.moving_clamps.items():
         if clamp.origin_point_name == clamp.z_axis_point_name:
-            what = f"clamp '{name}' has one point for both ends"
-            raise run.config_error(what, "model", "moving_clamps", name, allowed="two different points")
+            what, hint = f"clamp '{name}' has one point for both ends", "change one of the two points"
+            raise run.config_error(what, "model", "moving_clamps", name, allowed="two different points", hint=hint)
         found = (
             floating_joint_mechanism(name)
             if found is None
@@ -394,7 +396,7 @@ def _with_extra_frames(
         if owner is not None:
             tree = made[owner].mechanism
         elif said.marker_reference_pose:
-            what = f"'{name}' is placed by `marker_reference_pose`, but is attached to no frame of the object"
+            what = f"'{name}' has `marker_reference_pose`, but its parent is not a frame of the object"
             allowed = "a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%"
             raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame")
         else:
@@ -433,9 +435,9 @@ def marker_positions_from_reference_pose(
     if not names:
         return {}
     if run.model.object is not None and not run.model.object.is_root_fixed_in_world:
-        what = "the object's mount moves, so `marker_reference_pose` does not determine its place"
+        what = "the mount of the object moves, so `marker_reference_pose` does not determine its position"
         where = ("model", "frames", names[0], "marker_reference_pose")
-        hint, allowed = f"give model.frames.{names[0]}.xyz instead", "an object whose mount stands in the world"
+        hint, allowed = f"set model.frames.{names[0]}.xyz instead", "an object whose mount is fixed in the world"
         raise run.config_error(what, *where, allowed=allowed, hint=hint)
     q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
@@ -448,14 +450,14 @@ def marker_positions_from_reference_pose(
         group = recording.points[0].names if recording.points else ()
         if recording.marker_reference_pose is None:
             hint = f"record them, or give model.frames.{names[0]}.xyz in place of marker_reference_pose: true"
-            what = "the recording has no positions of its markers with the object held straight"
+            what = "the recording has no marker positions of the straight object"
             allowed = "positions of the points of its first group, shape (np, 3) [m]"
-            raise DataError(what, where=f"{recording.name}: straight", allowed=allowed, hint=hint)
+            raise DataError(what, where=f"recording '{recording.name}': straight", allowed=allowed, hint=hint)
         found[recording.name] = {}
         for name, pose in zip(names, placed, strict=True):
             if name not in group:
-                what = f"'{name}' is no point of {recording.name}"
-                raise run.config_error(what, "model", "frames", name, hint=nearest_name_hint(name, group))
+                what = f"'{name}' is not a point of recording '{recording.name}'"
+                raise run.config_error(what, "model", "frames", name, **unknown_name_error_arguments(name, group))
             local = pose[:3, :3].T @ (recording.marker_reference_pose[group.index(name)] - pose[:3, 3])
             found[recording.name] |= {f"{name}.{axis}": float(x) for axis, x in zip(_AXES, local, strict=True)}
     return found

@@ -138,21 +138,20 @@ def build_problem(
     ------
     ConfigError, DataError, ModelError
         Settings, recordings or names are inconsistent, a grasp cannot be closed, or a recording is unusable. With
-        `recordings.strict`, any issue of a recording.
-    """
+        `recordings.strict`, any issue of a recording."""
     system = build_system(run) if step is None else step.system
     free = free_parameter_names(run, system.parameters)
     if not free:
-        hint = "set parameters.NAME.free: true for what is sought"
-        raise run.config_error("no parameter is free", "parameters", hint=hint)
+        choice = unknown_name_error_arguments("", system.parameters.names, "set parameters.NAME.free: true")
+        raise run.config_error("no parameter is free", "parameters", **choice)
     same = sorted(set(run.recordings.estimate) & set(run.recordings.held_out))
     if same:
-        what = "a recording is both estimated on and held out"
-        raise run.config_error(what, "recordings", "held_out", allowed="one of the two", hint=same[0])
+        what, hint = f"the recording is both estimated on and held out: {same[0]}", "leave it out of one of the lists"
+        raise run.config_error(what, "recordings", "held_out", allowed="one of the two", hint=hint)
     estimate, held_out = read_recordings_of_role(run), read_recordings_of_role(run, "held_out")
     if not estimate:
-        hint = "list at least one recording"
-        raise run.config_error("there is no recording to estimate on", "recordings", "estimate", hint=hint)
+        what, allowed = "there is no recording to estimate on", "one recording or more"
+        raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
     _check_sensors(run, [*estimate, *held_out])
     estimate, held_out, issues = _check_recordings(run, system, free, estimate, held_out)
     options = problem_options(run, system, [*estimate, *held_out, *reference_recordings])
@@ -187,7 +186,7 @@ def min_initial_closure_error_by_grasp(problem: EstimationProblem, episode: Epis
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
-        hint = f"first check these issues: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
+        hint = f"first correct these issues: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_initial_closure_error_by_grasp(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
@@ -203,8 +202,9 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
             what, details = f"no recording has a group '{name}'", unknown_name_error_arguments(name, sorted(known))
             raise run.config_error(what, "sensors", name, **details)
         if said.effort_sampling_kind is not None and name != JOINT_EFFORT_GROUP_NAME:
-            hint = f"say it of {JOINT_EFFORT_GROUP_NAME}, or leave it out"
-            raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_sampling_kind", hint=hint)
+            what, hint = f"'{name}' has no efforts", f"set it under sensors.{JOINT_EFFORT_GROUP_NAME}, or leave it out"
+            where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_GROUP_NAME}"
+            raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
         constants = next((c.constants for c in channel_kinds_for_group_name(group) if c.quantity == quantity), {})
         for constant in said.constants:
@@ -245,8 +245,8 @@ def _check_recordings(
     _raise_for_issues(run, doubts)
     if not kept[0]:
         hint = "; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump"))
-        what = "gaps leave nothing of the recordings to estimate on"
-        raise DataError(what, where=run.describe_location("recordings", "estimate"), hint=hint)
+        what, allowed = "no part of the recordings is long enough between gaps", "a recording without gaps"
+        raise DataError(what, where=run.describe_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(doubts)
 
 
@@ -364,7 +364,8 @@ def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
     first, *others = grave
     more = [f"{doubt.where}: {doubt.what}" for doubt in others]
     what = "; ".join([f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}", *more])
-    raise DataError(what, where=first.where, hint=first.advice + (f" ({first.setting})" if first.setting else ""))
+    hint = first.advice + (f" ({first.setting})" if first.setting else "")
+    raise DataError(what, where=first.where, allowed="recordings without this issue", hint=hint)
 
 
 def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:

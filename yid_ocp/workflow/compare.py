@@ -22,7 +22,8 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
     """Run and compare all methods, and write the run folder. Successful if any method converged."""
     solvers, experiment = list(run.compare.methods.values()), run.compare.reference_paper_experiment_name
     if not solvers:
-        raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
+        what, allowed = "there is no method to compare", ", ".join(SOLVERS)
+        raise run.config_error(what, "compare", "methods", allowed=allowed, hint="add a method, or leave the key out")
     if experiment is not None and experiment not in PAPER_ESTIMATES:
         what = f"Caldwell et al. (2014) have no experiment '{experiment}'"
         raise run.config_error(what, "compare", "reference_paper_experiment_name", allowed=", ".join(PAPER_ESTIMATES))

@@ -16,7 +16,7 @@ from yid_ocp.data.channel_checks import white_noise_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.files import named_attributes
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
@@ -244,8 +244,8 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
         return arms[0].tool_frames[0], arms[0]
     if frame not in tree.frames:
         allowed = ", ".join(name for arm in arms for name in arm.tool_frames)
-        hint = nearest_name_hint(frame, tree.frames)
-        raise ConfigError(f"there is no frame '{frame}'", where="--holder", allowed=allowed, hint=hint)
+        said = unknown_name_error_arguments(frame, tree.frames) | {"allowed": allowed}
+        raise ConfigError(f"there is no frame '{frame}'", where="--holder", **said)
     carried = tree.frames[frame].joint_index
     own = next((arm for arm in arms if carried >= 0 and tree.joint_names[carried] in arm.joints), arms[0])
     return frame, own
@@ -257,17 +257,15 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     seen = ", ".join([*(group.name for group in recording.points), *wrists])
     is_servo = joints.effort is None and _commanded(joints)
     if not has_object and not is_servo and joints.effort is None and not wrists:
-        what = "nothing in the recording shows what moving the arm takes"
+        what = "the recording has no measurement of the forces that move the arm"
         allowed = "efforts of its joints, commanded positions that differ from the measured ones, or a wrist sensor"
-        hint = (
-            "import them too (`yid-ocp import FILE --preview` lists what there is), or add --object and its dimensions"
-        )
-        raise ConfigError(what, where=recording.name, allowed=allowed, hint=hint)
+        hint = "import them too (see `yid-ocp import FILE --preview`), or add --object and its dimensions"
+        raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if joints.effort is None and not seen and has_object:
-        hint = "import points too (`yid-ocp import FILE --preview` lists what there is)"
+        hint = "import points too (see `yid-ocp import FILE --preview`)"
         allowed = "points on the object, or efforts of the joints that move it"
-        what = "nothing in the recording shows what the object does"
-        raise ConfigError(what, where=recording.name, allowed=allowed, hint=hint)
+        what = "the recording has no measurement of the object"
+        raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if is_servo:
         return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
     if joints.effort is None:

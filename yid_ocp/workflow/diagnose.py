@@ -182,8 +182,9 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
     for group, field in sorted(_noise_levels(problem)):
         level = getattr(sensors[group], field) if group in sensors else None
         if level is None:
-            what = f"the fraction of noise in the {field} of '{group}' is given, but not the {field}"
-            raise run.config_error(what, "diagnosis", "noise_fraction_of_std", hint=f"set sensors.{group}.{field}")
+            what = f"diagnosis.noise_fraction_of_std needs the {field} of '{group}', which is not set"
+            where, hint = ("diagnosis", "noise_fraction_of_std"), f"set sensors.{group}.{field}"
+            raise run.config_error(what, *where, allowed="all noise levels under `sensors`, or 1", hint=hint)
         by_name = isinstance(level, Mapping)
         smaller: Any = {name: share * std for name, std in level.items()} if by_name else share * level
         sensors[group] = replace(sensors[group], **{field: smaller})

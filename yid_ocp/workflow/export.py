@@ -66,10 +66,11 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         return EXIT_DONE
     if source.is_dir() and form == "csv":
         allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording, or the run's signals as mcap"
-        raise ConfigError("a run is no table", where="--format csv", allowed=allowed, hint=hint)
+        raise ConfigError("a run folder cannot be written as CSV", where="--format csv", allowed=allowed, hint=hint)
     if not source.is_dir() and form not in (None, "csv", _MCAP):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
-        raise ConfigError(f"{source.name} is no run folder", where=f"--format {form}", allowed=allowed)
+        what, hint = f"{source.name} is not a run folder", "choose --format csv, or give a run folder"
+        raise ConfigError(what, where=f"--format {form}", allowed=allowed, hint=hint)
     contents: dict[str, Any] = {"notes": []}
     texts: list[str] = []
     if source.is_dir():
@@ -131,7 +132,8 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         values = {name: float(entry["value"]) for name, entry in parameters.items()}
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         where = str(folder / "result.json")
-        raise DataError("the result has no parameters", where=where, hint="run it again") from error
+        allowed, hint = "a result of `solve` or `diagnose` of this version", "run the command again"
+        raise DataError("the result has no parameters", where=where, allowed=allowed, hint=hint) from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
     whole = run_history.settings_with_added_effects(nominal, run_history.parameter_values_by_effect_label(values))
@@ -139,8 +141,7 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
 
 
 def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: Progress) -> dict[str, Any]:
-    """Write the final model of a run and, except for `yaml`, a manifest of what the format represents. Returns the
-    manifest.
+    """Write a run's final model and, except for `yaml`, a manifest of what the format represents. Returns the manifest.
 
     Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this."""
     if form not in _MODEL_FORMATS:
@@ -295,8 +296,9 @@ def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     with open_hdf5_after_read_check(source) as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:
-            what, allowed = f"the trajectories are of format '{form}'", ", ".join(_PREDICTION_TOPICS)
-            raise DataError(what, where=str(source), allowed=allowed, hint="run it again")
+            what, allowed = f"the trajectories have the format '{form}'", ", ".join(_PREDICTION_TOPICS)
+            hint = "run the command again with this version"
+            raise DataError(what, where=str(source), allowed=allowed, hint=hint)
         for name, signals in _recordings(file, form).items():
             files.append(Path(out) / f"{name}.mcap")
             notes += _shift_notes(f"{files[-1].name}: ", export_mcap(signals, files[-1]))

@@ -23,8 +23,8 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Fit every friction law with one kind of motion left out in turn, and write the run folder.
 
-    Successful if the warranted law's fit to all recordings converged. Raises `DataError` if there are fewer than two
-    kinds of motion."""
+    Successful if the warranted law's fit to all recordings converged. Raises `DataError` for fewer than two kinds of
+    motion."""
     joints = None if run.model.friction is None else run.model.friction.joints
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")
@@ -38,8 +38,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             if len(kinds) < 2:
                 allowed = "two recordings or more in which the motors are on"
                 hint = "list more under recordings.estimate or recordings.held_out"
-                what = "a law is tested on motions that are not fitted, and there is only one motion"
-                raise DataError(what, allowed=allowed, hint=hint)
+                what = "a law is tested on recordings that are not fitted, but there is only one recording"
+                where = settings.describe_location("recordings")
+                raise DataError(what, where=where, allowed=allowed, hint=hint)
             solution = solve(problem, run.solver, restarts=False)
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
@@ -47,7 +48,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             fits.append(friction_ladder.cross_validate_friction_law(law, problem, solution, kinds))
             solved[law] = (settings, problem, solution)
         if not fits:
-            raise DataError("no friction law could be fitted", hint="run `yid-ocp check` with this configuration")
+            what, hint = "no friction law could be fitted", "run `yid-ocp check` with this configuration"
+            where = run.describe_location("recordings")
+            raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
         best = friction_ladder.simplest_fit_within_std_error(fits, kinds)
         settings, problem, solution = solved[best.law]
         names = friction_parameter_names(settings, problem.system.parameters)

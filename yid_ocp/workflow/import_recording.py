@@ -65,8 +65,8 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     if arguments.preview:
         return _preview(arguments, asked)
     if arguments.out is None:
-        allowed = "--out RECORDING.h5, or --preview to look only"
-        raise ConfigError("the recording to write is not named", where="--out", allowed=allowed)
+        allowed, hint = "--out RECORDING.h5, or --preview", "add --out RECORDING.h5"
+        raise ConfigError("the option --out is missing", where="--out", allowed=allowed, hint=hint)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
     with stderr_progress_display(arguments) as progress:
@@ -75,7 +75,8 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         if len(files) > 1:
             recording = replace(_merged(files, options, offsets, progress), name=Path(arguments.out).stem)
         elif offsets:
-            raise ConfigError("a clock offset needs several files", where="--clock-offset")
+            what, hint = "there is one file, which has no other clock", "leave --clock-offset out"
+            raise ConfigError(what, where="--clock-offset", allowed="with two files or more", hint=hint)
         else:
             recording = read_third_party_recording(files[0], options, progress)
         write_recording(recording, arguments.out)
@@ -161,7 +162,9 @@ def _merged(
     known = {file: () if has_native_recording_suffix(file) else reader_option_names(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):
-            raise DataError(f"none of the files takes the option '{name}'", where=_flag(name), hint="leave it out")
+            what = f"no file has a format with the option '{name}'"
+            allowed = ", ".join(sorted(set().union(*known.values())))
+            raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint="leave it out")
     late = {name: options[name] for name in ("joints", "points", "torque_constants", "gears") if name in options}
     units = dict(options.get("units") or {})
     if units.get("effort") in CURRENT_UNITS:
@@ -177,10 +180,12 @@ def _merged(
             matched |= set(own["columns"])
         parts.append(read_third_party_recording(file, own, progress))
     if missing := set(columns) - matched:
-        raise DataError(f"no file has a column '{min(missing)}'", where="--columns", hint="--preview lists them")
+        what, allowed = f"no file has a column '{min(missing)}'", "columns that --preview lists"
+        raise DataError(what, where="--columns", allowed=allowed, hint="correct the name, or leave it out")
     stems = [Path(file).stem for file in files]
     if len(set(stems)) < len(stems):
-        raise DataError("two of the files have one name", where=", ".join(files), hint="rename one of them")
+        what, allowed = "two of the files have the same name", "a name of its own for each"
+        raise DataError(what, where=", ".join(files), allowed=allowed, hint="rename one of them")
     parts = [replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)]
     merged = merge_recordings(parts, offsets)
     return convert_to_si_and_validate(merged, ", ".join(files), SelectionAndUnitOptions(**late))
@@ -234,11 +239,11 @@ def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
         try:
             pairs[key] = _MAPPINGS[option](value)
         except ValueError as error:
-            where = f"{_flag(option)} {entry}"
-            raise ConfigError(f"'{value}' is no number", where=where, allowed="KEY=NUMBER") from error
+            where, hint = f"{_flag(option)} {entry}", "write a number after ="
+            raise ConfigError(f"'{value}' is not a number", where=where, allowed="NAME=NUMBER", hint=hint) from error
         if not (key and equals and value):
-            allowed = "KEY=VALUE,KEY=VALUE"
-            raise ConfigError(f"'{entry}' is no pair", where=_flag(option), allowed=allowed, hint="quote it whole")
+            what, hint = f"'{entry}' is not NAME=VALUE", "write =, and quote the entry if it has spaces or *"
+            raise ConfigError(what, where=_flag(option), allowed="NAME=VALUE,NAME=VALUE", hint=hint)
     return pairs
 
 

@@ -39,7 +39,8 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `init` and return its exit code."""
     out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
+        hint = f"write --out {out.stem}.yaml"
+        raise ConfigError(f"the file name is '{out.name}'", where="--out", allowed="NAME.yaml", hint=hint)
     read_urdf(robot)
     item = _object_from_arguments(arguments)
     with stderr_progress_display(arguments) as progress:
@@ -52,7 +53,8 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     written = {file: raw for file, raw in made.items() if raw is not None}
     for file in (out, out.with_suffix(".html"), *written):
         if file.exists() and not arguments.replace:
-            raise OutputError("the file is there already", where=str(file), hint="choose another --out, or --replace")
+            hint = "choose another --out, or add --replace"
+            raise OutputError("the file already exists", where=str(file), allowed="a new file", hint=hint)
 
     def near(path: str | Path) -> str:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
@@ -87,30 +89,32 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject |
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
             if getattr(arguments, name):
-                what, hint = f"--{name} describes an object, and none is named", "add --object, or leave it out"
-                raise ConfigError(what, where="--object", allowed=", ".join(templates), hint=hint)
+                what, hint = f"--{name} needs --object", f"add --object KIND, or leave --{name} out"
+                raise ConfigError(what, where=f"--{name}", allowed=f"with --object {', '.join(templates)}", hint=hint)
         return None
     if word not in templates:
         said = unknown_name_error_arguments(word, templates)
-        raise ConfigError(f"there is no choice of --object '{word}'", where="yid-ocp init", **said)
+        raise ConfigError(f"there is no object '{word}'", where="--object", **said)
     template = templates[word]
     links = template.default_links if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
-        raise ConfigError(f"the object has {links} links", where="--links", allowed="1 to 64")
+        raise ConfigError(f"the object has {links} links", where="--links", allowed="a whole number from 1 to 64")
     numbers = {name: getattr(arguments, name) for name in ("length", "mass", "radius")}
     for text in arguments.number:
         name, equals, value = text.partition("=")
         if name not in template.further_numbers or not equals:
             allowed = ", ".join(f"{key}=NUMBER, {words}" for key, words in template.further_numbers.items())
-            what = f"'{text}' is no further number of a {word}"
+            what = f"'{text}' is not an additional number of a {word}"
             raise ConfigError(what, where="--number", allowed=allowed or "none", hint="leave it out")
         numbers[name] = comma_separated_numbers(value, 1, "--number")[0]
     for name, number in numbers.items():
         if number is not None and not 0 < number < float("inf"):
-            raise ConfigError(f"the {name} is {number:g}", where=f"--{name}", allowed="a number above 0")
+            unit = "kg" if name == "mass" else "m" if name in ("length", "radius") else "SI unit"
+            raise ConfigError(f"the {name} is {number:g}", where=f"--{name}", allowed=f"a number above 0 [{unit}]")
     given = {**numbers, **{name: getattr(arguments, name) for name in ("section", "branch", "branches")}}
     if given["branch"] and not template.has_branches:
-        raise ConfigError(f"a {word} has no branches", where="--branch", allowed="--object tree")
+        what, hint = f"a {word} has no branches", "set --object tree, or leave --branch out"
+        raise ConfigError(what, where="--branch", allowed="with --object tree", hint=hint)
     return template.build({name: value for name, value in given.items() if value}, links)
 
 
@@ -119,7 +123,8 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
     for text in given:
         frame, equals, point = text.partition("=")
         if not (frame and equals and point):
-            raise ConfigError(f"'{text}' is no grasp", where="--grasp", allowed="FRAME=POINT, such as tool0=w_cable")
+            hint = "write for example --grasp tool0=w_cable"
+            raise ConfigError(f"'{text}' is not FRAME=POINT", where="--grasp", allowed="FRAME=POINT", hint=hint)
         grasps[frame] = point
     return grasps
 
@@ -132,12 +137,14 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
             recording = import_recording.read_third_party_recording(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
         elif options:
-            what, flags = f"{file.name} is a recording already", ", ".join(options)
-            raise ConfigError(what, where=flags, hint="leave these options out")
+            what = f"{file.name} is already a recording, which takes no options of readers"
+            where, allowed = ", ".join(map(import_recording._flag, options)), "options with files of other formats"
+            raise ConfigError(what, where=where, allowed=allowed, hint="leave these options out")
         else:
             made[file] = None
     if len(made) < len(arguments.files):
-        raise DataError("two of the files would become one recording", where=", ".join(arguments.files))
+        what, where = "two of the files have the same name", ", ".join(arguments.files)
+        raise DataError(what, where=where, allowed="a name of its own for each", hint="rename one of them")
     return made
 
 

@@ -158,8 +158,9 @@ def _linearised(
     try:
         found = step_diagnostics.checked_step_linearisation(step, *at)
     except np.linalg.LinAlgError as error:
-        what = "the step cannot be linearised: its equations are singular"
-        raise ModelError(what, where=point.description) from error
+        what, allowed = "the step cannot be linearised: its equations are singular", "a model with regular equations"
+        hint = "give massless links a mass, or remove redundant grasps"
+        raise ModelError(what, where=point.description, allowed=allowed, hint=hint) from error
     return found, step_diagnostics.linearise_step_equations(step, *at)
 
 

@@ -174,13 +174,16 @@ def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict
     file = folder / "result.json"
     if not file.is_file() or not (folder / "trajectories.h5").is_file():
         what = f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}"
-        raise run.config_error(what, *where, hint="give the run folder that it printed")
+        allowed = "a run folder with result.json and trajectories.h5"
+        raise run.config_error(what, *where, allowed=allowed, hint="give the run folder that the command printed")
     result, formats = read_result_file(file), [ESTIMATE_RESULT_FORMATS[command] for command in commands]
     if result.get("format") not in formats:
         what = f"{folder} is a run folder of another command ({result.get('format')})"
-        raise run.config_error(what, *where, allowed=" or ".join(formats))
+        hint = f"give a run folder of {' or '.join(commands)}"
+        raise run.config_error(what, *where, allowed=" or ".join(formats), hint=hint)
     if result.get("status") == "failed":
-        raise DataError(f"the solve in {folder} failed: {result['message']}", where=run.describe_location(*where))
+        what, hint = f"the solve in {folder} failed: {result['message']}", "give the folder of a successful run"
+        raise DataError(what, where=run.describe_location(*where), allowed="a successful run", hint=hint)
     return result, folder
 
 
@@ -204,7 +207,7 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
 def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collection[str]) -> None:
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
-        what = f"{run.plan.parameter_run} was solved with {', '.join(lacking)}, which this model does not have"
+        what = f"{run.plan.parameter_run} has the effect {', '.join(lacking)}, which this model does not have"
         hint = "list the same effects under model.effects"
         raise run.config_error(what, "plan", "parameter_run", allowed="a run of `solve` on the same model", hint=hint)
 

@@ -177,7 +177,8 @@ def _publish(folder: RunFolder, lock: FileLock) -> None:
         except OSError as error:
             if not os.path.lexists(target) or number > _NAMES:
                 what = f"the run is complete but its folder cannot be renamed: {os_error_reason(error)}"
-                raise OutputError(what, where=str(target), hint=f"its results stay in {temporary}") from error
+                hint = f"rename {temporary}, which has the results"
+                raise OutputError(what, where=str(target), hint=hint) from error
             target = folder.final_path.with_name(f"{folder.final_path.name}-{number}")
     if target != folder.final_path:
         log.warning("%s was taken while the run went on: its folder is %s", folder.final_path, target)
@@ -200,8 +201,9 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary = target.parent / f".{target.name}{_UNFINISHED}"
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
-            allowed, hint = "no such folder, or one that a run left", "move it away, or choose another --out"
-            what = "the hidden folder with this run's name was not made by a run"
+            allowed = "no folder of this name, or the folder of an interrupted run"
+            hint = "move it, or choose another --out"
+            what = "the hidden folder for this run was not made by a run"
             raise OutputError(what, where=str(temporary), allowed=allowed, hint=hint)
         lock = _locked(temporary)
         if lock is None:
@@ -213,7 +215,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         _remove_all_but_lock(temporary)
         return target, lock
     hint, allowed = "choose another name with --out, or wait for the other run", "another name for every run"
-    raise OutputError("another run is making this folder", where=str(targets[0]), allowed=allowed, hint=hint)
+    raise OutputError("another run is writing this folder", where=str(targets[0]), allowed=allowed, hint=hint)
 
 
 def _is_of_a_run(temporary: Path) -> bool:
@@ -276,7 +278,8 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
         return [parent / name for name in (stem, *(f"{stem}-{i}" for i in range(2, _NAMES)))]
     allowed = "a new name, or an empty folder"
     if not str(out).strip() or "\0" in str(out):
-        raise OutputError("this is not a valid folder name", where="--out", allowed=allowed)
+        what, hint = f"{str(out)!r} is not a valid folder name", "choose another name"
+        raise OutputError(what, where="--out", allowed=allowed, hint=hint)
     try:
         target = Path(out).expanduser().absolute()
         is_link, is_folder = target.is_symlink(), target.is_dir()
@@ -288,10 +291,11 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
         hint = "choose another name with --out, or leave it out for a numbered one"
         raise OutputError("the run folder exists and is not empty", where=str(target), allowed=allowed, hint=hint)
     if is_link:
-        hint = "name the folder that it leads to, or choose another --out"
-        raise OutputError("the run folder's name is that of a link", where=str(target), allowed=allowed, hint=hint)
+        hint = "give the folder that the link points to, or choose another --out"
+        raise OutputError("the run folder is a symbolic link", where=str(target), allowed=allowed, hint=hint)
     if is_file:
-        raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
+        hint = "choose another --out"
+        raise OutputError("the run folder is an existing file", where=str(target), allowed=allowed, hint=hint)
     return [target]
 
 

@@ -66,14 +66,13 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     except (LookupError, TypeError, ValueError) as error:
         what = "the result has no covariance of its parameters"
         allowed = "keys parameters and covariance, as this version writes them"
-        raise DataError(what, where=str(file), allowed=allowed, hint="run it again") from error
+        raise DataError(what, where=str(file), allowed=allowed, hint="run the command again") from error
     if not names:
-        hint = "give a run in which some parameter was found"
-        raise DataError("the run found no parameter", where=str(file), hint=hint)
+        what, hint = "the run found no parameter", "give a run in which a parameter was found"
+        raise DataError(what, where=str(file), allowed="one found parameter or more", hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
-        raise DataError(
-            "its covariance is missing or invalid", where=str(file), allowed="finite, with a positive diagonal"
-        )
+        what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
+        raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint="run the command again")
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
 
 
@@ -100,11 +99,12 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
     file = Path(folder) / "result.json"
     result = read_result_file(file)
     if result.get("format") not in ESTIMATE_RESULT_FORMATS.values():
-        what = f"the run folder is one of another command ({result.get('format')})"
+        what = f"the run folder is of another command ({result.get('format')})"
         hint = "give a run folder of `solve` or `diagnose`"
         raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
     if result.get("status") == "failed":
-        raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
+        what, hint = f"the run failed: {result.get('message')}", "give the folder of a successful run"
+        raise DataError(what, where=str(file), allowed="a successful run", hint=hint)
     return result
 
 
@@ -112,10 +112,12 @@ def read_result_file(file: Path) -> dict[str, Any]:
     """Read any command's result.json. Raises `DataError` if it cannot be read or has an old format."""
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
-        raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
+        what, allowed = f"there is no finished run in {file.parent}", "a run folder with result.json"
+        raise DataError(what, where=str(file), allowed=allowed, hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
-        raise DataError("the file is not a result of a run", where=str(file), hint="run it again")
+        what, hint = "the file is not a result of a run", "run the command again"
+        raise DataError(what, where=str(file), allowed="an object in JSON", hint=hint)
     if result.get("format") in _OLD_FORMATS:
         what = f"the run is of an earlier version ({result['format']}), whose keys had other names"
         what, hint = f"{what}; {_RENAMED_KEYS_HINT}", "diagnose again with this version"
@@ -133,8 +135,8 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
         except DataError as error:
             raise run.config_error(error.what, *where, allowed=error.allowed, hint=error.hint) from error
         if any(Path(folder).resolve() == Path(other.run_name).resolve() for other in found):
-            what = f"{folder} is given twice, and would count twice"
-            raise run.config_error(what, *where, hint="list every run once")
+            what, hint = f"{folder} is given twice, and would count twice", "leave one of them out"
+            raise run.config_error(what, *where, allowed="every run once", hint=hint)
         if differing := _difference(run, _settings(folder)):
             what = f"{folder} is a run of another model: model.{differing} differs"
             hint = f"compare model.{differing} with {Path(folder) / 'config.yaml'}"
@@ -142,7 +144,8 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
         found.append(own)
     dependent = _dependent(run.diagnosis.baseline)
     if dependent:
-        raise run.config_error(dependent, "diagnosis", "baseline", hint="give the later one alone")
+        allowed, hint = "runs without a common baseline", "give the later run only"
+        raise run.config_error(dependent, "diagnosis", "baseline", allowed=allowed, hint=hint)
     return tuple(found)
 
 
@@ -161,7 +164,8 @@ def require_same_model(folders: Sequence[Path]) -> None:
     """Raise `ConfigError` unless all run folders have the same model and none is the baseline of another."""
     dependent = _dependent(folders)
     if dependent:
-        raise ConfigError(dependent, where="report", hint="diagnose without --baseline for a history, or leave one out")
+        allowed, hint = "independent runs", "diagnose without --baseline for a history, or leave one run out"
+        raise ConfigError(dependent, where="arguments of `report`", allowed=allowed, hint=hint)
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
     for folder, settings in known[1:]:
         if differing := _difference(known[0][1], settings):
@@ -217,7 +221,8 @@ def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recor
         file = resolve_recording_path(path)
         if not is_file(file):
             where = ("recordings", "reference_recordings", i)
-            raise run.config_error(f"there is no such recording: {file}", *where, hint="check the path")
+            what, allowed = f"there is no such recording: {file}", "the path of an existing file"
+            raise run.config_error(what, *where, allowed=allowed, hint="check the path")
         found.append(read_recording(file))
     for folder in () if found else run.diagnosis.baseline:
         there = _settings(folder)
@@ -237,11 +242,12 @@ def require_recordings_not_in_baseline(
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
             where = ("diagnosis", "baseline")
-            what = f"{episode.name} is a recording of the baseline too, and would count twice"
+            what = f"{episode.name} is also a recording of the baseline, and would count twice"
             if not runs or run.recordings.reference_recordings:
                 where = ("recordings", "reference_recordings")
                 what = f"{episode.name} is one of the reference recordings"
-            raise run.config_error(what, *where, allowed="recordings of another time")
+            hint = "leave it out of one of the two"
+            raise run.config_error(what, *where, allowed="recordings of another time", hint=hint)
 
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
@@ -253,11 +259,12 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Compare runs of one model in chronological order, or two runs of the same recordings. Writes JSON and a page."""
     if len(paths) < 2:
-        hint = "add the runs of other days"
-        raise ConfigError("one run has no history", where="report", allowed="two or more run folders", hint=hint)
+        what, hint = "one run has no history", "add run folders of other days"
+        raise ConfigError(what, where="arguments of `report`", allowed="two or more run folders", hint=hint)
     twice = [str(path) for i, path in enumerate(paths) if path.resolve() in [p.resolve() for p in paths[:i]]]
     if twice:
-        raise ConfigError("a run is given twice, and would count twice", where=twice[0], hint="list every run once")
+        what, hint = "the run is given twice, and would count twice", "leave one of them out"
+        raise ConfigError(what, where=twice[0], allowed="every run once", hint=hint)
     if len(paths) == 2 and _have_same_recordings(paths):
         return _overlay_runs(paths, out, progress)
     estimates = [read_estimates(path) for path in paths]
@@ -323,7 +330,8 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
     if not pairs:
         hint = "compare runs that use the same sensors"
-        raise DataError("the runs have no predicted channel in common", where=str(folders[1]), hint=hint)
+        what, allowed = "the runs have no predicted channel in common", "one common channel or more"
+        raise DataError(what, where=str(folders[1]), allowed=allowed, hint=hint)
     pairs.sort(key=lambda pair: "estimate" in roles[pair[0].recording])
     channels = [
         {

@@ -17,7 +17,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.effects import EFFECTS
-from yid_ocp.errors import ConfigError, YidError, nearest_name_hint
+from yid_ocp.errors import ConfigError, YidError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import file_sha256, is_file
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.registry import Registry
@@ -44,7 +44,8 @@ def load_plugins(run: RunSettings) -> None:
         path, where = Path(plugin), run.describe_location("plugins", i)
         name, digest = str(path.resolve()), file_sha256(path)
         if _loaded.get(name, digest) != digest:
-            raise ConfigError("the plug-in changed after it was loaded", where=where, hint="start a new Python")
+            what, hint = "the plug-in changed after it was loaded", "start a new Python process"
+            raise ConfigError(what, where=where, allowed="the loaded file", hint=hint)
         if name not in _loaded:
             with _registering(f"plug-in {path.name}", where, f"correct {path.name}", path):
                 _run(path, digest)
@@ -90,7 +91,7 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
         unchanged = all(set(registry) == names for registry, names in zip(_REGISTRIES, before, strict=True))
         if unchanged and not known:
             allowed = "a class or function under @EFFECTS.register(NAME) or @SENSOR_READERS.register(NAME)"
-            raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed)
+            raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
     except (Exception, SystemExit) as error:
         for registry, names in zip(_REGISTRIES, before, strict=True):
             registry.unregister_names(set(registry) - names)
@@ -99,7 +100,8 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
             raise ConfigError(what, where=where, allowed=error.allowed, hint=error.hint or hint) from error
         line = None if path is None else _line(error, path)
         what = f"the {name} raised {type(error).__name__}: {error}"
-        raise ConfigError(what, where=f"{where} (line {line})" if line else where, hint=hint) from error
+        where = f"{where} (line {line})" if line else where
+        raise ConfigError(what, where=where, allowed="a file that Python can import", hint=hint) from error
 
 
 def _line(error: BaseException, path: Path) -> int | None:
@@ -123,7 +125,7 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
 
 def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
     """Make (not raise) a `ConfigError` about an unknown name in the settings, with the nearest known name."""
-    return run.config_error(f"there is no {noun} '{name}'", *path, hint=nearest_name_hint(name, known))
+    return run.config_error(f"there is no {noun} '{name}'", *path, **unknown_name_error_arguments(name, known))
 
 
 def input_files_by_name(run: RunSettings) -> dict[str, Path]:
@@ -151,8 +153,8 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
         return file
     names = [entry.name for entry in file.parent.glob(f"*{file.suffix}")] if file.parent.is_dir() else []
     check = "check the path, which is relative to the configuration file"
-    hint = nearest_name_hint(file.name, names) if names else check
-    raise run.config_error(f"there is no such {noun}: {file}", *key, hint=hint)
+    hint = nearest_name_question(file.name, names) or check
+    raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 
 def resolve_recording_path(path: str) -> Path:

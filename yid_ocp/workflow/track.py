@@ -49,7 +49,7 @@ from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import issues_to_plain_data, recording_quality_issues_with_model
 from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path, unknown_name_error
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
@@ -228,7 +228,7 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
     for name in settings.gripper_start_offsets:
         if name not in grasps:
             where = ("track", "virtual_frames", "gripper_start_offsets", name)
-            raise run.config_error(f"there is no grasp '{name}'", *where, allowed=", ".join(grasps))
+            raise unknown_name_error(run, "grasp", name, grasps, *where)
     with add_setting_location_to_errors(run, "track", "virtual_frames"):
         posture = grasping_joint_angles(system, offsets=settings.gripper_start_offsets)
         simulation = SimulationOptions(settings.duration)

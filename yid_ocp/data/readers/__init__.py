@@ -17,7 +17,7 @@ from yid_ocp.data.readers.base import FilePreview, TopicOrColumnSummary, mean_sa
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
+from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)
@@ -30,9 +30,8 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     """Read and check a recording in any known format. The path's suffix selects the reader.
 
     Formats: HDF5 recording, CSV file, rosbag, MCAP file, ROS 2 bag folder, C3D file, LeRobot dataset. `options` are
-    those of the reader in `READERS`. Raises `DataError` if the format or an option is unknown, or if the reader refuses
-    the file.
-    """
+    those of the reader in `READERS`. Raises `DataError` if the format or an option is unknown, or the reader refuses
+    the file."""
     path = Path(path)
     known_as = _format_of(path)
     reader, known = READERS[known_as], reader_option_names(path)
@@ -75,8 +74,8 @@ def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
 def _format_of(path: Path) -> str:
     if not path.suffix and not path.exists():
         near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-        hint = nearest_name_hint(path.name, near) if near else "check the path"
-        raise DataError("there is no such file", where=str(path), hint=hint)
+        hint = nearest_name_question(path.name, near) or "check the path"
+        raise DataError("there is no such file", where=str(path), allowed="an existing file or folder", hint=hint)
     key = path.suffix.lower()
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"

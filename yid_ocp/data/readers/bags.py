@@ -24,7 +24,7 @@ from yid_ocp.data.foreign_formats import (
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
+from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limited_memory
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
@@ -66,7 +66,7 @@ class OpenBag:
 
     def __init__(self, path: Path) -> None:
         highlevel, typesys = (
-            base.import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags", path)
+            base.import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags")
             for name in ("highlevel", "typesys")
         )
         self.path = path
@@ -90,10 +90,18 @@ class OpenBag:
             with limited_memory():  # compressed data may state no size or a wrong one
                 yield
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
-            what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(self.path)
+            tool = "rosbag" if self.path.suffix == ".bag" else "ros2 bag"
+            what = "the bag cannot be read: it is incomplete or damaged"
+            hint = f"repair it by `{tool} reindex`, or copy it again"
+            if isinstance(error, MemoryError):
+                what = "the bag cannot be read: it is damaged, or needs too much memory"
+                hint = f"check it by `{tool} info`"
+            elif self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
+                what = "the bag cannot be read: its folder has no metadata.yaml"
+            elif self.path.is_file() and not self.path.stat().st_size:
+                what, hint = "the bag cannot be read: it is empty (0 bytes)", "copy it again"
             allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
-            hint = "check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`"
-            raise DataError(what, where=where, allowed=allowed, hint=hint) from error
+            raise DataError(what, where=str(self.path), allowed=allowed, hint=hint) from error
 
     def topic_names_of_types(self, *kinds: str) -> list[str]:
         """Names of the bag's topics with one of the given message types."""
@@ -108,7 +116,9 @@ class OpenBag:
     def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
         """Return the `DataError` for a bag without usable topics, with a list of its topics."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
-        return DataError(what, where=str(self.path), allowed=allowed, hint=f"it holds {held}")
+        return DataError(
+            what, where=f"{self.path}, with {held}", allowed=allowed, hint="choose a field by --field, or another bag"
+        )
 
 
 def relative_message_time_function(
@@ -141,8 +151,7 @@ class BagOptions(base.SelectionAndUnitOptions):
 
     `joints` is required if the messages of a topic differ in their joints; messages that lack one are skipped. `points`
     are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`. By default they are all topics of points, poses and
-    transforms except `/tf`, each under the last descriptive part of its name.
-    """
+    transforms except `/tf`, each under the last descriptive part of its name."""
 
     joint_topics: Sequence[str] | None = None  # topics of the joint states; all that there are when absent
     # topic of joint states whose positions are commands: `position_command`, held until the next command
@@ -172,13 +181,12 @@ def read_bag(
 
     Times are header stamps (recording times if a message has no stamp), relative to the first message. A joint channel
     that is empty or all NaN is omitted. `notes` lists unused topics. Raises `DataError` if `rosbags` is not installed,
-    if the bag cannot be read, has no usable topic or is ambiguous, and the errors of `validated_recording`.
-    """
+    if the bag cannot be read, has no usable topic or is ambiguous, and the errors of `validated_recording`."""
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
     if distance is not None and not 0 < distance < float("inf"):
-        what, allowed = f"pose_axis_point_distance = {distance:g}", "a distance above 0 [m]"
-        raise DataError(what, where=str(path), allowed=allowed)
+        what, allowed = f"pose_axis_point_distance is {distance:g} m", "a distance above 0 [m]"
+        raise DataError(what, where=f"--pose-axis-point-distance, for {path}", allowed=allowed)
     bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress, options.fields)
     groups, notes = _joints(bag, options, str(path))
     seen = _named_places(bag, options.points, str(path))
@@ -288,10 +296,12 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
     for channel, (topic, _, path) in split.items():
         bag.check_topic_is_among(topic, [known.name for known in bag.topics], "messages")
         if not path:
-            raise DataError(f"the field of '{channel}' has no name", where=where, allowed=allowed)
+            hint = f"write --field {channel}={topic}.FIELD"
+            raise DataError(f"the field of '{channel}' has no name", where=where, allowed=allowed, hint=hint)
     if len(topics) > 1 or (fields and "position" not in fields):
-        what = "fields are of several topics" if len(topics) > 1 else "no field is the position"
-        raise DataError(what, where=where, allowed=allowed)
+        what = f"the fields are of {len(topics)} topics" if len(topics) > 1 else "no field is the position"
+        hint = "choose fields of one topic" if len(topics) > 1 else "add --field position=/TOPIC.FIELD"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     return next(iter(topics), ""), {channel: path for channel, (_, _, path) in split.items()}
 
 
@@ -396,8 +406,8 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
         messages = [message for message in bag.states if message.source == topic]
         sets = {tuple(sorted(message.content.name)): tuple(message.content.name) for message in messages}
         if wanted is None and len(sets) > 1:
-            what, hint = f"the messages have {len(sets)} different sets of joints", "choose joints that come together"
-            allowed = "; ".join(", ".join(names) for names in sets.values())
+            what, hint = f"the messages have {len(sets)} different sets of joints", "choose joints of one set"
+            allowed = "one of the sets: " + "; ".join(", ".join(names) for names in sets.values())
             raise DataError(what, where=f"{where}: {topic}", allowed=allowed, hint=f"{hint}: --joints NAME,NAME")
         names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
         kept = [message for message in messages if names and set(names) <= set(message.content.name)]
@@ -412,7 +422,8 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
         kept = [message for message in messages if set(names) <= set(message.content.name)]
         if not kept or not names:
             what = f"no message of '{command}' has all joints"
-            raise DataError(what, where=where, allowed=", ".join(names) or "joints of another topic")
+            allowed, hint = f"commands of {', '.join(names) or 'the joints'}", "choose another --command-topic"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
         found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), kept, True))
     return found, tuple(notes)
 
@@ -428,12 +439,12 @@ def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, 
     allowed = "; ".join(dict.fromkeys(", ".join(names) for names in sets)) or "no joints were recorded"
     for name in wanted:
         if name not in known:
-            hint = nearest_name_hint(name, known) if known else ""
+            hint = nearest_name_question(name, known) or "choose recorded joints: --joints NAME,NAME"
             raise DataError(f"there is no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
     if got != set(wanted):
-        what = "the joints never come in one message"
-        raise DataError(what, where=where, allowed=allowed, hint="choose joints that come together")
+        what, allowed = "no message has all the chosen joints", f"joints of one of these sets: {allowed}"
+        raise DataError(what, where=where, allowed=allowed, hint="choose joints of one set: --joints NAME,NAME")
 
 
 def _on_one_clock(
@@ -464,9 +475,12 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
                 rows.append([values[own.index(name)] for name in entry.names])
             elif len(values):
                 what = f"a message has {len(values)} values of '{channel}' for {len(own)} joints"
-                raise DataError(what, where=where, allowed="one for each joint, or none")
+                hint = "correct the node that publishes the topic, or choose another topic with --joint-topic"
+                raise DataError(what, where=where, allowed="one value for each joint, or none", hint=hint)
         if rows and len(rows) < len(states):
-            raise DataError(f"{len(states) - len(rows)} of {len(states)} messages lack '{channel}'", where=where)
+            what = f"{len(states) - len(rows)} of {len(states)} messages lack '{channel}'"
+            allowed = "all messages, or none"
+            raise DataError(what, where=where, allowed=allowed, hint="choose another topic with --joint-topic")
         if rows and not np.isnan(rows).all():
             channels[channel] = np.array(rows)
     if "position" not in channels:
@@ -530,7 +544,9 @@ def _positions(
     for point, message in entries:
         key = seconds(message), point
         if key in seen:
-            raise DataError(f"point '{point}' comes twice at {key[0]:g} s", where=f"{where}: {message.source}")
+            what, where = f"point '{point}' has two positions at {key[0]:g} s", f"{where}: {message.source}"
+            hint = "name the points of the two sources differently: --points SOURCE=POINT"
+            raise DataError(what, where=where, allowed="one position of a point at a time", hint=hint)
         seen[key] = message.content.point
     times, names = sorted({time for time, _ in seen}), sorted({point for _, point in seen})
     rows, columns = ({key: index for index, key in enumerate(keys)} for keys in (times, names))

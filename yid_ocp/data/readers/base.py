@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, missing_package_error, unknown_name_error_arguments
 from yid_ocp.registry import Registry
 
 _RecordingReader = Callable[..., Recording]
@@ -77,9 +76,8 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
             continue
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
-            raise DataError(
-                f"'{word}' is no unit", where="units", **unknown_name_error_arguments(word, chain(*_TO_SI.values()))
-            )
+            said = unknown_name_error_arguments(word, chain(*_TO_SI.values()))
+            raise DataError(f"the unit '{word}' is unknown", where="units", **said)
         for quantity in (quantity for quantity, si in _QUANTITIES.items() if si == of):
             _set_unit(units, quantity, word)
     return units | exact
@@ -87,7 +85,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
 
 def _set_unit(units: dict[str, str], quantity: str, unit: str) -> None:
     if units.setdefault(quantity, unit) != unit:
-        what, hint = f"'{quantity}' is given two units, {units[quantity]} and {unit}", f"as in {quantity}={unit}"
+        what, hint = f"'{quantity}' has two units, {units[quantity]} and {unit}", f"leave one out: {quantity}={unit}"
         raise DataError(what, where="units", allowed="one unit for every quantity", hint=hint)
 
 
@@ -100,7 +98,7 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
     factors = dict.fromkeys(_QUANTITIES, 1.0)
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
-            what = f"a unit is given for '{quantity}', which is no quantity"
+            what = f"the quantity '{quantity}' of a unit is unknown"
             raise DataError(what, where=where, **unknown_name_error_arguments(quantity, _QUANTITIES))
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
@@ -117,9 +115,11 @@ def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, 
         recorded, equals, name = (part.strip() for part in entry.partition("="))
         name = name if equals else recorded
         if not recorded or not name:
-            raise DataError(f"'{entry}' names no {noun}", where=where, allowed=f"NAME, or RECORDED=NAME of a {noun}")
+            allowed, hint = f"NAME, or RECORDED=NAME of a {noun}", "add the name, or leave the entry out"
+            raise DataError(f"the entry '{entry}' has no name of a {noun}", where=where, allowed=allowed, hint=hint)
         if recorded in found or name in found.values():
-            raise DataError(f"the {noun} '{name}' is chosen twice", where=where, hint="name it once")
+            what, allowed = f"the {noun} '{name}' is chosen twice", f"every {noun} once"
+            raise DataError(what, where=where, allowed=allowed, hint="leave one of the two entries out")
         found[recorded] = name
     return found
 
@@ -141,8 +141,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
     """Convert the recording `raw` to SI units, select joints and points, and validate the result.
 
     Raises `DataError` for an unknown joint, point, quantity or unit, or a current without torque constants, and the
-    errors of `validated_recording`.
-    """
+    errors of `validated_recording`."""
     factors = _factors(options.units or {}, where)
     group = raw.joints
     if group is not None:
@@ -192,7 +191,8 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
     shared = [source for source, name in chosen.items() if names.count(name) > 1]
     if shared:
         what = f"{', '.join(shared)} give points of the same name"
-        raise DataError(what, where=where, allowed="a name for each", hint=f"name them: points {shared[0]}=NAME, ...")
+        hint = "name them: --points " + ",".join(f"{source}=NAME{i + 1}" for i, source in enumerate(shared[:4]))
+        raise DataError(what, where=where, allowed="a name of its own for each point", hint=hint)
 
 
 def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, where: str) -> Array:
@@ -201,22 +201,23 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
     for word, given in (("torque_constants", constants), ("gears", gears)):
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
-                what = f"{word} is given for '{pattern}', which is no joint"
+                what = f"{word} has a value for '{pattern}', but no joint has this name"
                 raise DataError(what, where=where, **unknown_name_error_arguments(pattern, names))
             if not (math.isfinite(value) and value != 0):
-                raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed="a number that is not zero")
+                allowed = "a finite number that is not zero"
+                raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed=allowed)
     if _spaceless((options.units or {}).get("effort", "")) not in CURRENT_UNITS:
         if constants or gears:
-            what = "torque constants or gears are given, but the efforts are no currents"
-            allowed = "units effort=A or effort=mA beside them"
-            raise DataError(what, where=where, allowed=allowed, hint="set the unit of effort to A")
+            what = "torque constants or gears are given, but the unit of the efforts is not that of a current"
+            allowed = "torque constants and gears with --units effort=A or effort=mA"
+            raise DataError(what, where=where, allowed=allowed, hint="add --units effort=A, or leave them out")
         return np.ones(len(names))
     factors = np.ones(len(names))
     for j, name in enumerate(names):
         own = [value for pattern, value in constants.items() if fnmatch.fnmatchcase(name, pattern)]
         if not own:
-            what = f"the effort of '{name}' is a current, and its torque constant is not given"
-            allowed = "torque_constants for every joint [N m/A]"
+            what = f"the effort of '{name}' is a current, but its torque constant is not given"
+            allowed = "a torque constant for every joint [N m/A]"
             hint = f"--torque-constants {name}=0.1, or '*=0.1' for all"
             raise DataError(what, where=where, allowed=allowed, hint=hint)
         ratio = [value for pattern, value in gears.items() if fnmatch.fnmatchcase(name, pattern)]
@@ -224,12 +225,12 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
     return factors
 
 
-def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
+def import_optional(module: str, extra: str, what: str) -> Any:
     """Import a module of the package's optional dependencies `extra`. Raises `DataError` (`what`) if it is missing."""
     try:
         return import_module(module)
     except ImportError as error:
-        raise DataError(what, where=str(where), hint=f"pip install 'yid-ocp[{extra}]'") from error
+        raise missing_package_error(DataError, what, extra) from error
 
 
 def mean_sample_rate(t: Array) -> float:
@@ -269,9 +270,8 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
-    its periods there. Raises `DataError` if two sources have a joint in common, if their channels differ, or if they
-    share no time.
-    """
+    its periods there. Raises `DataError` if two sources share a joint, if their channels differ, or if they share no
+    time."""
     if len(groups) == 1:
         return groups[0][1], ()
     _check_separate(groups, where)
@@ -279,7 +279,9 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     kept = np.all([_can_interpolate(group.t, clock.t) for _, group in groups], axis=0)
     if not kept.any():
         listed = "; ".join(f"{name}: {group.t[0]:.6g} to {group.t[-1]:.6g} s" for name, group in groups)
-        raise DataError("the joint states share no time", where=where, allowed=listed, hint="choose one of the topics")
+        what = f"the joint states of the topics were never recorded at the same time: {listed}"
+        hint = "choose one of the topics: --joint-topic TOPIC"
+        raise DataError(what, where=where, allowed="topics whose times overlap", hint=hint)
     t = clock.t[kept]
 
     def joined(channel: str) -> Array:
@@ -318,5 +320,5 @@ def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str) -> Non
     for source, group in groups:
         lacking = sorted(every - set(group.values_by_channel))
         if lacking:
-            what = f"{source} has no {lacking[0]}, which another topic of joint states has"
+            what = f"{source} has no {lacking[0]}, but another topic of joint states has it"
             raise DataError(what, where=where, allowed="the same channels on every topic", hint=choose)

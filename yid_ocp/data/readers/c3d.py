@@ -51,8 +51,7 @@ def read_c3d(
     maps the markers to keep to their names; by default all labelled markers that were ever seen are kept. `notes` lists
     omitted content: unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels.
     Raises `DataError` if `ezc3d` is not installed, if the file cannot be read or has no markers, and the errors of
-    `validated_recording`.
-    """
+    `validated_recording`."""
     path = Path(path)
     digest = file_sha256(path)
     found = _markers(path)
@@ -80,7 +79,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
 
 
 def _markers(path: Path) -> _Markers:
-    ezc3d = base.import_optional("ezc3d", "c3d", "reading C3D files needs the package ezc3d", path)
+    ezc3d = base.import_optional("ezc3d", "c3d", "reading C3D files needs the package ezc3d")
     check_readable_in_fork(path, _complaint, "C3D")
     try:
         file = ezc3d.c3d(str(path))
@@ -93,12 +92,14 @@ def _markers(path: Path) -> _Markers:
         analog = [label for label in _listed(parameters.get("ANALOG", {}), "LABELS") if label]
         computed = {label for key in _COMPUTED for label in _listed(parameters["POINT"], key) if label}
     except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+        raise _unreadable(path) from error
     if not rate > 0 or not len(position) or not labels:
         what = "the C3D file has no markers" if not labels else "the C3D file has no frames, or no rate"
-        raise DataError(what, where=str(path), allowed="labelled 3-D points and their rate")
+        hint = "export it again with the trajectories of the markers"
+        raise DataError(what, where=str(path), allowed="labelled 3-D points and their rate", hint=hint)
     if unit and unit not in _UNITS:
-        raise DataError(f"the unit of the markers is '{unit}'", where=str(path), allowed=", ".join(_UNITS))
+        what, hint = f"the unit of the markers is '{unit}'", "export it again in one of these units"
+        raise DataError(what, where=str(path), allowed=", ".join(_UNITS), hint=hint)
     position = position[:, : len(labels)]
     unseen = (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
     position[unseen] = np.nan
@@ -129,14 +130,15 @@ def _complaint(path: Path) -> str:
 
     try:
         ezc3d.c3d(str(path))
-    except Exception as error:  # whatever stands in the way
-        return _unreadable(path, f"{type(error).__name__}: {error}").what
+    except Exception:  # whatever stands in the way
+        return _unreadable(path).what
     return ""
 
 
-def _unreadable(path: Path, why: str) -> DataError:
-    allowed = "a C3D file as Vicon, Qualisys or OptiTrack export it"
-    return DataError(f"the C3D file cannot be read ({why})", where=str(path), allowed=allowed, hint="export it again")
+def _unreadable(path: Path) -> DataError:
+    why = "it is damaged, cut off or of another format" if path.stat().st_size else "it is empty"
+    allowed, hint = "a C3D file as Vicon, Qualisys or OptiTrack export it", "copy it again, or export it again"
+    return DataError(f"the C3D file cannot be read: {why}", where=str(path), allowed=allowed, hint=hint)
 
 
 def _listed(group: Mapping[str, Any], key: str) -> list[str]:

@@ -27,7 +27,7 @@ from yid_ocp.data.recording import (
     Recording,
     SensorChannelGroup,
 )
-from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_error_arguments
+from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
 from yid_ocp.sensors import CHANNEL_KINDS
 
@@ -50,8 +50,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     """Options of `read_csv`: meaning of columns, columns to keep, delimiter, header and clock.
 
     `columns` gives the meaning of columns whose names do not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
-    column name matches any text, which replaces a `*` in the meaning: `*_pos` with `position:*`.
-    """
+    column name matches any text, which replaces a `*` in the meaning: `*_pos` with `position:*`."""
 
     columns: Mapping[str, str] | None = None
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
@@ -80,15 +79,15 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are recognised by their headers, which also state
     the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. If all cells of the joints,
     of the points or of a sensor are empty in a row, this group has no sample at that time. Raises `DataError` if the
-    file, a column, cell, option or unit cannot be understood, and the errors of `validated_recording`.
-    """
+    file, a column, cell, option or unit cannot be understood, and the errors of `validated_recording`."""
     path = Path(path)
     digest = file_sha256(path)
     said = options.description, path.name, path.stem, digest
     if (capture := _mocap_table(path)) is not None:
         if options.columns:
-            what, hint = "the columns of a motion capture export are named by its header", "choose markers with points"
-            raise DataError(what, where=str(path), hint=hint)
+            what = "this is a motion capture export, whose header names its columns"
+            allowed, hint = "motion capture exports without --columns", "choose markers with --points MARKER=POINT"
+            raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         seen, unit, remarks = capture
         sensor = seen.sensor if options.point_sensor_name == "unknown" else options.point_sensor_name
         group = replace(seen, sensor=sensor, frame=options.frame)
@@ -191,7 +190,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     table = np.array(numbers).reshape(-1, len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
     if not numeric.any():
-        hint = "check that it is a table, and which delimiter it uses"
+        hint = "check that the file is a table, and set its --delimiter"
         raise DataError("the table has no column of numbers", where=str(path), allowed=_ALLOWED, hint=hint)
     text = ~np.isfinite(table) & (np.array(blank).reshape(table.shape) == 0)
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
@@ -232,12 +231,14 @@ for _suffix in (".csv", ".tsv", ".txt"):
     base.FILE_PREVIEWERS.register(_suffix)(_preview_csv)
 
 _ALLOWED = "one header row with names such as t, q_<joint>, effort_<joint>, <point>_x"
+_OR_SKIP = ", or skip such lines with --skip-bad-lines"
 
 
 def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every nonempty line."""
     if len(delimiter) != 1:
-        raise DataError(f"the delimiter is {delimiter!r}", where=str(path), allowed="one character")
+        hint = "set one character, such as --delimiter ';'"
+        raise DataError(f"the delimiter is {delimiter!r}", where=str(path), allowed="one character", hint=hint)
     try:
         with check_input_file(path).open(encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(_limited_lines(file, path), delimiter=delimiter, skipinitialspace=True)
@@ -247,13 +248,13 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
                 if count > MAX_INPUT_NUMBERS:
                     check_max_input_numbers(count, str(path))
                 if len(cells) > _MAX_COLUMNS:
-                    what, hint = f"the table has {len(cells)} columns", "see whether the delimiter is right"
+                    what, hint = f"the table has {len(cells)} columns", "check the --delimiter: comma, semicolon or tab"
                     raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)
                 if cells and not cells[0].lstrip().startswith(("#", "sep=")):  # the latter tells Excel the delimiter
                     yield lines.line_num, cells
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        what = f"the file is not a table of text ({error})"
-        raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8") from error
+        what, hint = "the file is not a table in UTF-8 text", "export it as CSV in UTF-8"
+        raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8", hint=hint) from error
 
 
 def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
@@ -261,7 +262,7 @@ def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
     while line := file.readline(_MAX_LINE_LENGTH + 1):
         if len(line) > _MAX_LINE_LENGTH:
             what, allowed = f"a line has more than {_MAX_LINE_LENGTH} characters", "one row of numbers per line"
-            raise DataError(what, where=str(path), allowed=allowed, hint="see whether it is a table")
+            raise DataError(what, where=str(path), allowed=allowed, hint="check that the file is a table of numbers")
         yield line
 
 
@@ -287,13 +288,14 @@ def _read_table(
             bad.append(line)
     table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
     if not len(table):
-        allowed, hint = "one header row, then one row per time", "see whether the export was cut off"
+        allowed, hint = "one header row, then one row per time", "check that the export is complete"
         raise DataError("the table has no rows", where=str(path), allowed=allowed, hint=hint)
     n_lines = len(table) + len(bad)
     if len(bad) > _MOST_BAD * n_lines:
-        what = f"{len(bad)} of {n_lines} lines are no rows of {len(names)} numbers"
-        where, allowed = f"{path}, line {bad[0]}", "a table most of whose lines are rows of numbers"
-        hint = "look at it with --preview; set the delimiter or leave columns of text out"
+        what = f"{len(bad)} of {n_lines} lines are not rows of {len(names)} numbers"
+        where = f"{path}, line {bad[0]}" + (" and later lines" if len(bad) > 1 else "")
+        allowed = f"at most {_MOST_BAD:.0%} of the lines"
+        hint = "set the --delimiter, or leave columns of text out: --columns NAME=skip (see --preview)"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
@@ -304,13 +306,13 @@ def _read_table(
 
 def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> None:
     if not any(header):
-        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED)
+        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED, hint="export it again")
     if options.header and all(_is_number(cell) for cell in header):
-        hint = "say so: --no-header --columns t,position:JOINT,..., one meaning for every column"
+        hint = "--no-header --columns t,position:JOINT,... with one meaning for every column"
         raise DataError("the table has no header row", where=f"{path}, line 1", allowed=_ALLOWED, hint=hint)
     if len(header) == 1:
         others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]
-        hint = f"set delimiter={others[0]}" if others else ""
+        hint = f"set --delimiter {others[0]}" if others else "export the times and the measurements as columns"
         raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=_ALLOWED, hint=hint)
     name, count = Counter(header).most_common(1)[0]
     if options.header and count > 1:
@@ -331,7 +333,8 @@ def _number(cell: str) -> float:
 
 def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Meaning], where: str) -> list[float]:
     if len(cells) != len(header):
-        raise DataError(f"the row has {len(cells)} cells", where=where, allowed=f"{len(header)} cells, as the header")
+        what, allowed = f"the row has {len(cells)} cells", f"{len(header)} cells, as the header"
+        raise DataError(what, where=where, allowed=allowed, hint=f"correct the row{_OR_SKIP}")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
         if meaning:
@@ -339,7 +342,8 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Me
                 numbers.append(float(cell) if cell.strip() else math.nan)
             except ValueError as error:
                 allowed = "a number with a decimal point, or nothing where there was no measurement"
-                raise DataError(f"column '{name}' holds '{cell}'", where=where, allowed=allowed) from error
+                what, hint = f"column '{name}' holds '{cell}'", f"leave the cell empty{_OR_SKIP}"
+                raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return numbers
 
 
@@ -361,17 +365,18 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         if own is None and name not in given:
             channels = ", ".join(f"{channel}_<joint>" for channel in JOINT_CHANNEL_UNITS)
             allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z"
-            skipped = f"{name}={base.SKIPPED_COLUMN_MEANING} to leave it out (--preview proposes that)"
-            hint = f"rename it, or say what it is: --columns {name}=position:JOINT, or {skipped}"
+            hint = f"rename the column, give its meaning (--columns '{name}=position:JOINT'), or leave it out "
+            hint += f"(--columns '{name}={base.SKIPPED_COLUMN_MEANING}')"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
-            what = f"columns '{meant[own]}' and '{name}' mean the same, {' '.join(own).strip()}"
-            allowed = "one column for every channel"
+            what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
+            allowed = "one column for every meaning"
             hint = f"leave one out: --columns {name}={base.SKIPPED_COLUMN_MEANING}"
             raise DataError(what, where=where, allowed=allowed, hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:
-        raise DataError("the table has no column of times", where=where, allowed="t or time", hint="columns NAME=t")
+        allowed, hint = "a column named t or time, in seconds", "name the column of times: --columns NAME=t"
+        raise DataError("the table has no column of times", where=where, allowed=allowed, hint=hint)
     return list(meanings.values()), units
 
 
@@ -383,11 +388,16 @@ def _given_meaning(column: str, given: str, where: str) -> _Meaning:
     kind, _, name = given.partition(":")
     known = (*JOINT_CHANNEL_UNITS, *_AXES, *_COMPONENTS)
     if not name or kind not in known:
-        what, choice = f"column '{column}' is given the meaning '{given}'", f"one of {', '.join(known)}"
+        what = f"the meaning '{given}' of column '{column}' is unknown"
         allowed = (
-            f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with a joint's, a point's or a sensor's name and {choice}"
+            f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with the name of a joint, point or sensor and the kind "
         )
-        hint = nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME"
+        allowed += ", ".join(known)
+        hint = (
+            f"{column}={kind}:NAME"
+            if kind in known
+            else nearest_name_question(kind, known) or f"{column}=position:JOINT"
+        )
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
 
@@ -396,7 +406,8 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
     places = {meaning: i for i, meaning in enumerate(meanings)}
     for meaning in wanted:
         if meaning not in places:
-            what = f"there is no column for {meaning[0]} of '{meaning[1]}'"
+            what, skip = f"there is no column for {meaning[0]} of '{meaning[1]}'", base.SKIPPED_COLUMN_MEANING
             allowed = "every channel for all joints, position always; x, y and z of every point and every sensor"
-            raise DataError(what, where=where, allowed=allowed)
+            hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
     return table[:, [places[meaning] for meaning in wanted]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -16,7 +17,7 @@ from pydantic import BaseModel, Field, ValidationError
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError
 from yid_ocp.files import check_input_file, check_max_input_numbers, file_sha256, read_input_json
 
 _STATE, _ACTION = "observation.state", "action"
@@ -43,11 +44,11 @@ class _Feature(BaseModel):
 
 class _Info(BaseModel):
     codebase_version: str
-    fps: float = Field(gt=0, allow_inf_nan=False)
-    features: dict[str, _Feature]
-    total_episodes: int = Field(default=0, ge=0)
+    fps: float = Field(gt=0, allow_inf_nan=False, description="a number above 0 [Hz]")
+    features: dict[str, _Feature] = Field(description="an object with {dtype, names} for every feature")
+    total_episodes: int = Field(default=0, ge=0, description="a whole number from 0")
     data_path: str = ""
-    chunks_size: int | None = Field(default=None, gt=0)
+    chunks_size: int | None = Field(default=None, gt=0, description="a whole number from 1")
     robot_type: str | None = None
 
 
@@ -75,8 +76,7 @@ def read_lerobot_episode(
     records in radians, are refused unless `units` states their unit (often degrees). `notes` lists images and other
     features. The other options are those of `SelectionAndUnitOptions`; `joints` can omit a gripper that is not in the
     model. Raises `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode,
-    and the errors of `validated_recording`.
-    """
+    and the errors of `validated_recording`."""
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
     names, channels, left = _channels(dataset, table)
@@ -127,48 +127,50 @@ def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None
     widest, robot = _widest(group), dataset.info.robot_type or ""
     if widest <= _MAX_RADIANS and not _NEVER_RADIANS.search(robot):
         return
-    of = f", and a {robot} is not recorded in radians" if _NEVER_RADIANS.search(robot) else ""
-    what = f"angles reach {widest:.3g}{of}: the unit has to be said"
-    allowed = "--units deg, or --units position=rad where they are radians after all"
-    hint = "--units deg"
+    of = f", and LeRobot does not record a {robot} in radians" if _NEVER_RADIANS.search(robot) else ""
+    what = f"the unit of the joint positions is unknown: they reach {widest:.3g}{of}"
+    allowed, hint = "--units deg, or --units position=rad", "--units deg"
     if widest <= _MAX_NORMALISED:
         hint = (
-            "--units deg if the robot was recorded with use_degrees=true; else these are -100 to 100 of the calibrated "
+            "--units deg if the robot was recorded with use_degrees=true. Otherwise the values are normalised to the "
         )
-        hint += "range, which are no angles: record again with use_degrees=true"
+        hint += "calibrated range (-100 to 100) and cannot be converted: record again with use_degrees=true"
     raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def _dataset(folder: Path) -> _Dataset:
     file = folder / "meta" / "info.json"
-    where, hint = str(file), "convert it with the tools of LeRobot"
+    where, hint = str(file), "convert the dataset again with the conversion script of LeRobot"
     try:
         info = _Info.model_validate(read_input_json(file))
     except ValidationError as error:
         wrong = error.errors()[0]
-        what = f"{'.'.join(map(str, wrong['loc'])) or 'the whole'} in the dataset's description: {wrong['msg']}"
-        raise DataError(what, where=where, allowed="codebase_version, fps and features in JSON", hint=hint) from error
+        key, allowed = ".".join(map(str, wrong["loc"])), "an object with codebase_version, fps and features"
+        if key:
+            allowed = _Info.model_fields[str(wrong["loc"][0])].description or "text"
+        what = f"{key or 'the content'} = {json.dumps(wrong['input'])[:60]} is not allowed"
+        what = f"the key '{key}' is missing" if wrong["type"] == "missing" else what
+        raise DataError(what, where=f"{where}: {key}" if key else where, allowed=allowed, hint=hint) from error
     version = info.codebase_version
     if version not in _VERSIONS:
-        raise DataError(f"the dataset is of version {version}", where=where, allowed=", ".join(_VERSIONS), hint=hint)
+        what = f"the dataset has the version {version}"
+        raise DataError(what, where=f"{where}: codebase_version", allowed=", ".join(_VERSIONS), hint=hint)
     if _STATE not in info.features:
-        raise DataError(
-            f"the dataset has no {_STATE}", where=where, **unknown_name_error_arguments(_STATE, info.features)
-        )
+        said = {"allowed": f"features with {_STATE}", "hint": "record the dataset with the state of a robot"}
+        raise DataError(f"the dataset has no {_STATE}", where=f"{where}: features", **said)
     return _Dataset(folder, info)
 
 
 def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path]:
     """Columns of one episode, shape (frames, numbers of a frame), and its file."""
-    arrow, parquet = (
-        base.import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow", dataset.folder)
-        for name in ("pyarrow", "pyarrow.parquet")
-    )
+    names = "pyarrow", "pyarrow.parquet"
+    arrow, parquet = (base.import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow") for name in names)
     where = f"{dataset.folder}, episode {episode}"
     last = dataset.info.total_episodes - 1
     allowed = f"0 to {last}" if last >= 0 else "an episode that was recorded"
     if episode < 0 or (last >= 0 and episode > last):
-        raise DataError(f"there is no episode {episode}", where=str(dataset.folder), allowed=allowed)
+        hint = "choose a recorded episode with --episode NUMBER"
+        raise DataError(f"there is no episode {episode}", where=str(dataset.folder), allowed=allowed, hint=hint)
     files = _files(dataset, episode)
     wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.info.features]
     columns = [*wanted, "frame_index", "episode_index"]
@@ -180,11 +182,13 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
             table = parquet.read_table(file, columns=columns, filters=[("episode_index", "=", episode)])
             found = {name: _matrix(table[name].combine_chunks(), name, dataset.folder) for name in columns}
         except (arrow.ArrowException, OSError, KeyError, ValueError) as error:
-            what = f"the table of the episode cannot be read ({type(error).__name__}: {error})"
-            raise DataError(what, where=str(file), allowed=f"a parquet file with {', '.join(columns)}") from error
+            what = "the table of the episode cannot be read: it is damaged or not a parquet file"
+            hint = "download or copy the file again"
+            allowed = f"a parquet file with {', '.join(columns)}"
+            raise DataError(what, where=str(file), allowed=allowed, hint=hint) from error
         if len(found["frame_index"]):
             return found, file
-    raise DataError("no table has the episode", where=where, allowed=allowed, hint="download the whole dataset")
+    raise DataError("no table has this episode", where=where, allowed=allowed, hint="download the whole dataset")
 
 
 def _files(dataset: _Dataset, episode: int) -> list[Path]:
@@ -200,8 +204,10 @@ def _files(dataset: _Dataset, episode: int) -> list[Path]:
             return [dataset.folder / pattern.format(**numbers)]
     except ValueError:  # braces that do not match
         pass
-    where, allowed = str(dataset.folder / "meta" / "info.json"), "{episode_chunk:03d} and {episode_index:06d} in a path"
-    raise DataError(f"data_path is '{pattern}'", where=where, allowed=allowed, hint="correct it as LeRobot writes it")
+    where = f"{dataset.folder / 'meta' / 'info.json'}: data_path"
+    allowed = "a path in the dataset with {episode_chunk:03d} and {episode_index:06d}"
+    hint = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    raise DataError(f"data_path is '{pattern}'", where=where, allowed=allowed, hint=hint)
 
 
 def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
@@ -221,7 +227,8 @@ def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
         while hasattr(kind, "value_field"):
             kind = kind.value_type
         if not (types.is_integer(kind) or types.is_floating(kind)):
-            what, hint = f"{name} holds {kind} where numbers are expected", "record the dataset again"
+            what = f"the column {name} holds {kind} instead of numbers"
+            hint = "convert the dataset again, or record it again"
             raise DataError(what, where=where, allowed="numbers, or lists of numbers", hint=hint)
 
 
@@ -239,7 +246,8 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
         at = [entries.index((joint, channel)) for joint in joints if (joint, channel) in entries]
         if len(at) < len(joints):
             what = f"{_STATE} has the {channel} of {len(at)} of {len(joints)} joints"
-            raise DataError(what, where=str(dataset.folder), allowed="every channel for all joints")
+            allowed, hint = "every channel for all joints", f"record the {channel} of all joints, or of none"
+            raise DataError(what, where=f"{dataset.folder}: {_STATE}", allowed=allowed, hint=hint)
         channels[channel] = state[:, at]
     left = {}
     for name in dataset.info.features:
@@ -266,8 +274,8 @@ def _matrix(column: Any, name: str, folder: Path) -> Array:
         n_lengths = max(n_lengths, len(compute.unique(compute.list_value_length(column))))
         column = column.flatten()
     if n_lengths > 1 or len(column) < rows:
-        what = f"{name} is not a list of as many numbers in every frame"
-        raise DataError(what, where=str(folder), allowed="numbers", hint="record the dataset again")
+        what, allowed = f"{name} has different counts of numbers in its frames", "equally many numbers in every frame"
+        raise DataError(what, where=str(folder), allowed=allowed, hint="convert the dataset again, or record it again")
     return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
 
 

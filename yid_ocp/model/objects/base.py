@@ -14,7 +14,7 @@ from annotated_types import Ge, Le
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
+from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
 from yid_ocp.model.system import System
@@ -48,8 +48,7 @@ class ClampPoseDefinition:
     """Defines a clamp's pose by two measured points. The first is the origin, and the z axis points to the second.
 
     With `level` the roll angle is zero (x axis perpendicular to world y). With `transported` it starts as `level`, and
-    the clamp never rotates about its own z axis.
-    """
+    the clamp never rotates about its own z axis."""
 
     clamp_name: str
     origin_point_name: str
@@ -70,18 +69,20 @@ class CableTopology:
         free = self.parent_branch_vertex_names[2:-2]
         if not free:
             what = f"the parent has {len(self.parent_branch_vertex_names)} vertices"
-            allowed = "5 or more: two held at each end"
-            raise ModelError(what, where="cable", allowed=allowed)
+            allowed, hint = "5 or more: two are held at each end", "add vertices between the ends"
+            raise ModelError(what, where="cable: parent_branch_vertex_names", allowed=allowed, hint=hint)
         for name, vertices in self.vertex_names_by_child_branch.items():
             if len(vertices) < 2 or vertices[0] not in free:
-                what = f"child '{name}' does not leave the parent at one of its free vertices"
-                raise ModelError(what, where="cable", allowed=", ".join(free))
+                what = f"the branch '{name}' has {len(vertices)} vertices, starting with {vertices[:1] or 'none'}"
+                allowed = f"two or more vertices, the first of them one of {', '.join(free)}"
+                raise ModelError(what, where=f"cable: vertex_names_by_child_branch.{name}", allowed=allowed)
         for vertex in self.vertex_names:
             if vertex not in self.undeformed_positions:
-                hint = nearest_name_hint(vertex, self.undeformed_positions)
-                raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", hint=hint)
+                said = unknown_name_error_arguments(vertex, self.undeformed_positions)
+                raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", **said)
         if len(set(self.vertex_names)) != len(self.vertex_names):
-            raise ModelError("a vertex belongs to two branches", where="cable")
+            allowed, hint = "every vertex in one branch", "list the vertex in one branch only"
+            raise ModelError("a vertex belongs to two branches", where="cable", allowed=allowed, hint=hint)
 
     @property
     def vertex_names(self) -> tuple[str, ...]:
@@ -139,8 +140,7 @@ class InitCommandObjectFactory:
     """Template for one word of `init --object`.
 
     `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
-    Raises `ConfigError` if an input is missing.
-    """
+    Raises `ConfigError` if an input is missing."""
 
     default_links: int  # per segment
     build: Callable[[Mapping[str, Any], int], InitCommandObject]
@@ -166,7 +166,9 @@ def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
         noun = f"{count} numbers" if count > 1 else "a number"
-        raise ConfigError(f"'{text}' is not {noun}", where=flag, allowed=f"{noun} with commas" if count > 1 else noun)
+        allowed = f"{noun} with commas between" if count > 1 else noun
+        hint = f"write for example {flag} {','.join(['0.1'] * count)}"
+        raise ConfigError(f"'{text}' is not {noun}", where=flag, allowed=allowed, hint=hint)
     return values
 
 
@@ -184,9 +186,7 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 class ObjectKind:
     """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
-    A subclass overrides `kind`, and `build_segments` or `build`. A kind that is a whole system is also a
-    `ClampedObject`.
-    """
+    A subclass overrides `kind`, and `build_segments` or `build`. A whole system is also a `ClampedObject`."""
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
     default_link_refinement: ClassVar[bool] = False

@@ -27,7 +27,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Len
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, ModelError, nearest_name_hint
+from yid_ocp.errors import DataError, ModelError, unknown_name_error_arguments
 from yid_ocp.files import read_input_text
 from yid_ocp.model.flexible import (
     AXIS_UNIT_VECTORS,
@@ -73,8 +73,7 @@ class CableOptions:
     With `shape_memory_fraction`, each joint's rest angle is (1 - memory) x undeformed + memory x (start angle -
     load/stiffness). The load is the joint's torque in equilibrium at the start of the recording. The fraction becomes
     the parameter `SEGMENT.memory`. For a recording that starts in motion it is multiplied by 1/(1 + (start
-    speed/`start.speed_scale`)^2). Branches without an entry have the `default_branch`. `gravity` is in m/s^2.
-    """
+    speed/`start.speed_scale`)^2). Branches without an entry have the `default_branch`. `gravity` is in m/s^2."""
 
     branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by branch, parent and children")] = (
         field(default_factory=dict)
@@ -115,7 +114,8 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         return {row["point"]: np.array([float(row[axis]) for axis in "xyz"]) for row in rows}
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         allowed = "columns point, x, y, z with numbers in metres"
-        raise DataError("the table of vertices is malformed", where=str(path), allowed=allowed) from error
+        what, hint = "the table of vertices lacks a column, or has a cell that is not a number", "correct the table"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
 
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
@@ -137,8 +137,7 @@ def clamped_cable_system(
 
     The twelve coordinates of `clamp_start` and `clamp_end` are prescribed. Frames are all vertices, `junction_CHILD`
     and `last_edge`. Parameters are those of each segment (`parent.bend`, ...), `clamp_start.length`, `clamp_start.roll`
-    and, for a weld, `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent.
-    """
+    and, for a weld, `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent."""
     options = options or CableOptions()
     item = flexible_object(_segments(cable, lengths, options), name="cable")
     if options.has_rest_angle_parameters:
@@ -322,8 +321,8 @@ model:
         found = CableTopology(self.parent_branch_vertex_names, dict(self.vertex_names_by_child_branch), undeformed)
         for name in self.branch_properties:
             if name not in found.vertex_names_by_branch:
-                hint = nearest_name_hint(name, found.vertex_names_by_branch)
-                raise ModelError(f"there is no branch '{name}'", where=f"branch_properties.{name}", hint=hint)
+                said = unknown_name_error_arguments(name, found.vertex_names_by_branch)
+                raise ModelError(f"there is no branch '{name}'", where=f"model.object.branch_properties.{name}", **said)
         return found
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:

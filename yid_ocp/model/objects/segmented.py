@@ -54,8 +54,8 @@ class FlexibleSegmentSettings:
     def segment(self, name: str, damping: float, link_division: int) -> Segment:
         """Build the named `Segment`. Links are divided into `link_division` links at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
-            hint = "set length or link_lengths"
-            raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)
+            what, where, hint = f"segment '{name}' has no length", f"model.object.segments.{name}", "set one of the two"
+            raise ModelError(what, where=where, allowed="length or link_lengths [m]", hint=hint)
         n = link_division
         # a rigidity does not depend on the number of links, a stiffness per joint does
         factor = 1 if self.stiffness_given_as_rigidity else n
@@ -126,7 +126,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     length, mass, radius = base.required_object_numbers("each branch of a tree", numbers, base.SIZE_DESCRIPTIONS)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
-        raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
+        raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="a whole number from 1 to 16")
     # perpendicular to the holder's z axis, the first one along its x axis
     turns = [(0.0, quarter, round(4 * quarter * i / count, 7)) for i in range(count)]
     branches = enumerate((_init_segment(links, length, mass, radius, rpy=turn) for turn in turns), 1)
@@ -145,10 +145,12 @@ def _grown(branches: Sequence[tuple[str, FlexibleSegmentSettings]]) -> dict[str,
     made: dict[str, FlexibleSegmentSettings] = {}
     for name, branch in branches:
         if name in made:
-            raise ConfigError(f"two branches are called '{name}'", where="--branch", allowed="a name for each")
+            what, allowed = f"two branches are called '{name}'", "a name of its own for each branch"
+            raise ConfigError(what, where="--branch", allowed=allowed, hint="rename one of them")
         if branch.parent is not None and branch.parent not in made:
-            what = f"branch '{name}' grows on '{branch.parent}', which does not come before it"
-            raise ConfigError(what, where="--branch", allowed=", ".join(made) or "the holder alone")
+            what = f"branch '{name}' grows on '{branch.parent}', which is not an earlier branch"
+            allowed, hint = ", ".join(made) or "a branch without @PARENT first", "list the parent before the branch"
+            raise ConfigError(what, where="--branch", allowed=allowed, hint=hint)
         made[name] = branch
     return made
 
@@ -158,10 +160,12 @@ def _branch(text: str, links: int) -> tuple[str, FlexibleSegmentSettings]:
     name, at, parent = said.partition("@")
     count = len(numbers.split(","))
     if not (name and equals) or (at and not parent) or count not in (3, 6):
-        raise ConfigError(f"'{text}' describes no branch", where="--branch", allowed=_BRANCH_SHAPE)
+        what, hint = f"'{text}' does not describe a branch", "write for example --branch left=0.4,0.03,0.008"
+        raise ConfigError(what, where="--branch", allowed=_BRANCH_SHAPE, hint=hint)
     values = base.comma_separated_numbers(numbers, count, "--branch")
     if min(values[:3]) <= 0:
-        raise ConfigError(f"'{text}' has a size that is not above 0", where="--branch", allowed=_BRANCH_SHAPE)
+        what, allowed = f"'{text}' has a size that is not above 0", "length [m], mass [kg] and radius [m] above 0"
+        raise ConfigError(what, where="--branch", allowed=allowed)
     turn = (values[3], values[4], values[5]) if count == 6 else _NO_TURN
     return name, _init_segment(links, values[0], values[1], values[2], rpy=turn, parent=parent or None)
 
