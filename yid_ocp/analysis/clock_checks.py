@@ -120,8 +120,7 @@ def check_robot_held_point_clock(
 
     The points are seen at `seen` (N, np, 3) [m] at the times `t` (N,); `path` returns their positions from the angles.
     `by_angle` (N, np, 3, k) is the derivative of these positions with respect to the angles. `std` is the noise of the
-    points [m], zero if unknown.
-    """
+    points [m], zero if unknown."""
     span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
     size = np.concatenate([np.full(by_angle.shape[3], _ENCODER_ZERO_STD), np.full(6, _FRAME_ERROR_STD)])

@@ -85,8 +85,7 @@ def compare_methods(
     noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run of a method that
     supports it. `truth` are known parameter values. `callback` receives the method's name and every `Iterate`. `limits`
     are the criteria by which a residual exceeds noise. Each method may use an equal part of the remaining `time_budget`
-    [s].
-    """
+    [s]."""
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
     deadline = time.perf_counter() + time_budget
 

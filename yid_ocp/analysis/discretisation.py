@@ -131,8 +131,7 @@ def refitted_residual_at_finer_step(
     """Whitened residual of `fine` one Gauss-Newton step from the coarse fit x (nx,), or None if the step fails.
 
     `fine` is the problem with a shorter time step, and `at_x` the coarse evaluation with Jacobian. With process noise,
-    the weights are the coarse ones.
-    """
+    the weights are the coarse ones."""
     made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
     return None if isinstance(made, str) else made[1]
 
@@ -142,8 +141,7 @@ def longest_accurate_time_step(problem: EstimationProblem) -> float:
 
     The step starts at 20 ms and is halved at most five times. It is accepted if half the step changes the predictions
     by at most 3 % of their residual or of the noise, whichever is larger (root mean squares, whitened). A poor initial
-    guess has a larger residual and therefore allows a larger error of the step.
-    """
+    guess has a larger residual and therefore allows a larger error of the step."""
     x, problem = problem.initial_unknowns, problem.with_time_step(_MAX_TIME_STEP)
     for _ in range(_MAX_HALVINGS):
         fine = problem.with_time_step(problem.step.time_step / 2)
@@ -210,8 +208,7 @@ def measure_discretisation_shifts(
 
     `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. For
     other points, set `model_difference_only`. Returns the shifts of every shared free parameter, empty if nothing was
-    tried, and notes on shifts that could not be computed.
-    """
+    tried, and notes on shifts that could not be computed."""
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
     for key in kinds:
@@ -310,8 +307,7 @@ def step_map_natural_frequencies(
 
     The driven and prescribed coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts
     at `guess` (n,). The rules are as in `compile_step`. The midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
-    The force split affects only growth.
-    """
+    The force split affects only growth."""
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: with these held still nothing can swing"

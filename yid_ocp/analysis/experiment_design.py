@@ -180,8 +180,7 @@ class CandidateExperimentSensitivities:
 
     `position_sensitivities` holds the derivatives of each frame's position at every node, by (episode, group, frame).
     They are with respect to the nx unknowns and to the q torque-error unknowns of this episode (see
-    `point_sensitivities_and_joint_sensor_information`).
-    """
+    `point_sensitivities_and_joint_sensor_information`)."""
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
     x: Array

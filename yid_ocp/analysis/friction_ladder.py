@@ -113,8 +113,7 @@ def friction_torque_clouds(
 
     The measured torque is the residual of the discrete equations along the smoothed measured angles with zero friction.
     The predicted torque is the change of this residual by the fitted law. The result is empty for models with
-    constraints or internal coordinates.
-    """
+    constraints or internal coordinates."""
     step, system = problem.step, problem.system
     driven = system.driven
     if not driven or step.sizes["m"] or step.sizes["nz"] or len(driven) != system.n_coordinates:

@@ -216,8 +216,7 @@ def check_inertial_effort_excitation(
 
     Static configurations determine weight and stiffness. Damping, friction and inertia require the efforts of motion,
     here estimated by inverse dynamics and friction of a typical size. `effort` are the options of the effort sensor.
-    `arm.has_all_angles_recorded(recording)` must hold.
-    """
+    `arm.has_all_angles_recorded(recording)` must hold."""
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or effort.use is False:
@@ -256,8 +255,7 @@ def check_joint_excitation(
 ) -> Iterator[Issue]:
     """Yield issues about joints with free parameters (`asked`, by joint) that hardly move in any recording.
 
-    `position` are the options of the position sensor.
-    """
+    `position` are the options of the position sensor."""
     for joint, parameters in asked.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:

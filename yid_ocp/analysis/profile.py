@@ -75,8 +75,7 @@ def compute_profile_likelihood_interval(
     chi2. An end is open if the level is not reached before the unknown's bound, or within a factor of 1000 (Venzon and
     Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496). `index` selects the unknown, `x` (nx,) is the best
     fit, and `evaluation` the evaluation at `x` with Jacobian. `std` is the unknown's standard deviation; it sets the
-    first step and may be infinite.
-    """
+    first step and may be infinite."""
     walk = _Walk(problem, x, index, evaluation)
     size = min(std / abs(x[index]), 0.5) if walk.logarithmic else min(std, 10 * float(problem.unknown_scales[index]))
     lower, upper = walk.end(-1, size), walk.end(1, size)
@@ -149,8 +148,7 @@ def mark_unidentifiable_near_zero_estimate(
     An unobserved twist of a branch moves only if its stiffness is near zero, and then it fits the noise. The cost has a
     narrow minimum there, lower than at all large values by what one additional parameter removes from the noise. `x`
     (nx,) is the best fit, `index` selects the unknown, `evaluation` is the evaluation at `x`, and `size` the
-    parameter's entry of `typical_parameter_magnitudes`.
-    """
+    parameter's entry of `typical_parameter_magnitudes`."""
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry
     rise = _Walk(problem, x, index, evaluation).rise(size)

@@ -146,8 +146,7 @@ def parameter_detectabilities(
     One unit is added to one row of one step that starts at `state`. The later steps are linear, x' = (A - B_u K) x,
     where K is the first gain of the tracking filter. The row is observed to first order if a reading changes within
     `_RESPONSE_STEPS` steps. `symbols` are the named equations and `stages` their linearisation at `state`. `episode`
-    provides the sensors and the tracking filter; without it only rows are listed.
-    """
+    provides the sensors and the tracking filter; without it only rows are listed."""
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
     for row, column in zip(*symbols.full_jacobian_sparsity_pattern.get_triplet(), strict=True):

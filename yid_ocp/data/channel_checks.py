@@ -165,8 +165,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
 
     Noise stated in the settings (`choice`) is not checked, because it may represent model error. As noise need not be
     white, the largest estimate from all samples, every second sample, and so on up to `_MAX_SAMPLE_PERIOD` counts;
-    quantization counts as well. Channels without noise are skipped because they were computed, as commands are.
-    """
+    quantization counts as well. Channels without noise are skipped because they were computed, as commands are."""
     found: dict[str, list[tuple[str, float, float]]] = {}
     commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):

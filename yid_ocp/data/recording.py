@@ -330,8 +330,7 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
         strictly increasing. A joint channel is not finite, or a point is infinite or partly seen. A standard deviation
         is negative. The kind of effort is unknown. A pose is not a rigid transform. Joint positions exceed 50 rad or
         points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any machine.
-        `marker_reference_pose` does not match the first group of points.
-    """
+        `marker_reference_pose` does not match the first group of points."""
     origin = where or f"recording '{recording.name}'"
     require_data(recording.all_groups, "the recording has no group", origin, "joints, points, points_<name>")
     texts = (("description", recording.description), ("source", recording.source))

@@ -151,8 +151,7 @@ class Payload(EffectBase):
     Usually w is 1/mass, and K = e e'/mass is the second moment of a point. Only for a location further than
     `_POINT_INERTIA_DISTANCE`, and near mass zero, w goes smoothly to zero. The second moment of the link about its new
     centre is Sigma + c h e e'. For an added mass h is 1. For a removed mass h = (1 + a^4)^(-1/4) with a = c e' Sigma^-1
-    e. This keeps the link's inertia positive, and is almost 1 if the removed mass was part of the link.
-    """
+    e. This keeps the link's inertia positive, and is almost 1 if the removed mass was part of the link."""
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
     required_excitation = "its orientation to gravity"

@@ -73,8 +73,7 @@ class KalmanStepMatrices:
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
         """Smoothed measurement noise (r, c) and the costate before the step (nx, c), from the costate after the step.
 
-        `white` are the normalized innovations. The smoothed state is the filter's prediction + P costate.
-        """
+        `white` are the normalized innovations. The smoothed state is the filter's prediction + P costate."""
         pulled = self.transition._propagate_costate_back(costate)
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
         return noise, pulled + self.observation.T @ noise
@@ -94,8 +93,7 @@ def kalman_matrices_and_next_covariance(
     """Compute a filter step's gains, the next state covariance without process noise, and log det S.
 
     `covariance` is P (nx, nx) before the measurement, `observation` is H (r, nx), and S = I + H P H'. If rounding makes
-    S indefinite, only its diagonal is used, and log det S is returned as infinity.
-    """
+    S indefinite, only its diagonal is used, and log det S is returned as infinity."""
     cross = observation @ covariance
     whitening, log_determinant = np.zeros((0, 0)), 0.0
     if len(observation):
@@ -154,8 +152,7 @@ class KalmanSteps:
 
         `mean` is the mean before all steps, `measured` (r, c) the measurements. `push` (k, m, c) is added to the
         parameters during a step's transition. `shift` (k, nx - ns) is added to the parameters of the first column after
-        it.
-        """
+        it."""
         if (library := _library()) is not None:
             return self._compiled_columns(library, measured, mean, shift, push)
         white, seen, ns = np.empty_like(measured), np.empty((len(self.moves), *mean.shape)), self.moves.shape[1]
@@ -170,8 +167,7 @@ class KalmanSteps:
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
         """Smoothed measurement noise (r, c), costates (nx, c) before all steps, and costates after each (k, nx, c).
 
-        `white` are the normalized innovations, `costate` is the costate after the last step.
-        """
+        `white` are the normalized innovations, `costate` is the costate after the last step."""
         if (library := _library()) is not None:
             return self._compiled_columns(library, white, costate, None, None)
         noise, seen = np.empty_like(white), np.empty((len(self.moves), *costate.shape))

@@ -365,8 +365,7 @@ def force_log_likelihood_coefficients(
     """Coefficients g (J,) and L (J, J) of an unknown's log likelihood g'f - f'L f / 2, where f are its values.
 
     `unknown` is the index of the unknown, in whose reference f is expressed. Free parameters, states and all other
-    unknowns are integrated out; `variance` gives the variances of their groups [squared reference].
-    """
+    unknowns are integrated out; `variance` gives the variances of their groups [squared reference]."""
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))
     intervals = []

@@ -123,8 +123,7 @@ class Step(ReprMixin):
         """Derivatives A (nx, nx), B_u (nx, nu), B_theta (nx, len(names)) of the next state by state, input, parameters.
 
         They follow from the implicit function theorem. Arguments are as in `__call__`; `names` are by default all of
-        theta.
-        """
+        theta."""
         sizes = self.sizes
         chosen = tuple(self.system.parameters.names if names is None else names)
         nx, nu, nt = sizes["nx"], sizes["nu"], len(chosen)

@@ -56,8 +56,7 @@ def lqr_tracking_feedback(
     model is that of the arms without the object. The gains act on the arms' angles and momenta. The reference momentum
     follows from the measured angles (N + 1, nu) [rad] and torques (N, nu) [N m] by the arms' DEL equations. It is
     therefore comparable with the model's momentum. The angles must be smooth enough for numerical differentiation.
-    `arms` is the result of `compile_driven_arms_only_step`, compiled if absent.
-    """
+    `arms` is the result of `compile_driven_arms_only_step`, compiled if absent."""
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arm_step = compile_driven_arms_only_step(step) if arms is None else arms

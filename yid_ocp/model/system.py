@@ -193,16 +193,14 @@ class Effect:
         """Added delay [s] of a channel: recorded minus true time of a sample. `channel` is as in `distorted_reading`.
 
         `camera` marks points of a camera. For `torque.JOINT`, a torque that drives the model, it is the delay of its
-        action.
-        """
+        action."""
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant [s] of a channel's first-order lag.
 
         For `torque.JOINT`, the acting torque lags behind the recorded one. For `joints.effort.JOINT`, the recorded
-        effort lags behind the true one.
-        """
+        effort lags behind the true one."""
         return ca.SX(0)
 
 
