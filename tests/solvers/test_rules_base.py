@@ -262,6 +262,15 @@ def test_another_start_takes_a_known_fit_only_within_a_hundredth_of_its_std_and_
     assert (again, solution.x.tolist()) == ([[4.0], [end]][:weightings], [kept])
 
 
+def test_another_start_of_gauss_newton_is_weighed_anew_only_where_it_leads_elsewhere():
+    """Weights of the best fit tell that a start four times as large leads to the same minimum."""
+    problem = Disturbed(linear(2.0 * np.eye(1), [-5.0]))
+    found = solve(problem, GaussNewton())
+    assert "(best of 2 starts)" in found.message
+    assert found.x.tolist() == pytest.approx([2.5])
+    assert [at[0] for at, _ in problem.frozen] == pytest.approx([1.0, 2.5], rel=1e-3)
+
+
 def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby():
     """The valley of x = 2 and the one of x = 2.5 lie on two sides of a ridge."""
 

@@ -41,7 +41,7 @@ from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
-from yid_ocp.solvers.initial_guess import unknowns_with_neutral_effects_activated
+from yid_ocp.solvers.initial_guess import other_minimum_starts, unknowns_with_neutral_effects_activated
 
 if TYPE_CHECKING:
     import pandas
@@ -299,16 +299,15 @@ _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
 # If the arm folds the object for a moment, minima can be close together. If the model does not explain the recording,
 # the best fit is multiplied by these factors and tried again: a stiffer object folds less.
 _NEARBY_START_FACTORS = (1.25, 1.6)
-# A branch measured a few times a second fits several frequencies, so a parameter with a relative std above the first
-# number can have other minima. It is multiplied by these factors, and the others follow the fit's covariance. If the
-# cost rises by less than the second number times the predicted rise, the search continues there (twice at most).
-_MIN_SCANNED_RELATIVE_STD, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = 0.03, 0.2, 2
-_SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 # Process noise is linearised at the start of a pass; passes end when one changes nothing.
 _MAX_WHITENING_PASSES = 6
 # A search that comes this close to a known fit returns that fit [standard deviations]. Two searches can end farther
 # apart in the same minimum, because of solver tolerance or the last pass's whitening; the better end is kept.
 _SAME_FIT_STDS = 0.01
+# Another start is first followed under the weights of the best fit, to a coarse tolerance. It ends in the same minimum
+# where it comes this near to that fit [standard deviations] without this gain, what a tenth of a standard deviation is
+# worth, and in a worse one above this multiple of its cost.
+_SAME_MINIMUM_STDS, _MIN_COST_GAIN_OF_START, _MAX_COST_RATIO_OF_START = 0.3, 0.005, 1.15
 _STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
@@ -402,7 +401,7 @@ class _MultiStartSearch:
             if not best.evaluation.ok or assess_goodness_of_fit(best.weighted, best.evaluation, limits).explains:
                 break
             self._try(self._multiple(best.result.x, factor), f"best fit x {factor:g}", most)
-        minima = _other_minima(self._best)
+        minima = other_minimum_starts(self._best.weighted, self._best.evaluation, self._best.result.x)
         most = self._n_starts + len(minima)
         for near in minima:
             self._try(near, "another local minimum", most)
@@ -417,12 +416,31 @@ class _MultiStartSearch:
         note = f"start {self._n_starts} of at most {most}: {what}"
         log.info("starting again: %s", note)
         try:
-            again = _fit_from(self._problem, self._solver, x, _noting(self._callback, note), self._fits)
+            again = self._no_better_minimum(x, note)
+            again = again or _fit_from(self._problem, self._solver, x, _noting(self._callback, note), self._fits)
         except YidError as error:
             # a failed restart must not lose the present fit
             log.info("no fit from there: %s", error)
             return
         self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
+
+    def _no_better_minimum(self, x: Array, note: str) -> _Fit | None:
+        """The best fit, where under its weights a start leads to it or to a worse one; else None."""
+        best, coarse = self._best, getattr(self._solver, "coarse", None)
+        if coarse is None or not (best.evaluation.ok and self._problem.has_process_noise):
+            return None
+        near = _minimize_cost(coarse, best.weighted, x, _noting(self._callback, note))
+        cost, distance = (
+            near.history[-1].cost if near.history else 0.0,
+            _stds_apart(best.evaluation, near.x - best.result.x),
+        )
+        is_worse = cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
+        # along an unknown that the data hardly inform the better end counts
+        is_same = distance < _SAME_MINIMUM_STDS and cost > best.evaluation.cost - _MIN_COST_GAIN_OF_START
+        if near.status == Status.FAILED or not (is_worse or is_same or near.stopped_by_callback):
+            return None
+        same = replace(best.result, stopped_by_callback=near.stopped_by_callback)
+        return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
 
     def solution(self, limits: ExcessResidualCriteria) -> Solution:
         """Solution of the best fit, with its uncertainty."""
@@ -505,12 +523,18 @@ def _fit_from(
     weighted = problem
     for number in range(passes):
         weighted = problem_whitened_at(weighted, x, warm) if passes > 1 else problem
-        which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
-        result = _minimize_cost(solver, weighted, x, _noting(callback, which))
-        x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
-        history += result.history
+        noted = _noting(callback, f"pass {number + 1} of at most {passes}" if passes > 1 else "")
+        begun, coarse = x, getattr(solver, "coarse", solver) if passes > 1 else solver
+        for own in dict.fromkeys((coarse, solver)):
+            result = _minimize_cost(own, weighted, x, noted)
+            x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
+            history += result.history
+            moved = _stds_apart(result.evaluation, x - begun)
+            # far from its end a pass need not be exact, as the next one weighs anew
+            if result.stopped_by_callback or (moved > _SAME_MINIMUM_STDS and number < passes - 1):
+                break
         # the second pass is the first about torque offsets that are not guessed
-        if (number and len(result.history) < 2) or result.stopped_by_callback:
+        if (number and (len(result.history) < 2 or moved < _SAME_FIT_STDS)) or result.stopped_by_callback:
             break
         # a search that reaches a known fit is not whitened again
         if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
@@ -525,8 +549,13 @@ def _fit_from(
 
 def _is_at(fit: _Fit, x: Array) -> bool:
     """Whether a point differs from a fit by d with negligible |J d|, which bounds all |d_i| / std_i."""
-    slopes = fit.evaluation.jacobian if fit.evaluation.ok else None
-    return slopes is not None and float(np.linalg.norm(slopes @ (x - fit.result.x))) < _SAME_FIT_STDS
+    return _stds_apart(fit.evaluation, x - fit.result.x) < _SAME_FIT_STDS
+
+
+def _stds_apart(evaluation: Evaluation | None, moved: Array) -> float:
+    """|J d| of a move d; infinite without a Jacobian."""
+    slopes = evaluation.jacobian if evaluation is not None and evaluation.ok else None
+    return math.inf if slopes is None else float(np.linalg.norm(slopes @ moved))
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:
@@ -537,30 +566,6 @@ def _doubtful(fit: _Fit, first: Array) -> BoolArray:
     std = np.sqrt(np.maximum(np.diag(unknowns_covariance_and_reduced_chi2(fit.weighted, fit.evaluation)[0]), 0.0))
     loose = (std > _LOOSE_RELATIVE_STD * np.abs(x)) & (std < 100 * np.abs(first))
     return fit.weighted.positive_unknowns_mask & (loose | (x < _COLLAPSED_FRACTION * first))
-
-
-def _other_minima(fit: _Fit) -> list[Array]:
-    """Starts from which a poorly known unknown may reach another minimum, the most likely start first."""
-    problem, finish, x = fit.weighted, fit.evaluation, fit.result.x
-    if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
-        return []
-    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, finish)
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    found: list[tuple[float, Array]] = []
-    # poorly known unknowns stay unchanged
-    known = std < np.abs(x)
-    for i in np.flatnonzero(problem.positive_unknowns_mask & known & (std > _MIN_SCANNED_RELATIVE_STD * np.abs(x))):
-        for factor in _SCAN_FACTORS:
-            along = np.where(known, covariance[:, i] / covariance[i, i], 0.0)
-            moved = np.clip(x + along * (factor - 1.0) * x[i], *problem.bounds)
-            # a stiffness is compared on a log scale if that is smaller: a vanishing slope is no minimum
-            expected = 0.5 * (min(abs(factor - 1.0), abs(math.log(factor))) * x[i] / std[i]) ** 2
-            there = problem.evaluate(moved, derivatives=False, equilibrium_guesses=finish.equilibrium_guesses)
-            rise = there.cost - finish.cost
-            if there.ok and expected > 2.0 and rise < _MAX_COST_RISE_RATIO * expected:
-                found.append((rise, moved))
-    found.sort(key=lambda entry: entry[0])
-    return [moved for _, moved in found[:_MAX_LOCAL_MINIMUM_STARTS]]
 
 
 def uses_process_noise_covariance(solver: Solver) -> bool:

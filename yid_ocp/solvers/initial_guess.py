@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ import numpy as np
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
+from yid_ocp.inference.uncertainty import unknowns_covariance_and_reduced_chi2
 from yid_ocp.integrator.step import generalized_momentum_from_velocity, simulate
 from yid_ocp.integrator.tracking_feedback import lqr_tracking_feedback
 from yid_ocp.problem.episodes import Episode, InitialStateWithSensitivity
@@ -35,6 +37,11 @@ _POOR_GUESS_CHI2 = 10.0
 _PARAMETER_FACTORS = (1.0, 4.0, 2.0, 10.0)
 # Shapes change slowly: so far apart is enough [s].
 _EQUILIBRIUM_SPACING = 0.1
+# A branch measured a few times a second fits several frequencies, so a parameter with a relative std above the first
+# number can have other minima. It is multiplied by these factors, and the others follow the fit's covariance. If the
+# cost rises by less than the second number times the predicted rise, the search continues there (twice at most).
+_MIN_SCANNED_RELATIVE_STD, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = 0.03, 0.2, 2
+_SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 
 
 @dataclass(frozen=True)
@@ -213,3 +220,26 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
     scaled = found.jacobian * size
     step = bounded_levenberg_marquardt_step(scaled, found.residual, 1e-10, low, high)
     return step[amplitudes] * size[amplitudes], predicted_cost_reduction(scaled, found.residual, step)
+
+
+def other_minimum_starts(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
+    """Starts from which a poorly known unknown may reach another minimum, the most likely start first."""
+    if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
+        return []
+    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, finish)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    found: list[tuple[float, Array]] = []
+    # poorly known unknowns stay unchanged
+    known = std < np.abs(x)
+    for i in np.flatnonzero(problem.positive_unknowns_mask & known & (std > _MIN_SCANNED_RELATIVE_STD * np.abs(x))):
+        for factor in _SCAN_FACTORS:
+            along = np.where(known, covariance[:, i] / covariance[i, i], 0.0)
+            moved = np.clip(x + along * (factor - 1.0) * x[i], *problem.bounds)
+            # a stiffness is compared on a log scale if that is smaller: a vanishing slope is no minimum
+            expected = 0.5 * (min(abs(factor - 1.0), abs(math.log(factor))) * x[i] / std[i]) ** 2
+            there = problem.evaluate(moved, derivatives=False, equilibrium_guesses=finish.equilibrium_guesses)
+            rise = there.cost - finish.cost
+            if there.ok and expected > 2.0 and rise < _MAX_COST_RISE_RATIO * expected:
+                found.append((rise, moved))
+    found.sort(key=lambda entry: entry[0])
+    return [moved for _, moved in found[:_MAX_LOCAL_MINIMUM_STARTS]]
