@@ -29,7 +29,7 @@ from yid_ocp.data import (
 )
 from yid_ocp.model.servos_and_springs import MotorOptions
 from yid_ocp.model.urdf import resolve_urdf_path
-from yid_ocp.workflow.build import build_system, settings_by_parameter_name
+from yid_ocp.workflow.build import build_system, free_parameter_names
 
 RATE = 125.0
 LENGTH = 0.5
@@ -97,13 +97,18 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     run = load_config("run.yaml")
     assert (run.model.arms.mode, run.model.arms.joints) == ("prescribed", ("roll", "pitch"))
     assert (run.problem.time_step, run.problem.initial_state) == (pytest.approx(0.008), "equilibrium")
-    assert run.sensors["points"].frames == {"m1": "cable:50%", "m2": "w_cable"}
+    assert {name: said.parent_frame for name, said in run.model.frames.items()} == {"m1": "cable:50%", "m2": "w_cable"}
+    assert not run.sensors["points"].frames, "a point has the name of its frame"
     # white noise from differences of a smooth motion, within a fifth
     assert run.sensors["points"].std == pytest.approx(2e-4, rel=0.2)
     assert run.sensors["joints.position"].std == pytest.approx(1e-4, rel=0.2)
     system = build_system(run)
     assert system.prescribed == ("roll", "pitch")
-    assert {"cable:50%", "w_cable"} <= set(system.point_frames)
+    assert {"m1", "m2", "w_cable"} <= set(system.point_frames)
+    # where a marker sits on the rod is known to some millimetres only
+    free = free_parameter_names(run, system.parameters)
+    assert {f"{name}.{axis}" for name in ("m1", "m2") for axis in "xyz"} <= set(free)
+    assert run.model.frames["m1"].position_std == pytest.approx(0.005 * LENGTH, rel=0.05)
     text = (bench / "run.yaml").read_text()
     assert text.startswith("# yaml-language-server: $schema=yid-ocp.schema.json\n")
     jsonschema.validate(YAML(typ="safe").load(text), config_json_schema())
@@ -122,7 +127,7 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
     page = Path("run.html").read_text()
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
     model, measured = scene["scenes"][0]["motions"]
-    assert set(measured["points"]) == {"cable:50%", "w_cable"}
+    assert set(measured["points"]) == {"m1", "m2"}
     assert set(measured["points"]) <= set(model["points"])
     # a straight stick that is seen where it is: points and frames meet all the time
     for name, at in measured["points"].items():
@@ -215,7 +220,7 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
     assert run.model.arms.servo.command_interpolation == "held"
     system = build_system(run)
     assert set(system.servos) == set(system.driven) == {"roll", "pitch"}
-    free = {name for name, said in settings_by_parameter_name(run, system.parameters).items() if said.free}
+    free = {name for name in free_parameter_names(run, system.parameters) if not name.startswith(("m1.", "m2."))}
     own = ("{}.servo_gain", "{}.servo_damping", "{}.servo_delay", "rotor_inertia@{}.armature")
     assert free == {"cable.bend", "cable.damping", *(name.format(joint) for joint in ("roll", "pitch") for name in own)}
     # a copy of the measured angles is no command, and efforts say more than commands
@@ -322,12 +327,13 @@ def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
 
 
 def test_on_a_rod_that_was_straight_a_marker_is_placed_within_a_fraction_of_a_millimetre(bench: Path) -> None:
-    frames = proposed(moved(SHORT, parts=(1 / 3, 1.0))).sensors["points"].frames
-    owner, _, percent = frames["m1"].partition(":")
-    assert (owner, frames["m2"]) == ("cable", "w_cable")
+    frames = proposed(moved(SHORT, parts=(1 / 3, 1.0))).model.frames
+    owner, _, percent = str(frames["m1"].parent_frame).partition(":")
+    assert (owner, frames["m2"].parent_frame) == ("cable", "w_cable")
     assert float(percent.removesuffix("%")) == pytest.approx(100 / 3, abs=0.05)
     # without a marker at its end nobody knows whether it was straight
-    assert proposed(moved(SHORT, parts=(1 / 3, 0.8))).sensors["points"].frames["m1"] == "cable:35%"
+    rounded = proposed(moved(SHORT, parts=(1 / 3, 0.8))).model.frames["m1"]
+    assert (rounded.parent_frame, rounded.position_std) == ("cable:35%", pytest.approx(0.015 * LENGTH, rel=0.05))
 
 
 SWING = """<robot name="swing"><link name="base"/><link name="upper"><inertial><mass value="1"/>
@@ -351,9 +357,9 @@ def test_late_markers_are_placed_by_where_they_are_while_the_arm_rests(late: flo
     place += 2e-4 * np.random.default_rng(0).standard_normal(place.shape)
     write_recording(Recording(joints, (PointGroup("points", ("a", "b"), t, place),), name="swing"), "swing.h5")
     assert main(["init", "swing.urdf", "swing.h5", "--out", "swing.yaml", *CABLE]) == 0
-    frames = load_config("swing.yaml").sensors["points"].frames
-    assert frames["b"] == "w_cable"
-    assert float(frames["a"].partition(":")[2].removesuffix("%")) == pytest.approx(100 / 3, abs=0.1)
+    frames = load_config("swing.yaml").model.frames
+    assert frames["b"].parent_frame == "w_cable"
+    assert float(str(frames["a"].parent_frame).partition(":")[2].removesuffix("%")) == pytest.approx(100 / 3, abs=0.1)
 
 
 def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:

@@ -186,15 +186,17 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
     assert main(["init", "package:ur5", str(bag), *UR5_NUMBERS, "--out", "cable.yaml", "--quiet"]) == 0
     run = load_config("cable.yaml")
     assert run.model.object is not None
-    assert run.sensors["points"].frames == {"middle": "cable:50%", "tip": "w_cable"}
+    places = {name: said.parent_frame for name, said in run.model.frames.items()}
+    assert places == {"middle": "cable:50%", "tip": "w_cable"}
     problem = load_problem("cable.yaml", ["problem.use_compiler=false"])
-    assert set(problem.free) == set(UR5.truth)
-    at_truth = problem.evaluate(problem.vector(UR5.truth), derivatives=False)
+    where = {f"{name}.{axis}": 0.0 for name in places for axis in "xyz"}
+    assert set(problem.free) == {*UR5.truth, *where}
+    at_truth = problem.evaluate(problem.vector(UR5.truth | where), derivatives=False)
     count = sum(len(group.t) * 3 * len(group.names) for group in recording.points)
     # the noise that the file states is what the data show, and the model that made them explains them
     assert 0.1 < 2 * at_truth.cost / count < 2
     for factor in (0.5, 2.0):
-        other = UR5.truth | {"cable.bend": factor * UR5.truth["cable.bend"]}
+        other = UR5.truth | where | {"cable.bend": factor * UR5.truth["cable.bend"]}
         assert problem.evaluate(problem.vector(other), derivatives=False).cost > 3 * at_truth.cost
 
 

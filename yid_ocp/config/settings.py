@@ -57,6 +57,11 @@ class _FrameSettings(MountSettings):
             "instead of xyz; for markers on an object whose root is fixed in the world"
         ),
     ] = False
+    position_std: Annotated[
+        float,
+        Ge(0),
+        OptionInfo("standard deviation of its position; above 0, NAME.x, NAME.y and NAME.z are estimated", "m"),
+    ] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -253,8 +253,8 @@ def _matches(name: str, key: str) -> bool:
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """Settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
-    Settings implied by `model.friction`, `model.arms.servo.motor` and `model.arms.link_mass_std` come first. Raises
-    `ConfigError` if a name or pattern matches nothing."""
+    Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.link_mass_std` and the frames'
+    `position_std` come first. Raises `ConfigError` if a name or pattern matches nothing."""
     sections = _section_parameter_settings(run, parameters)
     result = dict(sections)
     for key, given in run.parameters.items():
@@ -320,6 +320,10 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
     if run.model.arms.link_mass_std > 0:
         masses = [name for name in parameters.names if name.endswith(f".{_LINK_MASS_PARAMETER}")]
         found |= dict.fromkeys(masses, ParameterSettings(free=True, prior_std=run.model.arms.link_mass_std))
+    for frame, said in run.model.frames.items():
+        if said.position_std > 0:
+            own = ParameterSettings(free=True, prior_std=said.position_std)
+            found |= {f"{frame}.{axis}": own for axis in _AXES}
     return found
 
 
@@ -388,7 +392,8 @@ def _with_extra_frames(
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
     """Robot (or clamps) and objects with the additional frames of the settings.
 
-    A frame that recordings locate has parameters NAME.x, .y, .z; see `marker_positions_from_reference_pose`."""
+    A frame of uncertain position, or that recordings locate (`marker_positions_from_reference_pose`), has parameters
+    NAME.x, .y, .z."""
     made = list(items)
     for name, said in run.model.frames.items():
         where, parent = ("model", "frames", name), said.parent_frame
@@ -404,10 +409,10 @@ def _with_extra_frames(
             if parent is not None and not tree.has_frame(parent):
                 known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
                 raise unknown_name_error(run, "frame", parent, known, *where, "parent_frame")
-        if said.marker_reference_pose:
-            tree = _with_marker(tree, name, str(parent))
-        else:
-            tree = tree.with_added_frame(name, parent, transform_from_xyz_rpy(said.xyz, said.rpy))
+        pose = np.eye(4) if said.marker_reference_pose else transform_from_xyz_rpy(said.xyz, said.rpy)
+        tree = tree.with_added_frame(name, parent, pose)
+        if said.marker_reference_pose or said.position_std > 0:
+            tree = _with_estimable_position(tree, name, str(parent))
         if owner is None:
             carrier = tree
         else:
@@ -415,10 +420,10 @@ def _with_extra_frames(
     return carrier, made
 
 
-def _with_marker(tree: Mechanism, name: str, frame: str) -> Mechanism:
-    """The mechanism with a frame whose position in another frame is a parameter, with the same orientation."""
-    carrier = tree.with_added_frame(name, frame, np.eye(4)).frames[name]
-    entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {frame}") for axis in _AXES]
+def _with_estimable_position(tree: Mechanism, name: str, parent: str) -> Mechanism:
+    """The mechanism with parameters by which a frame is displaced from its position, along its own axes."""
+    carrier = tree.frames[name]
+    entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {parent}") for axis in _AXES]
     offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
     frames = {**tree.frames, name: Frame(carrier.joint_index, carrier.placement @ offset)}
     return replace(tree, frames=frames, parameters=tree.parameters.with_added(entries))

@@ -38,6 +38,8 @@ _COPIED_COMMAND_RATIO = 1e-6  # relative distance to the measured angles below w
 _TORQUE_BIAS_FRACTION = 0.01  # default constant torque error, as a fraction of a joint's effort limit
 _MIN_ARM_TRAVEL = 0.1  # joints that together turn less than this do not move [rad]
 _POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays bent [%]
+_ROUNDED_PLACE_STD = 0.015  # of a point by rounding to that resolution, as a fraction of the length: 5 % / sqrt(12)
+_PLACE_STD = 0.005  # of a point on a segment that was straight once, also off the centreline: it sits on the surface
 _MAX_ROUNDED_PERCENT = 0.2  # largest rounding of a location on a straight segment [%]
 _MAX_BEYOND_LENGTH = 0.02  # of the object's length; no point can be farther from its holder by more
 _MAX_LATENESS = 0.25  # largest lateness of the points' clock, for which the holder must stand still [s]
@@ -67,6 +69,12 @@ class _PointPlacement:
     point: str
     frame: str
     reason: str
+    position_std: float = 0.0  # of the point in that frame [m]; above 0 it has a frame of its own name there
+
+    @property
+    def model_frame(self) -> str:
+        """Frame of the model at which the point is predicted."""
+        return self.point if self.position_std > 0 else self.frame
 
 
 @dataclass(frozen=True)
@@ -344,7 +352,7 @@ def _places(
         parts = None if standing else _parts_when_straight(tree, recording, group, branches, holder)
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
-            frame, reason = "", "its place is not known"
+            frame, reason, std = "", "its place is not known", 0.0
             if point in frames or (colon and owner in names and part.endswith("%")):
                 frame, reason = point, "a frame of the model by its name"
             elif point in names:
@@ -352,7 +360,10 @@ def _places(
             elif not standing:
                 seen = group.t, group.position[:, i], math.nan if parts is None else float(parts[i])
                 frame, reason = _near(tree, recording, *seen, branches, holder)
-            placed.append(_PointPlacement(point, frame, reason))
+                if frame and len(branches) == 1:
+                    part_std = _ROUNDED_PLACE_STD if parts is None else _PLACE_STD
+                    std = part_std * branches[0].length
+            placed.append(_PointPlacement(point, frame, reason, std))
         found[name] = tuple(placed)
     return found
 

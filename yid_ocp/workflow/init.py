@@ -209,7 +209,8 @@ def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices
     """The recording with points renamed to the frames at which they probably are."""
     points = []
     for group in recording.points:
-        places = {place.point: place.frame or place.point for place in proposal.point_placements.get(group.name, ())}
+        placed = proposal.point_placements.get(group.name, ())
+        places = {place.point: place.model_frame or place.point for place in placed}
         names = tuple(places.get(name, name) for name in group.names)
         points.append(replace(group, names=names) if len(set(names)) == len(names) else group)
     return replace(recording, points=tuple(points))
@@ -358,8 +359,13 @@ def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterato
         yield _line("  ", "damping", "0.05", "viscous, of every coordinate [N m s/rad]")
     tips = [f"w_{segment.name}" for segment in item.settings.build_segments()]
     of_points = [places for group, places in proposal.point_placements.items() if "." not in group]
-    marked = [place.frame for places in of_points for place in places if place.frame]
-    wanted = dict.fromkeys([*tips, *marked, *grasps.values()])
+    marked = [place for places in of_points for place in places if place.frame]
+    wanted = dict.fromkeys([*tips, *(place.model_frame for place in marked), *grasps.values()])
+    if uncertain := {place.point: place for place in marked if place.position_std > 0}:
+        yield _line("  ", "frames", "", "where points sit [m]; NAME.x, .y and .z there are estimated, 0 ± position_std")
+    for name, place in uncertain.items():
+        there = {"parent_frame": place.frame, "position_std": float(f"{place.position_std:.2g}")}
+        yield f"    {_text(name)}: {_value(there)}"
     if set(wanted) > set(tips):
         yield from _listed("  ", "points", wanted, "frames for sensors; NAME:40% along a segment")
 
@@ -436,7 +442,8 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
         places, entries, said = proposal.point_placements.get(group, ()), [], f"noise: {noise.reason}"
         if noise.std is not None:
             entries, said = [f"std: {_number(noise.std)}"], f"{noise.std:.2g} {noise.unit}, {noise.reason}"
-        if frames := {place.point: place.frame for place in places if place.frame and place.frame != place.point}:
+        elsewhere = (place for place in places if place.model_frame not in ("", place.point))
+        if frames := {place.point: place.frame for place in elsewhere}:
             entries.append(f"frames: {_value(frames)}")
         told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts
         if group == "joints.effort":
