@@ -5,7 +5,8 @@ the amplitudes of candidate j, and P = I - J_theta J_theta^+:
 
     G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
 
-S_j = G_j for white noise of unit standard deviation. For autocorrelated noise, S_j is the sum of the scores'
+S_j = G_j for white noise of unit standard deviation. Encoders' noise that moves prescribed arms adds E_j E_j', where
+E_j = J_j' P e for draws e of what it does to the residual. For autocorrelated noise, S_j is the sum of the scores'
 autocovariances after the candidate's step (Bartlett weights, Newey and West 1987, doi:10.2307/1913610). The linear
 model predicts a decrease of r'r by s_j' G_j^-1 s_j, or less if an amplitude would leave its bounds. Shape parameters
 are tried on a grid, and the best p-value is corrected for that many trials (Davies 1987, doi:10.1093/biomet/74.1.33,
@@ -26,7 +27,11 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.null_test import ResidualChannel, chi2_p_value, residual_channel_indices
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import redraw_prescribed_path_noise
+from yid_ocp.problem.evaluation import Evaluation
 
+_N_PATH_NOISE_DRAWS = 32  # draws of encoders' noise, which give the variance of a score to a quarter
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
 
@@ -88,7 +93,7 @@ def linearize_candidates(
     labels = {effect.label for effect in base}
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
     own = [name for effect in base for name in effect.parameters.names]
-    residual, basis, warm = np.zeros(0), np.zeros((0, 0)), None
+    residual, basis, scatter, warm = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0)), None
     placed = problem.with_effects_and_relinearized_filters(base, values)
     series = residual_channel_indices(problem.problem)
     signatures: list[_EffectSignature] = []
@@ -107,15 +112,39 @@ def linearize_candidates(
         if k == 0:
             basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
             residual = data - basis @ (basis.T @ data)
+            scatter = _path_noise_residuals(trial, trial.vector(values), evaluation, series)
         moved = jacobian[:, places]
         moved = moved - basis @ (basis.T @ moved)
         edges = np.cumsum([len(effect.amplitude_names) for effect in chosen])[:-1]
         for effect, part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
             columns = np.ascontiguousarray(part)
-            signatures.append(
-                _EffectSignature(effect, grids[effect.label][k], columns, _covariance_of_scores(columns, series))
-            )
+            driven = columns.T @ scatter
+            covariance = _covariance_of_scores(columns, series) + driven @ driven.T
+            signatures.append(_EffectSignature(effect, grids[effect.label][k], columns, covariance))
     return AllCandidatesLinearization(residual, tuple(signatures))
+
+
+def _path_noise_residuals(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, series: Sequence[ResidualChannel]
+) -> Array:
+    """Changes of points' residuals by the noise of encoders that move prescribed arms, (nr, K), one column a draw.
+
+    They are divided by the root of K, so that the product with their transpose is a covariance. A lightly damped object
+    rings with that noise, which is neither white nor an error of the model. K is 0 where arms are driven."""
+    before, _ = linearization_without_weak_priors(problem, evaluation)
+    points = {group.name for episode in problem.episodes for group in episode.recording.points}
+    rows = np.concatenate([s.residual_indices for s in series if s.group in points] or [np.zeros(0, int)])
+    if not len(rows) or not problem.system.prescribed or not problem.system.unprescribed_coordinate_indices:
+        return np.zeros((len(before), 0))
+    rng, found = np.random.default_rng(0), []
+    for _ in range(_N_PATH_NOISE_DRAWS):
+        drawn = [redraw_prescribed_path_noise(own, problem.system, problem.options, rng) for own in problem.episodes]
+        trial = problem.with_episodes(drawn, ()).evaluate(x, False, evaluation.equilibrium_guesses)
+        if trial.ok:
+            after, _ = linearization_without_weak_priors(problem, replace(trial, jacobian=evaluation.jacobian))
+            found.append(np.zeros(len(before)))
+            found[-1][rows] = (after - before)[rows]
+    return np.stack(found, axis=1) / np.sqrt(len(found)) if found else np.zeros((len(before), 0))
 
 
 def _basis(matrix: Array) -> Array:

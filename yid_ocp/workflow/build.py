@@ -322,8 +322,8 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
         found |= dict.fromkeys(masses, ParameterSettings(free=True, prior_std=run.model.arms.link_mass_std))
     for frame, said in run.model.frames.items():
         if said.position_std > 0:
-            own = ParameterSettings(free=True, prior_std=said.position_std)
-            found |= {f"{frame}.{axis}": own for axis in _AXES}
+            names = [f"{frame}.{axis}" for axis in _AXES]
+            found |= dict.fromkeys(names, ParameterSettings(free=True, prior_std=said.position_std))
     return found
 
 
