@@ -164,7 +164,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
 
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
     trade = "a +10 % with b +10 % changes nothing that is measured"
-    assert said.startswith(f"this: a and b are seen only together: {trade}")
+    assert said.startswith(f"this: a and b are determined only together: {trade}")
     assert said.endswith("cannot be separated from the unknown start")
 
 
@@ -218,13 +218,13 @@ def test_directions_are_sorted_and_say_how_well_they_are_seen():
     assert [d.singular_value for d in directions] == pytest.approx([3.0, 30.0])
     assert [d.std_relative for d in directions] == pytest.approx([1 / 3, 1 / 30])
     assert [d.verdict for d in directions] == ["weak", "identifiable"]
-    assert [d.words for d in directions] == ["b is seen only weakly (± 33 %)", "a is seen (± 3.3 %)"]
+    assert [d.words for d in directions] == ["b is determined only weakly (± 33 %)", "a is determined (± 3.3 %)"]
     assert directions[0].components == {"a": pytest.approx(0.0), "b": pytest.approx(1.0)}
-    assert identifiability(Formula(two(30.0, 10.0), START)).directions[0].words == "b is seen (± 10 %)"
+    assert identifiability(Formula(two(30.0, 10.0), START)).directions[0].words == "b is determined (± 10 %)"
 
 
 @pytest.mark.parametrize(
-    ("size", "words"), [(0.24, "b is not seen by any sensor"), (0.26, "b is seen only weakly (± 385 %)")]
+    ("size", "words"), [(0.24, "b is observed by no sensor"), (0.26, "b is determined only weakly (± 385 %)")]
 )
 def test_what_is_hardly_seen_is_said_not_to_be_seen(size, words):
     """Fewer standard deviations than a quarter for a change by the whole value."""
@@ -246,13 +246,13 @@ def test_what_is_said_of_one_parameter_is_what_stands_beside_it():
         assert f"(± {percent_number_text(info.parameters[name].std_relative)} %)" in direction.words
 
 
-def test_a_joint_change_names_the_largest_part_first_and_leaves_small_ones_out():
+def test_a_common_change_names_the_largest_part_first_and_leaves_small_ones_out():
     def rows(x):
         a, b, c = (x[name] / 2 - 1 for name in "abc")
         return [-50 * (0.3 * a + 0.95 * b + 0.01 * c), 20 * (0.95 * a - 0.3 * b), 30 * c]
 
     last = identifiability(Formula(rows, dict.fromkeys("abc", 2.0))).directions[-1]
-    assert last.words.startswith("a joint change of b and a is seen (± 2")
+    assert last.words.startswith("a relative change of b and a in the ratio 1 : 0.32 is determined (± 2 %)")
     assert last.components["b"] > 0.9
 
 
@@ -262,8 +262,8 @@ def test_two_pairs_that_are_each_seen_together_are_told_apart():
 
     info = identifiability(Formula(rows, {"a": 2.0, "b": 5.0, "c": 3.0, "d": 4.0}))
     assert {d.words for d in info.unidentifiable_directions} == {
-        "a and b are seen only as a + b, as springs side by side are",
-        "c and d are seen only as the product c x d",
+        "a and b are determined only as a + b, as springs side by side are",
+        "c and d are determined only as the product c x d",
     }
     assert len(info.directions) == 4
 
@@ -307,9 +307,9 @@ def unseen(function, start=None, **more):
 def test_a_plain_combination_has_its_direction_and_holds_at_a_finite_change(function, units, words):
     said = unseen(function, units=dict(zip("ab", units, strict=True)))
     if words is None:
-        assert said.startswith("a and b are seen only together: ")
+        assert said.startswith("a and b are determined only together: ")
     else:
-        assert said == f"a and b are seen only as {words}"
+        assert said == f"a and b are determined only as {words}"
 
 
 def test_the_combination_that_moves_the_data_least_is_named_where_it_can_be_rolled_out():
@@ -329,7 +329,7 @@ def test_many_parameters_trade_in_percent_of_the_largest_change():
 
     [found] = identifiability(Formula(rows, dict.fromkeys(sizes, 1.0))).unidentifiable_directions
     trade = "b +10 % with e -8 % with d -6 % with c -4 % and the others to match"
-    assert found.words.startswith(f"a, b, c, d and 1 more are seen only together: {trade} changes nothing")
+    assert found.words.startswith(f"a, b, c, d and 1 more are determined only together: {trade} changes nothing")
 
 
 def test_fewer_rows_than_parameters_leave_directions_open():
@@ -426,7 +426,7 @@ def test_one_arm_of_the_paper(golden_problem, vision, known_std, unknown_std):
     for info in (known, unknown):
         assert {n for n, e in info.parameters.items() if e.verdict == "not_identifiable"} == twists
         words = {direction.words for direction in info.unidentifiable_directions}
-        assert words == {f"{twist} is not seen by any sensor" for twist in twists}
+        assert words == {f"{twist} is observed by no sensor" for twist in twists}
         assert max(info.parameters[name].std_relative for name in ("T1.bend", "T2.bend")) < 0.006
         assert info.parameters["T3.bend"].verdict == "weak"
     for name, entry in known.parameters.items():

@@ -346,7 +346,7 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
     relative, count = view.relative, len(view.names)
     hidden = view.alone * MAX_WEAK_RELATIVE_STD < 1.0
     found = [
-        _direction(view, np.eye(count)[i], f"{view.names[i]} is not seen by any sensor") for i in np.flatnonzero(hidden)
+        _direction(view, np.eye(count)[i], f"{view.names[i]} is observed by no sensor") for i in np.flatnonzero(hidden)
     ]
     rest = np.flatnonzero(~hidden)
     if len(rest):
@@ -422,7 +422,7 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     if form is None:
         return _combination_words(parts)
     names = [part.name for part in parts]
-    return f"{_joined(names)} are seen only as {form.format(a=names[0], b=names[1])}"
+    return f"{_joined(names)} are determined only as {form.format(a=names[0], b=names[1])}"
 
 
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
@@ -453,22 +453,25 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
     parts = sorted(_components(view, vector), key=lambda part: -abs(part.coefficient))
     own = float(std[view.names.index(parts[0].name)])
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
-    how = "is seen" if spread <= MAX_IDENTIFIABLE_RELATIVE_STD else "is seen only weakly"
-    joint = "a joint change of " if len(parts) > 1 else ""
-    return f"{joint}{_joined([part.name for part in parts])} {how} (± {percent_number_text(spread)} %)"
+    how = "is determined" if spread <= MAX_IDENTIFIABLE_RELATIVE_STD else "is determined only weakly"
+    what, changes = parts[0].name, [f"{part.coefficient / parts[0].coefficient:.2g}" for part in parts]
+    if len(parts) > 1:
+        ratio = " : ".join([*changes[:_MAX_LISTED_NAMES], "..."][: len(parts)])
+        what = f"a relative change of {_joined([part.name for part in parts])} in the ratio {ratio}"
+    return f"{what} {how} (± {percent_number_text(spread)} %)"
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:
     """Sentence on the combined change of parameters along an unidentifiable direction."""
     if len(parts) == 1:
-        return f"{parts[0].name} is not seen"
+        return f"{parts[0].name} is not observed"
     largest, shown = max(abs(part.coefficient) for part in parts), parts
     if len(parts) > _MAX_LISTED_NAMES:
         shown = sorted(parts, key=lambda part: -abs(part.coefficient))[:_MAX_LISTED_NAMES]
     trade = " with ".join(f"{part.name} {10 * part.coefficient / largest:+.2g} %" for part in shown)
     rest = " and the others to match" if len(shown) < len(parts) else ""
     listed = _joined([part.name for part in parts])
-    return f"{listed} are seen only together: {trade}{rest} changes nothing that is measured"
+    return f"{listed} are determined only together: {trade}{rest} changes nothing that is measured"
 
 
 def _joined(names: Sequence[str]) -> str:

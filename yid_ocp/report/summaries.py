@@ -406,14 +406,14 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
-        "rows of a step that contain the parameter, and those of them that sensors see to first order; what one unit "
-        f"more moves: a reading at most (from rest, within {seconds:.2g} s), all readings together (recordings)"
+        "rows: equations of a step that contain the parameter; observed: rows that influence a sensor. Sensitivity to "
+        f"one unit more: of one sensor from equilibrium (within {seconds:.2g} s), of all recorded readings"
     )
     yield SummaryTable([*_dependence_rows(result)], "Rows and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"and {left} more free parameters, in result.json" if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "observable rows are computed about a rest only"
+        yield "observed rows are computed about an equilibrium only"
     said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
     yield SummaryStatement(said, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
@@ -449,7 +449,8 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Equation rows that contain each free or named parameter, and changes of the readings by one unit of it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
-    yield "parameter", "unit", "rows", "which", "seen", "best sensor", "read by", "from rest [std]", "recordings [std]"
+    head = "parameter", "unit", "rows", "which", "observed", "best sensor", "read by"
+    yield *head, "equilibrium [std]", "recordings [std]"
     for name in dict.fromkeys([*shown, *result["asked"]]):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
