@@ -10,7 +10,7 @@ move its centre line and stay at zero."""
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Annotated, NamedTuple
@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.system import System
@@ -149,9 +150,9 @@ class ShapeFitter:
         corners, seen, held, gap = _expressions(system, kinematics, self.options)
         held, gap = (ca.substitute(entry, symbols, numbers) for entry in (held, gap))
 
-        def with_slope(entry: ca.SX) -> ca.Function:
-            slope = ca.densify(ca.jacobian(entry, q)[:, list(self.free_joints)])
-            return ca.Function("places", [q], ca.cse([entry, slope]))
+        def with_slope(entry: ca.SX) -> Callable[[Array], list[Array]]:
+            outputs = [entry, ca.jacobian(entry, q)[:, list(self.free_joints)]]
+            return dense_function_evaluator(ca.Function("places", [q], list(map(ca.densify, ca.cse(outputs)))))
 
         self._corners, self._seen, self._held = with_slope(corners), with_slope(seen), with_slope(held)
         ends = [
@@ -178,7 +179,7 @@ class ShapeFitter:
         self.free_end_links = tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING_DISTANCE))
 
     def _links_at(self, q: Array) -> Array:
-        return np.array(self._corners(q)[0]).reshape(-1, 2, 3)
+        return self._corners(q)[0].reshape(-1, 2, 3)
 
     def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
         """Fit the object's shape in one frame, from the guesses `starts` and the robot's configuration `q_known` (n,).
@@ -328,7 +329,7 @@ class ShapeFitter:
     ) -> FrameShapeFit:
         """The shape with its standard deviations and fit quality."""
         q, on_shape = best.q, evidence.is_own | evidence.is_contested
-        points, jacobian = (np.array(x) for x in self._seen(q))
+        points, jacobian = self._seen(q)
         places = points.reshape(-1, 3)
         spread = np.diag(jacobian @ np.linalg.solve(best.hessian, jacobian.T)).reshape(-1, 3)
         none = np.zeros(len(sight.skeleton_nodes), bool)
@@ -370,8 +371,8 @@ class ShapeFitter:
 
     def _quadratic(self, q: Array, task: _Task) -> LocalQuadraticModel:
         """Cost, gradient and Gauss-Newton Hessian with respect to the free bends."""
-        out, jacobian = self._corners(q)
-        corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
+        out, by_q = self._corners(q)
+        corners = out.reshape(-1, 2, 3)
         seen = task.points, task.camera, task.share
         surface = shape_evidence.nearest_surface_residuals(corners, self.link_radii, *seen)
         link, error = surface.link_indices, surface.signed_distance
@@ -395,7 +396,7 @@ class ShapeFitter:
             cost += 0.5 * off**2
             gradient += by_off * off
             hessian += np.outer(by_off, by_off)
-        held, by_held = (np.array(x) for x in self._held(q))
+        held, by_held = self._held(q)
         bend = (q - self.rest_configuration)[list(self.free_joints)] * self._prior
         cost += 0.5 * float(held.ravel() @ held.ravel() + bend @ bend)
         gradient += by_held.T @ held.ravel() + bend * self._prior
@@ -415,7 +416,7 @@ class ShapeFitter:
         free, many = len(self.free_joints), len(names)
         corners, jacobian = self._links_at(q), self._corners(q)[1]
         by_length, seen_by_length, held_by_length = (np.array(x) for x in self._grown(q))
-        chain = np.hstack([np.array(jacobian), by_length])
+        chain = np.hstack([jacobian, by_length])
         total = free + 2 * many
         gradient, hessian = np.zeros(total), np.zeros((total, total))
 
@@ -440,7 +441,7 @@ class ShapeFitter:
                 rows[0, : free + many] = -shape_evidence.link_axes(corners)[k] @ chain[6 * k + 3 : 6 * k + 6]
                 noise = max(self.options.surface_noise_std, evidence.noise_std)
                 add(rows, np.array([offset]), np.array([1.0 / noise**2]))
-        held, by_held = (np.array(x) for x in self._held(q))
+        held, by_held = self._held(q)
         add(np.hstack([by_held, held_by_length, np.zeros((len(held), many))]), held.ravel(), np.ones(len(held)))
         gradient[:free] += (q - self.rest_configuration)[list(self.free_joints)] * self._prior**2
         hessian[:free, :free] += np.diag(self._prior**2)
@@ -449,7 +450,7 @@ class ShapeFitter:
         follow = np.linalg.solve(hessian[:free, :free], both[:free])
         left = both[free:] - hessian[free:, :free] @ follow
         moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
-        moved = moved - np.array(self._seen(q)[1]) @ follow[:, 1:]
+        moved = moved - self._seen(q)[1] @ follow[:, 1:]
         return FrameTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
     def tube_links_at_configuration(self, q: Array) -> TubeLinks:
@@ -462,7 +463,7 @@ class ShapeFitter:
 
     def points_at_configuration(self, q: ArrayLike) -> Array:
         """Positions (np, 3) [m] of the system's points at a configuration."""
-        return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
+        return self._seen(np.asarray(q, float))[0].reshape(-1, 3)
 
 
 class _Minimum(NamedTuple):
