@@ -1,13 +1,16 @@
 """Every law of joint friction in recordings of another engine: is its size found, and is it told from its neighbour?
 
-    python benchmarks/friction_laws.py [--laws NAME ...] [--seeds FIRST LAST] [--size usual | small] [--file FILE]
+    python benchmarks/friction_laws.py [--laws NAME ...] [--seeds FIRST LAST] [--size usual | small] [--set KEY=VALUE]
+                                       [--file FILE]
 
 One geared joint with a pendulum (`configs/servo_pendulum.yaml`) follows 3 s of commands in MuJoCo, whose own solver
 holds and slides it: the size of its dry friction is set anew at every inner step (Dahl's law is a torque there). The
 encoder counts 4096 steps a turn after 0.5 mrad of noise. The recording is fitted with its own law and with the
-neighbour that lacks one amplitude of it. Found: that amplitude lies within two stated standard deviations. Told: the
+neighbour that lacks one amplitude of it. Found: that amplitude lies within two of the standard deviations that `solve`
+states, which count what half of the time step changes; those of noise alone stand beside them. Told: the
 neighbour is less likely by odds of 150 to 1, one parameter counting as one. `small` is three times what is detectable.
 Results are appended to FILE as lines of JSON, so that slices of seeds add up; the table is of all that is there.
+`--set` changes the settings of the fits, never of the recordings: such results need a FILE of their own.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import argparse
 import json
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,12 +27,12 @@ from typing import Any
 import numpy as np
 from so101_twin import INNER_STEP
 
+import yid_ocp
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
-from yid_ocp.solvers import solve
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
@@ -61,12 +64,12 @@ LADDER = {
 }
 
 
-def settings(law: str, file: str | None, start: Mapping[str, float]) -> RunSettings:
+def settings(law: str, file: str | None, start: Mapping[str, float], changes: Sequence[str] = ()) -> RunSettings:
     """The shipped configuration with one law of friction, the motor's gain and the joint's inertia unknown."""
     own = [] if file is None else [file]
     changed = ["recordings.held_out=[]", f"recordings.estimate={json.dumps(own)}", "model.arms.servo.motor={kind: dc}"]
     changed += ["model.friction=null" if not law else f"model.friction={{law: {law}}}"]
-    run = load_config(CONFIG, changed)
+    run = load_config(CONFIG, [*changed, *changes])
     given = {name: ParameterSettings(initial=value) for name, value in KNOWN.items()}
     given |= {name: ParameterSettings(initial=value, free=True) for name, value in FREE.items()}
     given |= {name: ParameterSettings(initial=value, free=True) for name, value in start.items()}
@@ -110,31 +113,37 @@ def of_law(law: str) -> dict[str, float]:
     return {name: value for name, value in USUAL.items() if name.partition("@")[0] in kinds}
 
 
-def fitted(law: str, file: str, start: Mapping[str, float], amplitude: str = "") -> tuple[float, float, float]:
-    """Chi2 of a law's fit, and an amplitude with its standard deviation."""
-    run = settings(law, file, start)
-    found = solve(build_problem(run), run.solver)
-    entry = found.parameters.get(amplitude)
-    return (2 * found.cost, math.nan, math.nan) if entry is None else (2 * found.cost, entry.value, entry.std)
+def fitted(
+    law: str, file: str, start: Mapping[str, float], changes: Sequence[str], amplitude: str = ""
+) -> tuple[float, float, float, float]:
+    """Chi2 of a law's fit, an amplitude with the standard deviation that `solve` states, and that of noise alone."""
+    run = settings(law, file, start, changes)
+    found = yid_ocp.solve(build_problem(run), run.solver)
+    chi2, entry, checks = 2 * found.cost, found.parameters.get(amplitude), found.checks
+    if entry is None or checks is None:
+        return chi2, math.nan, math.nan, math.nan
+    return chi2, entry.value, entry.std, checks.data_std[amplitude]
 
 
-def examined(law: str, seed: int, size: str) -> dict[str, Any]:
+def examined(law: str, seed: int, size: str, changes: Sequence[str]) -> dict[str, Any]:
     """One recording of a law, fitted with it and with its neighbour."""
     amplitude, neighbour = LADDER[law]
     truth = of_law(law)
     with tempfile.TemporaryDirectory() as folder:
         file = str(Path(folder) / "one.h5")
         write_recording(recorded(seed, truth), file)
-        chi2, value, std = fitted(law, file, truth, amplitude)
+        chi2, value, std, of_noise = fitted(law, file, truth, changes, amplitude)
         if size == "small":
-            truth = {**truth, amplitude: 3 * DEFAULT_THRESHOLDS.detectable_amplitude_z * std}
+            truth = {**truth, amplitude: 3 * DEFAULT_THRESHOLDS.detectable_amplitude_z * of_noise}
             write_recording(recorded(seed, truth), file)
-            chi2, value, std = fitted(law, file, truth, amplitude)
-        other, *_ = fitted(neighbour, file, {name: own for name, own in truth.items() if name in of_law(neighbour)})
+            chi2, value, std, of_noise = fitted(law, file, truth, changes, amplitude)
+        simpler = {name: own for name, own in truth.items() if name in of_law(neighbour)}
+        other, *_ = fitted(neighbour, file, simpler, changes)
     more = len(truth) - len(of_law(neighbour))
     told = other - chi2 - more > 2 * DEFAULT_THRESHOLDS.min_log_bayes_factor
     found = abs(value - truth[amplitude]) <= 2 * std
     kept = {"law": law, "seed": seed, "size": size, "truth": truth[amplitude], "value": value, "std": std}
+    kept |= {"std_of_noise": of_noise}
     return {**kept, "chi2": chi2, "neighbour_chi2": other, "found": bool(found), "told": bool(told)}
 
 
@@ -144,6 +153,7 @@ def main() -> int:
     parser.add_argument("--laws", nargs="*", choices=LADDER, default=[*LADDER])
     parser.add_argument("--seeds", nargs=2, type=int, default=(1, 20), metavar=("FIRST", "LAST"))
     parser.add_argument("--size", choices=("usual", "small"), default="usual")
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="of the fits")
     parser.add_argument("--file", type=Path, default=Path("friction_laws.jsonl"))
     arguments = parser.parse_args()
     lines = arguments.file.read_text(encoding="utf-8").splitlines() if arguments.file.exists() else []
@@ -151,7 +161,7 @@ def main() -> int:
     for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
         for law in arguments.laws:
             if (law, seed, arguments.size) not in done:
-                done[law, seed, arguments.size] = made = examined(law, seed, arguments.size)
+                done[law, seed, arguments.size] = made = examined(law, seed, arguments.size, arguments.changes)
                 with arguments.file.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(made) + "\n")
     print("| law | size | recordings | amplitude, true and median found | within two std | told from its neighbour |")
@@ -160,9 +170,10 @@ def main() -> int:
         for size in ("usual", "small"):
             own = [entry for entry in done.values() if (entry["law"], entry["size"]) == (law, size)]
             if own:
-                middle = [float(np.median([entry[key] for entry in own])) for key in ("truth", "value", "std")]
+                columns = ([entry[key] for entry in own] for key in ("truth", "value", "std", "std_of_noise"))
+                middle = [float(np.median(column)) for column in columns]
                 right, apart = (sum(entry[key] for entry in own) for key in ("found", "told"))
-                amplitude = f"{middle[0]:.3g}, {middle[1]:.3g} ± {middle[2]:.2g}"
+                amplitude = f"{middle[0]:.3g}, {middle[1]:.3g} ± {middle[2]:.2g} (noise {middle[3]:.2g})"
                 print(f"| {law} | {size} | {len(own)} | {amplitude} | {right} | {apart} from {neighbour} |")
     return 0
 

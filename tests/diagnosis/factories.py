@@ -84,12 +84,13 @@ def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTe
 # -- screening --------------------------------------------------------------------------------------------------------
 
 
-def signature(of: EffectBase, columns, noise=None, **shapes: float) -> _EffectSignature:
-    """A signature; its noise is white unless given."""
+def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) -> _EffectSignature:
+    """A signature; its noise is white unless given, and no stated priors contribute."""
     columns = np.asarray(columns, float)
     columns = columns[:, None] if columns.ndim == 1 else columns
     noise = columns.T @ columns if noise is None else np.atleast_2d(np.asarray(noise, float))
-    return _EffectSignature(of, {f"{of.label}.{name}": value for name, value in shapes.items()}, columns, noise)
+    named = {f"{of.label}.{name}": value for name, value in shapes.items()}
+    return _EffectSignature(of, named, columns, noise, priors * np.ones_like(noise))
 
 
 def point(residual, *signatures: _EffectSignature) -> AllCandidatesLinearization:

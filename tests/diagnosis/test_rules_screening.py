@@ -176,6 +176,14 @@ def test_a_score_is_that_of_the_lagrange_multiplier_test():
     assert found.p_value == pytest.approx(float(CHI2.sf(found.lm_statistic, 1)))
 
 
+def test_stated_priors_scatter_as_stated_where_they_decide_a_score():
+    """A load that the uncertain mass of a link imitates shows in the prior of that mass more than in the data."""
+    x, r = np.array([0.1, -0.1, 0.1, 5.0]), np.array([0.1, 0.2, -0.1, -0.8])
+    at = point(r, signature(TWO_SIDED, x, noise=1e-9, priors=25.0))
+    [found] = _score_candidates(at, [series(range(3))], [visible(TWO_SIDED)])
+    assert found.lm_statistic == pytest.approx(float(x @ r) ** 2 / 25.0, rel=1e-2)
+
+
 def test_a_residual_below_the_noise_does_not_make_a_score_sure():
     """What would be left scatters less than noise does, so the noise decides."""
     x, r = np.ones(4), -1.5 * np.ones(4)

@@ -109,7 +109,9 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     # the more it leans towards the residual, the more of it the second one explains
     columns = (column, column - lean * residual)
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
-    signatures = tuple(_EffectSignature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
+    signatures = tuple(
+        _EffectSignature(effect, values, x, x.T @ x, 0 * x.T @ x) for values, x in zip(grid, columns, strict=True)
+    )
     point = AllCandidatesLinearization(residual[:, 0], signatures)
     best = _score_candidates(point, [series(range(200))], _candidate_detectable_amplitudes(point))[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]

@@ -249,7 +249,7 @@ class BlindCaseGenerator:
         system, priors = self.problem.system, self.problem.options.prior_stds
         start = dict(zip(system.parameters.names, map(float, self.problem.theta), strict=True))
         drawn = {name: start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1) for name in self.problem.free}
-        for name in drawn.keys() & priors.keys():
+        for name in (own for own in drawn if own in priors):  # in their order: a set's differs from process to process
             drawn[name] = start[name] + priors[name] * rng.uniform(*_PRIOR_DEVIATIONS) * rng.choice([-1.0, 1.0])
         for effect in self._ordinary_friction:
             drawn |= {name: start[name] for name in effect.shape_parameter_names}

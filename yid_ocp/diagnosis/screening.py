@@ -43,6 +43,7 @@ class _EffectSignature:
     shape_values: dict[str, float]
     projected_sensitivity: Array  # X = P J_j, shape (nr, p), by its amplitudes
     score_noise_covariance: Array  # shape (p, p): covariance of X'r under the noise's own autocorrelation
+    score_prior_covariance: Array  # shape (p, p): the part of it that stated priors make
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ def linearize_candidates(
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis, scatter, warm = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0)), None
     placed = problem.with_effects_and_relinearized_filters(base, values)
-    series = residual_channel_indices(problem.problem)
+    series, factor = residual_channel_indices(problem.problem), problem.problem.options.stated_std_factor
+    rows = problem.problem.residual_rows
     signatures: list[_EffectSignature] = []
     for k in range(max(map(len, grids.values()), default=0)):
         chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
@@ -118,9 +120,10 @@ def linearize_candidates(
         edges = np.cumsum([len(effect.amplitude_names) for effect in chosen])[:-1]
         for effect, part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
             columns = np.ascontiguousarray(part)
-            driven = columns.T @ scatter
-            covariance = _covariance_of_scores(columns, series) + driven @ driven.T
-            signatures.append(_EffectSignature(effect, grids[effect.label][k], columns, covariance))
+            driven, priors = columns.T @ scatter, columns[rows.stated_priors] / factor
+            by_priors = priors.T @ priors
+            noise = _covariance_of_scores(columns, series) + driven @ driven.T + by_priors
+            signatures.append(_EffectSignature(effect, grids[effect.label][k], columns, noise, by_priors))
     return AllCandidatesLinearization(residual, tuple(signatures))
 
 
@@ -257,7 +260,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Residu
     lower, upper = _room(effect)
     step, decrease = _promised(x.T @ x, slope, lower, upper)
     # without the candidate's share of the residual, which would hide its significance
-    covariance = _newey_west_covariance(x, residual + x @ step, series)
+    covariance = _newey_west_covariance(x, residual + x @ step, series) + signature.score_prior_covariance
     # a residual below the noise must not make a score significant
     covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
     statistic = float(slope @ _pinv(covariance) @ slope)
