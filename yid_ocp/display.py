@@ -56,8 +56,8 @@ class Progress:
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Report that a new stage of the work begins.
 
-        `work` is the expected time of the stage, `ahead` the expected time of all later stages [s]. If `ahead` is
-        absent, the remaining time is reduced by `work`. A stage whose duration does not predict later stages (such as
+        `work` is the expected time of the stage, `ahead` the expected time of all later stages [s]. Without `ahead`,
+        the remaining time is reduced by `work`. A stage whose duration does not predict later stages (such as
         compilation) is included in `ahead`."""
 
     def report_iterate(self, entry: Any) -> None:

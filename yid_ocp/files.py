@@ -32,8 +32,7 @@ _MEMORY_OF_READING = 7 << 28  # address space for a library that reads a file [b
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
     """Check an input file and return its path. Raises `DataError` unless it is a regular file of at most `max_bytes`.
 
-    Pipes and devices are thus refused before anything is read. Every file that this package did not write or ship is
-    checked so."""
+    Every file that this package did not write or ship is checked, so pipes and devices are refused before reading."""
     allowed = "a file that can be read"
     try:
         info = path.stat()

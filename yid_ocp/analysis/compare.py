@@ -78,14 +78,13 @@ def compare_methods(
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     time_budget: float = math.inf,
 ) -> MethodComparison:
-    """Run several methods (`solvers`) from the same initial values and compare their estimates.
+    """Run several estimation methods (`solvers`) from the same initial values and compare their estimates.
 
     Steepest descent minimises the published cost (points in metres, no noise levels, no weak prior). The other methods
     minimise the problem's cost without process noise, which not every method supports. If the problem has process
-    noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run of a method that
-    supports it. `truth` are known parameter values. `callback` receives the method's name and every `Iterate`. `limits`
-    are the criteria by which a residual exceeds noise. Each method may use an equal part of the remaining `time_budget`
-    [s]."""
+    noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run that includes it.
+    `truth` holds known parameter values. `callback` receives the method's name and every `Iterate`. `limits` are the
+    criteria by which a residual exceeds noise. Each method may use an equal part of the remaining `time_budget` [s]."""
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
     deadline = time.perf_counter() + time_budget
 
@@ -258,12 +257,13 @@ def explain_paper_estimates(
     """Explain why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours, one sentence each.
 
     `estimates` come from recordings of such an experiment, `truth` holds known values. The result is empty if the model
-    does not explain the recordings. The reason is the first of these that applies to synthetic recordings:
+    does not explain the recordings. The explanation is the first of these that applies to synthetic recordings:
 
-    - not informed: the recordings do not determine the parameter, or so weakly that its interval contains the value
-    - near the truth: the value is within 10 % of the truth
-    - slow: the value is far from the truth, between the start and the point where the published method stops without
-      torque errors, or within 10 % of that point
+    - not informed: the recordings do not determine the parameter, or so weakly that its interval contains the published
+      value
+    - near the truth: the published value is within 10 % of the truth
+    - slow: the published value is far from the truth, and lies between the start and the point where the published
+      method stops without torque errors, or within 10 % of that point
     - torque error: constant torque errors lead the published method to such values
     - unexplained: none of these"""
     judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}

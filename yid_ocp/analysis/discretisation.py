@@ -128,10 +128,10 @@ def _gauss_newton_step_in_finer_model(
 def refitted_residual_at_finer_step(
     fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> Array | None:
-    """Whitened residual of `fine` one Gauss-Newton step from the coarse fit x (nx,), or None if the step fails.
+    """Predict the whitened residual of a fit with a shorter time step, or return None if the prediction fails.
 
-    `fine` is the problem with a shorter time step, and `at_x` the coarse evaluation with Jacobian. With process noise,
-    the weights are the coarse ones."""
+    `fine` is the problem with the shorter time step. One Gauss-Newton step is made from the coarse fit `x` (nx,), where
+    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used."""
     made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
     return None if isinstance(made, str) else made[1]
 
@@ -139,9 +139,9 @@ def refitted_residual_at_finer_step(
 def longest_accurate_time_step(problem: EstimationProblem) -> float:
     """Find the longest time step [s] whose error is small compared with the residual at the initial unknowns.
 
-    The step starts at 20 ms and is halved at most five times. It is accepted if half the step changes the predictions
-    by at most 3 % of their residual or of the noise, whichever is larger (root mean squares, whitened). A poor initial
-    guess has a larger residual and therefore allows a larger error of the step."""
+    Starting at 20 ms, the step is halved, at most five times, until a further halving changes the predictions by at
+    most 3 % of the larger of residual and noise (root mean squares of whitened values). A poor initial guess has a
+    larger residual and therefore allows a larger error."""
     x, problem = problem.initial_unknowns, problem.with_time_step(_MAX_TIME_STEP)
     for _ in range(_MAX_HALVINGS):
         fine = problem.with_time_step(problem.step.time_step / 2)
@@ -206,9 +206,9 @@ def measure_discretisation_shifts(
 ) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
     """Measure how estimates shift if every link is divided in two, and if the time step is halved.
 
-    `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. For
-    other points, set `model_difference_only`. Returns the shifts of every shared free parameter, empty if nothing was
-    tried, and notes on shifts that could not be computed."""
+    `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. If `x`
+    is not a minimum of the cost, set `model_difference_only`. Returns the shifts of every shared free parameter (empty
+    if nothing was tried), and notes on shifts that could not be computed."""
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
     for key in kinds:
@@ -284,7 +284,7 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 @dataclass(frozen=True)
 class NaturalFrequencies:
-    """Natural frequencies of a system's step map about an equilibrium, with the robot fixed.
+    """Natural frequencies of a system about an equilibrium, with the robot fixed, as the integrator reproduces them.
 
     Unstable modes grow from step to step although damping is included: the equilibrium is unstable, or the time step is
     too long for the tension of the object."""
@@ -303,11 +303,12 @@ def step_map_natural_frequencies(
     constraint_force: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
 ) -> NaturalFrequencies:
-    """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
+    """Compute the natural frequencies of a system about an equilibrium, as one integration step reproduces them.
 
-    The driven and prescribed coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts
-    at `guess` (n,). The rules are as in `compile_step`. The midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
-    The force split affects only growth."""
+    They are the eigenvalue angles of the linearised step without damping. The driven and prescribed coordinates are
+    fixed at `configuration` [rad or m]. The search for the equilibrium starts at `guess` (n,). `force_split` and
+    `constraint_force` are as in `compile_step`: the midpoint rule lowers a frequency f to atan(pi f h)/(pi h), with the
+    time step h, and the force split affects only the growth of modes."""
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: with these held still nothing can swing"
@@ -337,9 +338,9 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 
 
 def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
-    """Smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
+    """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
-    `configuration` holds driven and prescribed coordinates [rad or m]. Lengths are taken from `theta`."""
+    `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths."""
     if not system.grasps:
         return {}
     q, inner = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*system.effect_internal_coordinate_symbols.values())
@@ -385,11 +386,11 @@ _MAX_GROWTH_DECADES = 6.0
 
 @dataclass(frozen=True)
 class AlternatingErrorGrowth:
-    """Growth of errors that alternate in sign from step to step along one motion.
+    """Growth of numerical errors that alternate in sign from step to step along one motion.
 
-    Physical motion keeps its direction for several steps. A mode of the linearised step whose eigenvalue has a negative
-    real part changes sign at every step; it is a numerical artefact. If the eigenvalue's magnitude exceeds one, the
-    integration is unstable, even if Newton's method converges."""
+    A mode of the linearised step alternates if its eigenvalue has a negative real part. Such a mode is a numerical
+    artefact, because physical motion keeps its direction for several steps. If the eigenvalue's magnitude exceeds one,
+    the integration is unstable, even if Newton's method converges."""
 
     recording_name: str
     growth_decades: float  # powers of ten, over the stretch on which it grows most

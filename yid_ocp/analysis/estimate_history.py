@@ -22,10 +22,9 @@ _MIN_CORRELATION_EIGENVALUE = 1e-12  # smaller eigenvalues result from rounding
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunEstimates(ReprMixin):
-    """Estimates of n parameters from one run, with their covariance.
+    """Estimates (n,) of n parameters from one run, with their covariance (n, n), in the parameters' `units`.
 
-    Values (n,) and covariance (n, n) are in the parameters' `units`. If `is_fit_adequate` is False (the model does not
-    explain the recordings), the covariance includes the misfit."""
+    If `is_fit_adequate` is False (the model does not explain the recordings), the covariance includes the misfit."""
 
     run_name: str
     parameter_names: tuple[str, ...]
@@ -105,10 +104,11 @@ def nearby_positive_definite_covariance(covariance: Array) -> Array:
 
 
 def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
-    """Pool several runs' estimates. Also returns chi2 of the differences between runs, and its degrees of freedom.
+    """Combine the estimates of several runs into one weighted mean.
 
-    A run may lack some of the parameters. The pooled estimates contain the parameters of all runs. Their standard
-    deviations are multiplied by Birge's ratio if the runs differ by more than their own standard deviations explain."""
+    Returns the mean, chi2 of the differences between runs, and the degrees of freedom of chi2. Parameters that only
+    some runs contain are included. If the runs differ by more than their standard deviations explain, the standard
+    deviations of the mean are multiplied by Birge's ratio, sqrt(chi2 / degrees of freedom)."""
     names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
     information, sums = np.zeros((len(names), len(names))), np.zeros(len(names))
     # scaled by the first known standard deviations, to avoid rounding errors
@@ -136,9 +136,10 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
 def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
     """Test which parameters drifted between runs (in order of time), and which run is an outlier.
 
-    Each parameter is tested with its marginal variances, each run with its whole covariance. The significance level is
-    divided by the number of parameters or of runs. A run is an outlier if it disagrees with the other runs and these
-    agree without it, or better than without any other run. Two runs have no outlier."""
+    A run is an outlier if it disagrees with the other runs and the other runs are consistent, or clearly more
+    consistent without it than without any other run. With two runs no outlier is reported. A parameter is tested with
+    its marginal variances, a run with its whole covariance. The significance `level` is divided by the number of
+    parameters or of runs."""
     mean, chi2, degrees = pool_estimates(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))

@@ -194,11 +194,11 @@ def choose_cable_memory_fit(
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> ChosenCableMemoryFit:
-    """Refit without cable memory if recordings that start in motion do not support the memory.
+    """Choose between the fit with and a refit without cable memory, if recordings start in motion.
 
-    The load of a cable that moves at the start of a recording is unknown, and its apparent memory may be this motion.
-    Each such recording is predicted from the other ones, with and without memory (by one Gauss-Newton step from the fit
-    of all). The memory is kept if the sum of its errors is smaller."""
+    The load of a cable that moves at the start of a recording is unknown, and this motion can be mistaken for memory.
+    Leave-one-out prediction decides: each such recording is predicted from all others, with and without memory (by one
+    Gauss-Newton step from the fit of all). The memory is kept if it has the smaller total error."""
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
         return ChosenCableMemoryFit(problem, solution)

@@ -178,8 +178,8 @@ def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_Observa
 class CandidateExperimentSensitivities:
     """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
-    `position_sensitivities` holds the derivatives of each frame's position at every node, by (episode, group, frame).
-    They are with respect to the nx unknowns and to the q torque-error unknowns of this episode (see
+    `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
+    with respect to the nx unknowns and to the episode's q torque-error unknowns (see
     `point_sensitivities_and_joint_sensor_information`)."""
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node

@@ -26,10 +26,11 @@ _MAX_CLOUD_POINTS = 1500
 
 @dataclass(frozen=True)
 class FrictionLawFit:
-    """One friction law fitted to all recordings, with its prediction errors on recordings left out in turn.
+    """One friction law fitted to all recordings, with its prediction errors on recordings left out of the fit.
 
-    `left_out_errors` holds each recording's root mean square error, predicted by a fit without its kind of motion (NaN
-    if the fit failed). It is in the channels' unit, or in standard deviations if units differ."""
+    `left_out_errors` holds the root mean square prediction error of each recording by a fit without the recordings of
+    its kind of motion (NaN if the fit failed). The errors are in the channels' unit, or in standard deviations if units
+    differ."""
 
     law: str
     parameters: Mapping[str, ParameterEstimate]  # estimates of the fit to all recordings
@@ -86,10 +87,11 @@ def mean_and_std_error_over_motion_kinds(
 
 
 def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
-    """Choose the first of `fits` whose mean error over `kinds` is within one standard error of the smallest error.
+    """Choose the simplest friction law by the one-standard-error rule of cross-validation.
 
-    Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
-    """
+    Returns the first of `fits` whose mean error over the `kinds` of motion is within one standard error of the smallest
+    error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
+    doi:10.1007/978-0-387-84858-7)."""
     sizes = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds) for fit in fits]
     least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))
     return next((fit for fit, (mean, _) in zip(fits, sizes, strict=True) if mean <= least + error), fits[0])
@@ -111,9 +113,9 @@ def friction_torque_clouds(
 ) -> tuple[_FrictionTorqueCloud, ...]:
     """Measured and predicted friction torques of the driven joints that have some of `friction_parameters`.
 
-    The measured torque is the residual of the discrete equations along the smoothed measured angles with zero friction.
-    The predicted torque is the change of this residual by the fitted law. The result is empty for models with
-    constraints or internal coordinates."""
+    The measured friction torque is the residual of the discrete equations of motion without friction, along the
+    smoothed measured angles. The predicted torque is the change of this residual by the fitted law. The result is empty
+    unless every coordinate is driven, without constraints and internal coordinates."""
     step, system = problem.step, problem.system
     driven = system.driven
     if not driven or step.sizes["m"] or step.sizes["nz"] or len(driven) != system.n_coordinates:

@@ -70,8 +70,9 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that
 class ParameterIdentifiability:
     """Value, standard deviations and identifiability verdict of one parameter.
 
-    The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). It agrees with
-    `interval`, the 95 % profile-likelihood interval about the best fit of all unknowns (None if not requested)."""
+    The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). `interval` is
+    the 95 % profile-likelihood interval, in which all other unknowns are refitted, or None if not requested. The
+    verdict agrees with it."""
 
     value: float
     unit: str
@@ -136,12 +137,13 @@ def identifiability(
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     progress: Progress = NULL_PROGRESS,
 ) -> IdentifiabilityResult:
-    """Analyse by Fisher information which free parameters the problem's recordings determine.
+    """Determine which free parameters the problem's recordings identify, by the Fisher information.
 
-    With independent Gaussian noise, the Fisher information is I = J' J, where J = d r/d x are the whitened
-    sensitivities. The standard deviation of an unknown is the root of the diagonal of the inverse of I, which includes
-    all nuisances (Ljung 1999, System Identification, section 7.4; Raue et al. 2009, Bioinformatics 25:1923,
-    doi:10.1093/bioinformatics/btp358).
+    With independent Gaussian noise, the Fisher information is I = J' J, where J = d r/d x is the Jacobian of the
+    whitened residual r with respect to the unknowns x. The standard deviation of an unknown is the root of the
+    corresponding diagonal entry of the inverse of I, which includes all nuisances (Ljung 1999, System Identification,
+    section 7.4; Raue et al. 2009, Bioinformatics 25:1923, doi:10.1093/bioinformatics/btp358). Raises `SolverError` if
+    the rollout at the point fails, and `ConfigError` if `intervals` contains a name that is not a free parameter.
 
     Parameters
     ----------
@@ -162,13 +164,7 @@ def identifiability(
     -------
     IdentifiabilityResult
         For p free parameters: verdicts and standard deviations, correlations and Fisher information, shape (p, p).
-
-    Raises
-    ------
-    SolverError
-        The rollout at the point fails.
-    ConfigError
-        `intervals` contains a name that is not a free parameter."""
+    """
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in (own for own in wanted if own not in names):

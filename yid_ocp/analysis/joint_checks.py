@@ -82,9 +82,9 @@ class RecordedJointsModel:
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
-        """Positions (N, nf, 3) [m] of frames at recorded angles `q` (N, k), and their Jacobian by `q` (N, nf, 3, k).
+        """Positions (N, nf, 3) [m] of nf frames, and their Jacobian (N, nf, 3, k) with respect to k angles.
 
-        Every frame must satisfy `is_frame_determined_by_angles`."""
+        `q` (N, k) holds recorded angles. Every frame must satisfy `is_frame_determined_by_angles`."""
         place, slope = (np.array(ca.densify(x)) for x in self._places(frames).map(len(q)).call([q.T]))
         count, width = len(frames), len(self.joint_names)
         by_angle = slope.reshape(3 * count, len(q), width).transpose(1, 0, 2)
@@ -212,11 +212,11 @@ def known_effect_config_line(kind: str, location: str, quantity: str, value: flo
 def check_inertial_effort_excitation(
     arm: RecordedJointsModel, recording: Recording, effort: SensorOptions
 ) -> Iterator[Issue]:
-    """Yield an issue if efforts due to speed and acceleration do not exceed the noise of measured efforts.
+    """Yield an issue if a motion is too slow to determine damping, friction and inertia from measured efforts.
 
-    Static configurations determine weight and stiffness. Damping, friction and inertia require the efforts of motion,
-    here estimated by inverse dynamics and friction of a typical size. `effort` are the options of the effort sensor.
-    `arm.has_all_angles_recorded(recording)` must hold."""
+    Static configurations determine only weight and stiffness. The efforts due to speed and acceleration must exceed the
+    noise of measured efforts; they are estimated by inverse dynamics and friction of a typical size. `effort` holds the
+    options of the effort sensor. All angles of `arm` must be recorded."""
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or effort.use is False:
@@ -253,9 +253,9 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
 def check_joint_excitation(
     recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
-    """Yield issues about joints with free parameters (`asked`, by joint) that hardly move in any recording.
+    """Yield an issue for each joint that hardly moves in any recording, although some of its parameters are free.
 
-    `position` are the options of the position sensor."""
+    `asked` lists these parameters by joint. `position` holds the options of the position sensor."""
     for joint, parameters in asked.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:

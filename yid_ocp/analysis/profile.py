@@ -68,14 +68,15 @@ class ParameterProfileLikelihood:
 def compute_profile_likelihood_interval(
     problem: EstimationProblem, x: Array, index: int, std: float, evaluation: Evaluation
 ) -> ParameterProfileLikelihood:
-    """Compute the profile likelihood of one unknown and its 95 % interval, in which chi2 rises by less than 3.84.
+    """Compute the 95 % profile-likelihood interval of one unknown: the values at which chi2 rises by less than 3.84.
 
-    The profile is followed by continuation: from the previous value, the other unknowns are predicted along the tangent
-    and corrected by Gauss-Newton. Positive unknowns are represented by their logarithm. The weak prior is left out of
-    chi2. An end is open if the level is not reached before the unknown's bound, or within a factor of 1000 (Venzon and
-    Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496). `index` selects the unknown, `x` (nx,) is the best
-    fit, and `evaluation` the evaluation at `x` with Jacobian. `std` is the unknown's standard deviation; it sets the
-    first step and may be infinite."""
+    At each value of the unknown, all other unknowns are refitted by Gauss-Newton, from a prediction along the tangent.
+    Chi2 does not include the weak prior. An end of the interval is open if chi2 does not rise by 3.84 before the
+    unknown reaches its bound or 1000 times (or 1/1000 of) its estimate. Positive unknowns are represented by their
+    logarithm (Venzon and Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496).
+
+    `index` selects the unknown, `x` (nx,) is the best fit, and `evaluation` the evaluation at `x` with Jacobian. `std`,
+    the standard deviation of the unknown, sets the first step and may be infinite."""
     walk = _Walk(problem, x, index, evaluation)
     size = min(std / abs(x[index]), 0.5) if walk.logarithmic else min(std, 10 * float(problem.unknown_scales[index]))
     lower, upper = walk.end(-1, size), walk.end(1, size)
@@ -90,10 +91,11 @@ def compute_profile_likelihood_interval(
 def solution_with_profile_intervals(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
-    """Return a solution with profile-likelihood intervals and consistent verdicts for weakly determined parameters.
+    """Return a solution in which weakly determined parameters have profile-likelihood intervals and matching verdicts.
 
-    For these the cost is not quadratic; nor is it for stiffnesses that are small compared with their typical size
-    (`mark_unidentifiable_near_zero_estimate`). A problem that is too large for profiles keeps its solution."""
+    The cost of such a parameter is not quadratic, so that a standard deviation does not describe it. The same holds for
+    a stiffness that is small compared with its typical size (`mark_unidentifiable_near_zero_estimate`). The solution is
+    returned unchanged if the problem is too large for profiles."""
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
         return solution
@@ -143,12 +145,11 @@ def results_by_parameter_at_optimum(
 def mark_unidentifiable_near_zero_estimate(
     problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
 ) -> ParameterEstimate:
-    """Mark a small estimate `not_identifiable` if the data do not exclude its typical size (99.9 %).
+    """Mark a stiffness that is estimated near zero `not_identifiable` if the data allow its typical size too (99.9 %).
 
-    An unobserved twist of a branch moves only if its stiffness is near zero, and then it fits the noise. The cost has a
-    narrow minimum there, lower than at all large values by what one additional parameter removes from the noise. `x`
-    (nx,) is the best fit, `index` selects the unknown, `evaluation` is the evaluation at `x`, and `size` the
-    parameter's entry of `typical_parameter_magnitudes`."""
+    An unobserved twist of a branch can move, and thus fit the noise, only if its stiffness is near zero. The cost
+    therefore has a narrow, spurious minimum there. `x` (nx,) is the best fit, `evaluation` its evaluation, `index`
+    selects the unknown, and `size` is its entry of `typical_parameter_magnitudes`."""
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry
     rise = _Walk(problem, x, index, evaluation).rise(size)

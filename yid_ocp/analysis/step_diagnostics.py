@@ -141,12 +141,12 @@ def parameter_detectabilities(
     theta: Array,
     stages: StepEquationLinearizations,
 ) -> tuple[ParameterDetectability, ...]:
-    """Find the step equations that contain each parameter, and the sensors' response to the parameter.
+    """Find for each parameter the step equations that contain it, and which sensors respond to it.
 
-    One unit is added to one row of one step that starts at `state`. The later steps are linear, x' = (A - B_u K) x,
-    where K is the first gain of the tracking filter. The row is observed to first order if a reading changes within
-    `_RESPONSE_STEPS` steps. `symbols` are the named equations and `stages` their linearisation at `state`. `episode`
-    provides the sensors and the tracking filter; without it only rows are listed."""
+    For the response, one unit is added to one equation of a step that starts at `state`. The later steps are linear, x'
+    = (A - B_u K) x, where K is the first gain of the tracking filter. The equation is observed to first order if a
+    reading changes within `_RESPONSE_STEPS` steps. `symbols` are the named equations and `stages` their linearisation
+    at `state`. `episode` provides the sensors and the tracking filter; without it only equations are listed."""
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
     for row, column in zip(*symbols.full_jacobian_sparsity_pattern.get_triplet(), strict=True):
@@ -294,10 +294,11 @@ def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | Non
 
 
 def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
-    """Structural sparsity patterns of one step's matrices, by name.
+    """Structural sparsity patterns of the Jacobians of one step, by name.
 
-    `dR_dy` is the residual by the unknowns. `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` follow from the implicit function
-    theorem. `dR_dtheta` contains all rows by the parameters."""
+    `dR_dy` is the Jacobian of the step's residual with respect to its unknowns, `dR_dtheta` that of all rows with
+    respect to the parameters. `A` (state), `B_u` (input) and `B_theta` (parameters) are the Jacobians of the next
+    state."""
     whole = _mask(symbols.full_jacobian_sparsity_pattern)
     system = symbols.equations.system
     free = list(system.unprescribed_coordinate_indices)
@@ -396,11 +397,12 @@ def nlp_stage_sparsity(
     followed: Sequence[int],
     loose: Sequence[int],
 ) -> _NlpStage:
-    """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.symbolic_transcription`.
+    """Sparsity of one stage (time step) of the nonlinear program (NLP) that `transcribe` builds.
 
-    The parameters `free` are unknowns. `sensors` are evaluated at nodes. The tracking filter feeds the state rows
-    `followed` back to the torques. The rows `loose` of the initial state are estimated with a prior; the other
-    unprescribed rows are fixed."""
+    The order of rows and columns is as in `solvers.symbolic_transcription`. The parameters `free` are unknowns.
+    `sensors` are evaluated at nodes. `followed` are the state indices that the tracking filter feeds back to the
+    torques. `loose` are the indices of the initial state that are estimated with a prior; the other unprescribed states
+    are fixed."""
     e, system = symbols.equations, symbols.equations.system
     kept = list(system.unprescribed_coordinate_indices)
     rows = ca.vertcat(e.residual, e.p1)
@@ -436,7 +438,7 @@ def nlp_stage_sparsity(
 
 
 def full_nlp_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
-    """Size of the NLP with a node at every step, for recordings with the given numbers of `steps`.
+    """Size of the nonlinear program (NLP) for recordings with the given numbers of `steps`.
 
     `jacobian_nonzeros` counts entries of the constraint Jacobian. `hessian_nonzeros` counts both triangles of the exact
     Hessian of the step constraints times their multipliers, without entries of measurements. The initial state is

@@ -220,11 +220,11 @@ class EquationOrDerivativeFormula:
 
 @dataclass(frozen=True, repr=False)
 class NamedStepEquations(ReprMixin):
-    """Symbolic equations of one time step with named rows and columns. Rows are equations, columns variables.
+    """Symbolic equations of one time step, with names for rows (equations) and columns (variables).
 
-    The row blocks are `del` (DEL equations; at a prescribed coordinate the residual is -h times its effort),
-    `internal`, `constraint`, and `p1`, the momentum after the step. The column blocks are `q0`, `p0`, `z0`, `u`,
-    `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`."""
+    The row blocks are `del` (discrete Euler-Lagrange equations; at a prescribed coordinate the residual is -h times its
+    effort, with the time step h), `internal`, `constraint`, and `p1`, the momentum after the step. The column blocks
+    are `q0`, `p0`, `z0`, `u`, `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`."""
 
     equations: DiscreteEquations
     row_blocks: tuple[SymbolBlock, ...]

@@ -39,16 +39,17 @@ def point_sensitivities_and_joint_sensor_information(
 ) -> tuple[dict[tuple[str, str], Array], Array]:
     """Sensitivities of the points of episode `i` at every node, and Fisher information of its joint measurements.
 
-    In `problem` every point is seen at every node with unit standard deviation. `evaluation` is the evaluation at x
-    (nx,). `finest` is the smallest standard deviation of each group [m]. `encoders` is the problem with encoders of
-    driven joints as measurements.
+    In `problem` every point is seen at every node with unit standard deviation. `evaluation` is the evaluation at the
+    unknowns `x` (nx,). `finest` is the smallest standard deviation of each group [m]. `encoders` is the problem with
+    encoders of driven joints as measurements. The errors of torques and encoders are approximated by q unknowns.
 
     Returns
     -------
     slopes : dict of (group, frame) to ndarray, shape (N + 1, 3, nx + q)
-        Derivatives with respect to the unknowns, then to the low-rank unknowns of torque and encoder errors.
+        Derivatives with respect to the unknowns, then to the q errors.
     information : ndarray, shape (nx + q, nx + q)
-        Information of joint measurements, and of the prior of these errors."""
+        Information of joint measurements, and of the prior of the errors.
+    """
     assert evaluation.jacobian is not None
     episode, result = problem.episodes[i], evaluation.episode_predictions[i]
     driving = episode if encoders is None else encoders.episodes[i]

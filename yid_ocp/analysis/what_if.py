@@ -52,10 +52,10 @@ class ExperimentChange:
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
-    """Predicted identifiability of an experiment with some changes. `verdicts` is empty if it could not be evaluated.
+    """Predicted identifiability of an experiment with some changes. `verdicts` is empty if the prediction failed.
 
-    `gain` is the information gain 1/2 log det(1 + 16 I) over relative changes [nat], for a prior std of 400 % of each
-    parameter."""
+    `gain` [nat] is the information gain 1/2 log det(1 + 16 I), where I is the Fisher information of relative changes
+    and the prior standard deviation of each parameter is 400 %."""
 
     changes: tuple[str, ...]
     description: str
@@ -72,11 +72,11 @@ class ChangedExperimentResult:
 
 @dataclass(frozen=True, repr=False)
 class ExperimentRanking(ReprMixin):
-    """Changes of an experiment, ranked by the parameters that they make identifiable.
+    """Changes of an experiment, ranked by the number of parameters that they make identifiable.
 
-    `single_changes` are sorted by the number of identifiable parameters, then by gain [nat]; changes that could
-    not be evaluated come last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make
-    every parameter identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly."""
+    `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
+    last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make every parameter
+    identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly."""
 
     unchanged_experiment: ChangedExperimentResult
     single_changes: tuple[ChangedExperimentResult, ...]
@@ -107,18 +107,18 @@ def what_if(
     progress: Progress = NULL_PROGRESS,
     evaluate_changes: ChangeSetEvaluator | None = None,
 ) -> ExperimentRanking:
-    """Rank changes of an experiment by the number of parameters that they make identifiable.
+    """Rank changes of an experiment by the number of parameters that they make identifiable, without new measurements.
 
-    No new measurement is needed. New sensors observe the rollout of the recorded motion, on which the tracking filter
-    keeps the arms. New motions and a second arm are simulated in MuJoCo; without MuJoCo, another motion is taken from
-    held-out recordings.
+    A new sensor observes the simulation of the recorded motion, in which the tracking filter keeps the arms on that
+    motion. New motions and a second arm are simulated in MuJoCo; without MuJoCo, the motion of a held-out recording is
+    used.
 
     Parameters
     ----------
     solution : Solution or array_like, optional
         Point of the analysis; default: the initial values.
     start, grasp_std
-        Nuisances, and their errors, as in `identifiability`.
+        Knowledge of initial states and grasps, as in `identifiability`.
     two_arm_system : System, optional
         The system with a second arm and its grasp; without it this change is not tried.
     considered_changes : collection of str, optional
@@ -129,7 +129,8 @@ def what_if(
     Returns
     -------
     ExperimentRanking
-        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat]."""
+        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat].
+    """
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)

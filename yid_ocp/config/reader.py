@@ -41,14 +41,11 @@ def load_config(
 ) -> RunSettings:
     """Read and check the settings of a configuration file. Without `path`, the embedded file `default` is read.
 
-    Each override is `a.b=c`, a key and a value in YAML, which replaces or adds to the file's value. An overriding
-    section is merged key by key with the section of the file, unless it selects another kind or method, or is empty.
-
-    Raises
-    ------
-    ConfigError
-        Missing file, invalid YAML, an unknown or missing key, a value of the wrong type or outside its range. The error
-        states file, line and key, what is allowed and the nearest known key."""
+    Each override is `a.b=c`, a key and a value in YAML, which replaces the file's value or is added. A section in an
+    override is merged key by key with the section of the file, unless the override selects another kind or method, or
+    is empty. Raises `ConfigError` if the file is missing or is not YAML, a key is unknown or missing, or a value has
+    the wrong type or is outside its range. The error states file, line and key, what is allowed and the nearest known
+    key."""
     embedded = Path(str(resources.files("yid_ocp.data").joinpath("defaults", default)))
     file, origin = (embedded, "embedded default") if path is None else (Path(path), str(path))
     data, places = _parse(_read(file), origin)

@@ -161,11 +161,12 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
 
 
 def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
-    """Find channels with noise far below the stated noise. Channels of equal stated noise are pooled.
+    """Find channels whose noise is far below the noise that the recording states.
 
-    Noise stated in the settings (`choice`) is not checked, because it may represent model error. As noise need not be
-    white, the largest estimate from all samples, every second sample, and so on up to `_MAX_SAMPLE_PERIOD` counts;
-    quantization counts as well. Channels without noise are skipped because they were computed, as commands are."""
+    Channels of equal stated noise are judged together. Noise stated in the settings (`choice`) is not checked, because
+    it may represent model error. The noise is estimated from all samples, every second sample, and so on up to a period
+    of `_MAX_SAMPLE_PERIOD`, because it need not be white; the largest estimate counts, but at least the quantisation
+    noise. Computed channels without noise, such as commands, are skipped."""
     found: dict[str, list[tuple[str, float, float]]] = {}
     commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
@@ -228,7 +229,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
 def typical_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
-    """Distance between the two points of each of `edges` [m]: mean over frames, median over recordings.
+    """Typical distance [m] between the two points of each of `edges`: mean over frames, then median over recordings.
 
     If `frames` is given, only the first `frames` frames of each recording count. Raises `DataError` without a
     recording, or if an edge is never seen."""

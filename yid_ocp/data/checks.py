@@ -47,9 +47,10 @@ class _RecordingParts(NamedTuple):
 
 
 def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
-    """Split a recording at gaps of its joints or, without joints, of the `driving` points.
+    """Split a recording at gaps of its joint samples or, without joints, of the samples of the `driving` points.
 
-    Unless a rollout may start `anywhere`, also in motion, only later parts that start at rest are kept."""
+    The first part is kept, and each later part that starts at standstill. If `anywhere` is True, parts that start in
+    motion are kept too, because the problem can estimate their initial state. Very short parts are dropped."""
     t = _times(recording, driving)
     steps = np.diff(t)
     allowed = max(_MAX_SAMPLE_GAP, _MAX_MISSING_PERIODS * median_sample_period(t))

@@ -44,7 +44,7 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS
 
 
 def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
-    """Interpret every column of `header`. Returns the meanings (None if unclear) and the units in the names.
+    """Find the meaning of every column of `header` from its name (None if unclear), and the units in the names.
 
     `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`."""
     split = [_split_unit(name, sensor_components) for name in header]

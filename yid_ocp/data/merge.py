@@ -32,14 +32,14 @@ class _MotionLag(NamedTuple):
 
 
 def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str, float] | None = None) -> Recording:
-    """Merge recordings of one run into one named after the first. Notes report clocks, offsets and interpolation.
+    """Merge recordings of one run into one recording, named after the first.
 
     Recordings whose time ranges overlap are assumed to share one clock and are not shifted; a note reports a remaining
-    lag between points and joints. Recordings without overlap are aligned by the motion: the lag at which joint angles
-    explain the points best. Joints of several recordings are interpolated to the fastest clock; points and other
-    sensors keep their clocks. `clock_offsets` are seconds added to the times of a recording (by name), which is then
-    not aligned. Raises `DataError` if two recordings have a joint in common, if clocks cannot be aligned, or if an
-    offset names no recording."""
+    lag between points and joints. Recordings without overlap are aligned by the motion: the lag is chosen for which the
+    joint angles explain the points best. Joints of several recordings are interpolated to the fastest clock. Points and
+    other sensors keep their clocks. `clock_offsets` [s] are added to the times of the recordings that they name, which
+    are then not aligned. Raises `DataError` if two recordings have a joint in common, if clocks cannot be aligned, or
+    if an offset names no recording. Notes report clocks, offsets and interpolation."""
     offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
     where = ", ".join(names)
     for name in offsets:

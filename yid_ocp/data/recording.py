@@ -302,7 +302,7 @@ class Recording(ReprMixin):
         return replace(self, joints=replace(self.joints, effort_kind=kind))
 
     def time_slice(self, start: float, stop: float) -> Recording:
-        """Return a copy with the samples from start to stop [s] and their times, without groups that have none.
+        """Return a copy with the samples from `start` to `stop` [s]. Groups without such samples are omitted.
 
         Raises `DataError` if there are no samples in this interval, or if `start` is not before `stop`."""
         masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.all_groups]

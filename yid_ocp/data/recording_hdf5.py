@@ -52,11 +52,8 @@ _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
     """Read and check a `yid-recording/1` file. With `allow_nan_effort`, efforts may contain NaN.
 
-    Raises
-    ------
-    DataError
-        The file is missing, not HDF5, damaged or of another format. It has an unknown group, dataset, attribute or
-        unit, lacks a required one, or fails `validated_recording`."""
+    Raises `DataError` if the file is missing, not HDF5, damaged or of another format, if it has an unknown group,
+    dataset, attribute or unit or lacks a required one, or if `validated_recording` refuses the recording."""
     path = Path(path)
     digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
@@ -70,7 +67,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Check a recording and write a `yid-recording/1` file atomically. Efforts may contain NaN.
 
-    Raises the errors of `validated_recording`, and `OutputError` if writing fails; an older file then stays."""
+    Raises `OutputError` if writing fails (an older file is then kept), and `DataError` as in `validated_recording`."""
     validated_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:
         file.attrs.update(format=_RECORDING_FORMAT, description=recording.description, source=recording.source)
@@ -222,8 +219,8 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
     """Check in a forked process that a file can be read. A crash of the library then cannot end this process.
 
     `complaint` reads the file in the fork and returns a description of the error, empty on success. Raises `DataError`
-    if the file is not a regular file, with this description (for a file of the format `noun`), or if the fork crashes.
-    A fork is used because a new process takes a second, and pool processes may have no children."""
+    with this description, or if the file (of the format `noun`) is not a regular file, or if the fork crashes. A fork
+    is used because a new process takes a second, and pool processes may have no children."""
     files.check_input_file(path)
     if not hasattr(os, "fork"):
         return

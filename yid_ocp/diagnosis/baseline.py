@@ -74,9 +74,10 @@ class EarlierRunsComparison:
 
 
 def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
-    """Problem with a baseline's estimates as a joint prior, and with the baseline's parameters free.
+    """Return the problem with a baseline's estimates as a joint prior, in which the baseline's parameters are free.
 
-    Raises `ConfigError` if the model lacks a parameter or effect, or if a parameter differs between recordings."""
+    Raises `ConfigError` if the model lacks a parameter or effect of the baseline, or if a parameter differs between
+    recordings."""
     names, parameters = baseline.parameter_names, problem.system.parameters
     for name in names:
         if name not in parameters:
@@ -154,10 +155,11 @@ class EarlierRunsBaseline:
     def errors_with_effects_removed_and_added(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> ErrorsWithEffectsRemovedAndAdded | None:
-        """Predict reference recordings without the effects of `last`, and the diagnosed recordings with them.
+        """Test found effects on recordings made with and without them, such as before and after a repair.
 
-        None without effects or reference recordings. If there are no earlier runs, the parameters of the system without
-        the effects are estimated on the reference recordings."""
+        Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
+        there are no earlier runs, the parameters without the effects are estimated on the reference recordings. Returns
+        None without effects or reference recordings."""
         without, known = self.reference_recordings, self.combined_estimates
         if not last.effects or not without:
             return None

@@ -364,8 +364,9 @@ def calibrate_thresholds(
 ) -> dict[str, Any]:
     """Compute thresholds as conformal quantiles, and their effect on the ensemble (`yid-calibration/1`).
 
-    `labels`, `marks` and `answers` belong to the same cases. An answer holds the `result` with its `statistics`, and
-    `open`, the statistics with permissive thresholds if no gap was detected. Answers were obtained with `limits`."""
+    `labels`, `marks` and `answers` belong to the same cases. An answer holds the `result` with its `statistics` and, if
+    no gap was detected, `open`: the statistics with permissive thresholds. `limits` are the thresholds of the answers.
+    """
     every = zip(labels, marks, answers, strict=True)
     known = ((label, mark, entry["result"].get("statistics"), entry.get("open") or {}) for label, mark, entry in every)
     cases = [(label.category, mark, said, wide) for label, mark, said, wide in known if said is not None]
@@ -520,10 +521,11 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
 
 
 def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Judge a recorded case again, from the output of `evidence_to_json`. Returns the part that is scored.
+    """Judge a recorded case again, from the output of `evidence_to_json`, and return the part that is scored.
 
-    The thresholds are those of the diagnosis that still exist, with `changes`. The verdict is `not_judged` if they need
-    a refit that was not made. Steps before the first screening (events, time step, other starts) are not repeated."""
+    The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
+    `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,
+    time step, other starts) are not repeated."""
     known = {entry.name for entry in fields(Thresholds)}
     kept = {name: value for name, value in data["thresholds"].items() if name in known}
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))

@@ -213,12 +213,15 @@ def judgement_to_dict(judged: Judgement, seen: NominalEvidence, where: Sequence[
 def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     """Statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. Steps not reached are None.
 
-    `p_value`, `chi2_per_dof`: null test of both residuals together. `largest_channel`: chi2/n of the worst channel.
-    `candidate`: Bonferroni-corrected p-value of the best candidate. `evidence`: rise of the log evidence by unknown
-    forces, offsets and biases (None with process noise). `closure`, `closure_low`: held out, of all selected effects,
-    accepted or not. `explained`: over the smoother's decrease. `assumptions`: their number. `carried`: largest
-    difference between estimation and held-out estimates [stds]. `behind`, per single-effect refit: `left`, its held-out
-    chi2/n, and `squares`, its penalised r'r over all recordings relative to the first."""
+    - `p_value`, `chi2_per_dof`: null test of the estimation and held-out residuals together
+    - `largest_channel`: chi2/n of the channel with the largest chi2/n
+    - `candidate`: Bonferroni-corrected p-value of the best candidate
+    - `evidence`: rise of the log evidence by unknown forces, offsets and biases (None with process noise)
+    - `closure`, `closure_low`: held-out gap closure of all selected effects, accepted or not, and its lower bound
+    - `explained`: fraction of the smoother's decrease of r'r that the effects explain
+    - `assumptions`: number of assumptions
+    - `carried`: largest difference between estimation and held-out estimates [standard deviations]
+    - `behind`: per single-effect refit, held-out chi2/n (`left`) and BIC difference to the first (`squares`)"""
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     added, seen, before = finding.selected_effects, finding.smoother_result, finding.nominal_model
     differences = (entry.estimate_difference_and_std for entry in finding.transfer_checks)

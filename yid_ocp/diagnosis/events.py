@@ -136,11 +136,11 @@ def find_force_and_fault_events(
     smoothed: SmoothedUnknownsResult | None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> EventSet:
-    """Find significant events in all recordings of a problem, at a false-discovery rate over all time windows.
+    """Find short forces and sensor faults in all recordings that are significant at a false-discovery rate.
 
-    `problem` is whitened by sensor noise and has all samples. `x` (nx,) is its fit, and `evaluation` its evaluation,
-    with a Jacobian if `smoothed` is given. Forces that move the model are only searched where the smoother found
-    unknown forces."""
+    The rate refers to all time windows together. `problem` is whitened by sensor noise and has all samples. `x` (nx,)
+    is its fit, and `evaluation` its evaluation, with a Jacobian if `smoothed` is given. Forces that move the model are
+    searched only where the smoother found unknown forces."""
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
     told = [(e, result, problem.theta_and_initial_state_deviation(x, i)[0]) for i, (e, result) in enumerate(fitted)]
     shared = problem.theta_and_initial_state_deviation(x, 0)[0]
@@ -409,11 +409,11 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 
 
 def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
-    """Problem with compensated force events and without affected samples.
+    """Return the problem without the effect of found events, so that a fit is not disturbed by them.
 
-    Forces at joints driven by recorded torques are added to these torques. Excluded are effort samples of prescribed
-    joints in an event's window, wrong samples, and everything after an overspeed. Forces on an object and at servos are
-    not compensated."""
+    Forces at joints driven by recorded torques are added to these torques; forces on an object and at servos are not
+    compensated. Wrong samples are excluded, and effort samples of prescribed joints during an event, and everything
+    after an overspeed."""
     system, cutoff = problem.system, problem.options.path_cutoff
 
     def cleaned(episode: Episode) -> Episode:

@@ -44,9 +44,9 @@ def make_candidate_effects(
 ) -> list[EffectBase]:
     """Make the candidate effects for a system, without effects that its nominal model already has.
 
-    `choice` is "all", or lists `kind` (at all locations that a diagnosis tries) or `kind@location`. Raises
-    `ConfigError` if a kind does not exist, has no location here or is part of the nominal model, or if the list is
-    empty; `ModelError` if a location does not exist."""
+    `choice` is "all", or a list of `kind@location` or `kind` (at all locations that a diagnosis tries). Raises
+    `ConfigError` if the list is empty, or if a kind does not exist, has no location here or is part of the nominal
+    model. Raises `ModelError` if a location does not exist."""
     where, sensors = "diagnosis.candidates", recorded_signal_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
@@ -73,10 +73,10 @@ def make_candidate_effects(
 
 
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Candidates without those named as `kind` or `kind@location`.
+    """Return the candidates except those that `names` lists as `kind` or `kind@location`.
 
     Excluded candidates stay in the compiled step at their neutral values, so nothing is recompiled. Raises
-    `ConfigError` if a name is not a candidate, or if none is left."""
+    `ConfigError` if a name is not a candidate, or if no candidate is left."""
     where = "diagnosis.exclude"
     known = {name for effect in effects for name in (effect.kind, effect.label)}
     for name in names:
@@ -112,10 +112,11 @@ class TruncatedHeldOutRecording:
 
 @dataclass(frozen=True)
 class AllCandidatesProblem:
-    """Estimation problem of a system with all candidate effects. Any can be freed without recompiling.
+    """Estimation problem of a system with all candidate effects, each of which can be freed without recompiling.
 
     Sensors, statics and corrections are compiled once with all derivatives, and recordings are placed on the nodes
-    once. The tracking filter is computed at the nominal initial values, the same for every hypothesis."""
+    once. The tracking filter is computed at the nominal initial values and is therefore the same for every hypothesis.
+    """
 
     # system with all candidates at their neutral values, and free nominal parameters
     problem: EstimationProblem
@@ -186,10 +187,10 @@ class AllCandidatesProblem:
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], margin: float
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
-        """Truncate held-out recordings where the rollout fails. Also returns the truncated recordings.
+        """Truncate held-out recordings where the nominal model's rollout fails. Also returns these recordings.
 
-        `margin` is the fraction kept of the duration that the nominal model follows. If nothing useful is left,
-        estimation recordings are split in blocks. Residuals are whitened by sensor noise; see `whitened_at`."""
+        `margin` is the fraction kept of the duration that the model follows. If too little of every recording remains,
+        estimation recordings are split in blocks instead. Residuals are whitened by sensor noise; see `whitened_at`."""
         problem, x = self.problem, self.problem.vector(values)
         kept, cuts = [], []
         for episode in problem.held_out:
@@ -208,10 +209,10 @@ class AllCandidatesProblem:
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
     def without_other_places(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
-        """Problem on the step of the candidates at the place of `effects` alone, where torque noise makes it worth it.
+        """Return a cheaper problem whose step contains only the candidates at the location of `effects`.
 
-        A step of all candidates costs three times as much. The problem is unchanged without effects, and where they
-        have several places, or the filters contain states of other candidates."""
+        A step of all candidates costs three times as much. The problem is unchanged without process noise, if `effects`
+        have no or several locations, or if the filters contain states of other candidates."""
         places = {effect.location for effect in effects}
         if self.functions_of_place is None or len(places) != 1 or not self.problem.has_process_noise:
             return self
@@ -227,7 +228,7 @@ class AllCandidatesProblem:
     def with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Estimation problem with `effects` free and filters relinearised about the torque offsets at the values `at`.
+        """Estimation problem with free `effects`, its filters relinearised about the torque offsets at the values `at`.
 
         Filters of held-out recordings are unchanged: see `with_relinearized_held_out_filters`."""
         own = self.with_nominal_and_effects_free(effects)

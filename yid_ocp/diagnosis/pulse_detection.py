@@ -306,9 +306,10 @@ class _Rest:
 def detect_force_pulses(
     history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[list[DetectedForcePulse], float]:
-    """Detect pulses in one force estimate, largest evidence first. Also returns the number of windows searched.
+    """Detect force pulses in one force estimate, largest evidence first. Also returns the number of windows searched.
 
-    p-values refer to single windows. The number counts disjoint windows, of lengths a factor of two apart."""
+    The p-value of a pulse refers to a single window, so it must be corrected for the number of windows. This number
+    counts disjoint windows, of lengths a factor of two apart."""
     windows, tries, profiles = _looked_at(history.t.tobytes(), history.filter_cutoff, limits.max_event_duration)
     if not len(windows.begin):
         return [], 0.0

@@ -147,8 +147,8 @@ class UnrecordedRefitError(LookupError):
 class RefitContext:
     """Problem, thresholds, progress, store and deadline of one diagnosis. It makes the refits that rules request.
 
-    With `is_finished`, results come from the record alone; a missing result raises `UnrecordedRefitError`, the problem
-    is unused."""
+    With `is_finished`, results come from the record alone, without using the problem; a missing result raises
+    `UnrecordedRefitError`."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
@@ -238,14 +238,10 @@ def refit_with_effects(
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel | None:
-    """Fit nominal and effect parameters, and predict held-out recordings. None if no rollout succeeds.
+    """Fit nominal and effect parameters, and predict held-out recordings. Returns None if no rollout succeeds.
 
-    Parameters
-    ----------
-    start : mapping of str to float
-        Initial unknowns. If they cannot be rolled out, they are moved towards neutral effects.
-    name : str
-        Name in the store. Default: the labels of the effects, which suffice if no other start is tried."""
+    `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` is
+    the name in the store of refits; the default, the labels of the effects, suffices if no other start is tried."""
     problem = problem.without_other_places(effects)
     known = load_stored_refit(problem, effects, store, name)
     if known is not None:
@@ -430,10 +426,11 @@ def refit_with_each_effect(
     values: Mapping[str, float],
     where: str = "",
 ) -> list[RefitStatistics]:
-    """Refit the model with each of several effects or pairs added to `base`. Failed refits are left out.
+    """Refit the model with each of several effects, or pairs of effects, added to `base`. Failed refits are omitted.
 
-    Each entry of `tried` holds effects and their initial parameters. `values` are the initial values of all other
-    unknowns. `where` names this start in the store, if the same effects are also refitted from other starts."""
+    Each entry of `tried` holds the added effects and their initial parameters; `values` are the initial values of all
+    other unknowns. `where` labels these initial values in the store of refits, so that refits of the same effects from
+    other values remain distinct."""
     if not tried:
         return []
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""

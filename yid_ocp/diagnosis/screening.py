@@ -87,9 +87,9 @@ def linearize_candidates(
     values: Mapping[str, float],
     grid: int = DEFAULT_THRESHOLDS.shape_grid_size,
 ) -> AllCandidatesLinearization:
-    """Linearise the residual at `values` in the amplitudes of all candidates that are not yet in the model.
+    """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
-    The model contains the effects in `base`, with all their parameters free; `values` are the fitted unknowns of this
+    The model contains the effects in `base`, with all their parameters free. `values` are the fitted unknowns of this
     model. `grid` is the number of values per shape parameter. Raises `SolverError` if the rollout at `values` fails."""
     labels = {effect.label for effect in base}
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
@@ -309,9 +309,9 @@ class AllCandidatesScoreModel:
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
     def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
-        """Yield all pairs of candidates labelled in `among`, largest penalised decrease of r'r first.
+        """Yield all pairs of the candidates `among`, largest penalised decrease of r'r first (r: whitened residual).
 
-        A pair can explain what neither effect explains alone, because each can hide in the residual of the other."""
+        Two effects together can explain a residual that neither explains alone, because each masks the other."""
         bounds = [_room(effect) for effect in self.effects]
         lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
         columns, wanted = self._columns, [i for i, effect in enumerate(self.effects) if effect.label in set(among)]

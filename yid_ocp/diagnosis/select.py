@@ -86,9 +86,11 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
 
 
 def penalized_chi2_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
-    """Difference of r'r between two fits over fitted and held-out recordings, plus a parameter penalty.
+    """Difference of two fits' Bayesian information criterion (BIC): `fit` minus `other`, negative if `fit` is better.
 
-    With the penalty of Schwarz (1978, doi:10.1214/aos/1176344136), half the difference is the log odds of `other`."""
+    The BIC is r'r over estimation and held-out recordings (r: whitened residual) plus log(n) per effect parameter, with
+    n residuals (Schwarz 1978, doi:10.1214/aos/1176344136). Half the difference is the log odds of `other` against
+    `fit`."""
     held = fit.held_out_loss.total_chi2 - other.held_out_loss.total_chi2
     more = fit.effect_parameter_count - other.effect_parameter_count
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
@@ -225,8 +227,9 @@ def select_effects(
     """Select effects by forward selection on the held-out gap, then try replacing and removing each effect.
 
     `places` are the smoother's locations of the gap. If `moved` (the nominal fit has left the estimates of an earlier
-    run), candidates are also tried from those estimates. Returns the fits of single effects in the first round, the
-    chosen effect first (its last fit if it stays alone), then by held-out loss, and the selected effects."""
+    run), candidates are also tried from those estimates. Returns the fits of single effects in the first round and the
+    selected effects. The fit of the chosen effect comes first (its last fit if no other effect is selected), then all
+    other fits by held-out loss."""
     limits, alone, chosen, before = search.thresholds, screened, _Choice(nominal), nominal
     first: list[RefitStatistics] = []
     while len(chosen.fit.effects) < limits.max_effects:

@@ -80,8 +80,8 @@ class NominalEvidence:
     def has_gap(self, limits: Thresholds) -> bool:
         """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
 
-        Along a signature, some channel must also exceed noise, because a few deviating samples vanish in the sum over
-        all channels. A torque offset beyond its stated size needs no such channel: it is one number among thousands."""
+        Along a signature, some channel must also exceed noise: the sum over all channels hides a few deviating samples.
+        A torque offset beyond its stated size needs no such channel, because it is one number among thousands."""
         tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
         largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
         is_seen = largest > 1 + limits.min_channel_excess_chi2_per_dof
@@ -138,7 +138,8 @@ class Judgement:
     def required_fraction(self, limits: Thresholds) -> float:
         """Fraction of the smoother's explanation that the effects are required to explain.
 
-        Each further assumption must explain at least `min_explained_fraction` of the remainder."""
+        For k assumptions it is 1 - (1 - `min_explained_fraction`)^k: each assumption must explain that part of the
+        remainder."""
         return 1.0 - (1.0 - limits.min_explained_fraction) ** self.assumption_count
 
 
@@ -182,8 +183,8 @@ def judge(
 ) -> Judgement:
     """Decide the verdict from the evidence for a gap and from the results of a search for effects.
 
-    It is a function of numbers alone: refits, screenings and the smoother (`locate`) are requested by name and can come
-    from a record. `finished` is called with the name of each stage."""
+    Refits, screenings and the smoother (`locate`) are requested by name and can come from a record, so the verdict
+    depends on numbers alone. `finished` is called with the name of each stage."""
     limits, nominal = search.thresholds, seen.nominal_model
     has_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
     # a gap closed by shifted parameters counts only if an effect explains it

@@ -49,10 +49,10 @@ def signal_kinds_required_by_any_effect() -> frozenset[str]:
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """List all effect kinds and locations that the system allows and the recorded signals can reveal.
 
-    `system` does not contain the candidate effects. `recorded_sensors` are `signal_kinds_required_by_any_effect`,
-    sensors on a frame such as `wrist:FRAME`, and `points:GROUP` for points with a separate clock. Effects on prescribed
-    joints are omitted if no effort was recorded, because they would change no measurement. Raises `ModelError` for
-    another signal."""
+    `system` does not contain the candidate effects. `recorded_sensors` lists the recorded signals: names in
+    `signal_kinds_required_by_any_effect`, sensors on a frame such as `wrist:FRAME`, and `points:GROUP` for points with
+    a separate clock. Effects on prescribed joints are omitted if no effort was recorded, because they would change no
+    measurement. Raises `ModelError` for another signal."""
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
     for name in sorted(name for name in present - known if ":" not in name):
         said = unknown_name_error_arguments(name, sorted(known))

@@ -114,10 +114,11 @@ class SeriesElasticity(_DistortedReading):
 
 @EFFECTS.register("backlash")
 class Backlash(_DistortedReading):
-    """Gear backlash with the encoder on the motor side. The measured angle is q + width/2 tanh(effort/`_PLAY_TORQUE`).
+    """Gear backlash with the encoder on the motor side: the measured angle is q + width/2 tanh(effort/`_PLAY_TORQUE`).
 
-    A servo acts on the reading of its encoder. For a joint with a servo, the present play z is therefore an internal
-    coordinate without memory, which solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every step."""
+    A position servo controls the measured angle, so its torque depends on the play z between motor and joint. For a
+    joint with a servo, z is an internal coordinate that solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every
+    step and has no memory."""
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
     required_excitation = "how hard it pulls at its ends"
@@ -229,10 +230,10 @@ class _LateTorque(EffectBase):
 
 @EFFECTS.register("effort_delay")
 class EffortDelay(_LateTorque):
-    """Delay of a joint's torque. The torque that acts at t was recorded at t - delay.
+    """Delay of a joint's torque: the torque that acts at time t was recorded at t - delay.
 
-    For a prescribed arm, the effort recorded at t is the effort of the motion at t + delay. A negative delay means that
-    the effort is recorded late."""
+    At a prescribed arm, the effort recorded at t belongs to the motion at t + delay. A negative delay means that the
+    effort is recorded late."""
 
     equation = "the torque that acts at t was recorded at t - delay"
     possible_locations = _effort_arms
@@ -246,11 +247,12 @@ class EffortDelay(_LateTorque):
 
 @EFFECTS.register("effort_lag")
 class EffortLag(_LateTorque):
-    """First-order lag of a joint's torque z after its command, time_constant dz/dt = command - z.
+    """First-order lag of a joint's torque z behind its command: time_constant dz/dt = command - z.
 
-    The recorded torque is the command. For a prescribed joint, the required effort follows the recorded effort; with a
-    negative time constant, the recorded effort follows the required one, as with a filtered sensor. Before the start of
-    a recording, both are constant at their initial values."""
+    At a driven joint, the recorded torque is the command and the applied torque lags behind it. At a prescribed joint,
+    the torque that the motion requires lags behind the recorded torque. A negative time constant, allowed only at
+    prescribed joints, reverses the roles: the recorded torque lags, as with a filtered sensor. Before the start of a
+    recording, both torques are constant at their initial values."""
 
     equation = "time_constant dz/dt = command - z"
     possible_locations = _effort_joints
@@ -328,10 +330,10 @@ class _BackEmf(_ServoChange):
 
 @EFFECTS.register("current_limit")
 class CurrentLimit(_ServoChange):
-    """Current limit of a DC motor. The current is motor torque / published torque constant kt.
+    """Current limit of a DC motor, where current = motor torque / published torque constant kt.
 
-    The internal parameter is limit^-16, as in `ServoSaturation`. Unlike the duty limit, it also limits braking torque.
-    """
+    Unlike the duty limit, it also limits braking torque. The internal parameter is limit^-16, so that its neutral value
+    zero means that there is no limit."""
 
     equation = "torque = kt clip(torque/kt, limit)"
     possible_locations = _published_motor_joints
@@ -361,10 +363,10 @@ class ServoDelay(_ServoChange):
 
 @EFFECTS.register("servo_saturation")
 class ServoSaturation(_ServoChange):
-    """Additional smooth torque limit of a servo. The torque is demand / (1 + |demand/limit|^16)^(1/16).
+    """Additional smooth torque limit of a servo, with torque = demand / (1 + |demand/limit|^16)^(1/16).
 
-    The internal parameter is limit^-16. It adds to the model's limit and is neutral at zero, with a nonzero
-    derivative."""
+    The internal parameter is limit^-16. Its neutral value zero means that there is no additional limit, and its
+    derivative is nonzero at zero. It is added to the model's own limit^-16."""
 
     equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"
 

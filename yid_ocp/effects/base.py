@@ -154,8 +154,8 @@ class EffectBase(Effect):
     ) -> dict[str, ReportedParameterValue]:
         """Convert the parameters to their reported form. For example, a compliance is reported as a stiffness.
 
-        Missing `values` are nominal, missing `stds` NaN. The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p
-        C)."""
+        Missing `values` are nominal, missing `stds` are NaN. A reported power of C, C^(-1/p), has the standard
+        deviation C^(-1/p) std(C)/(p C)."""
         result = {}
         for definition, entry in zip(self.definitions, self.parameters, strict=True):
             value = float((values or {}).get(entry.name, entry.value))

@@ -138,20 +138,22 @@ class PointMass(EffectBase):
 
 @EFFECTS.register("payload")
 class Payload(EffectBase):
-    """Payload fixed to a frame, with its centre at (mx, my, mz)/mass. A negative mass removes excess mass of the model.
+    """Point mass fixed to a frame, with first moments m = (mx, my, mz) about the frame. A negative mass removes mass.
 
-    The first moments are limited to L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 + (`_MAX_COM_SHIFT` M)^2). The limited
-    and reported moments are s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8). All bodies of the joint together have
-    the mass M (in L at least 1 kg), the centre C, and Sigma, the integral of r r' dm about C. With e = s + mass (frame
-    - C), the payload adds to the link `mass`, the first moment e about C, and the second moment about C
+    Let the bodies that move with the joint have mass M, centre C, and second-moment matrix Sigma, the integral of r r'
+    dm about C. The payload adds `mass`, the first moment e = s + mass (frame - C) about C, and the second moment about
+    C
 
-        K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),
-        w(mass) = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4).
+        K = e e' (1/(M + mass) + c h),  c = w M/(M + mass),
+        w = mass^3/(mass^4 + (|e|/`_POINT_INERTIA_DISTANCE`)^4 + `_POINT_INERTIA_MIN_MASS`^4).
 
-    Usually w is 1/mass, and K = e e'/mass is the second moment of a point. Only for a location further than
-    `_POINT_INERTIA_DISTANCE`, and near mass zero, w goes smoothly to zero. The second moment of the link about its new
-    centre is Sigma + c h e e'. For an added mass h is 1. For a removed mass h = (1 + a^4)^(-1/4) with a = c e' Sigma^-1
-    e. This keeps the link's inertia positive, and is almost 1 if the removed mass was part of the link."""
+    These terms equal those of a point mass (s = m, w = 1/mass, h = 1, K = e e'/mass), except in three cases:
+
+    - Large moments are limited smoothly at L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 + (`_MAX_COM_SHIFT` M)^2), with M
+      at least 1 kg: s = m (1 + (|m|/L)^8)^(-1/8). s is also the reported moment.
+    - Near mass zero, and beyond `_POINT_INERTIA_DISTANCE`, w goes smoothly to zero, because 1/mass diverges.
+    - For a removed mass h = (1 + a^4)^(-1/4), with a = c e' Sigma^-1 e. The second moment of the link about its new
+      centre, Sigma + c h e e', thus stays positive. h is almost 1 if the mass was part of the link."""
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
     required_excitation = "its orientation to gravity"
@@ -283,10 +285,10 @@ class RotorInertia(EffectBase):
 
 @EFFECTS.register("aerodynamic_drag")
 class AerodynamicDrag(EffectBase):
-    """Quadratic air drag on a segment's links. The force is F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
+    """Quadratic air drag on a segment's links, F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
-    v_n is the velocity of a link's centre normal to the link, with |v_n| smoothed below `_ABS_SMOOTHING_SPEED`. r and l
-    are the link's radius and length. J_c is the Jacobian of its centre."""
+    v_n is the velocity of a link's centre (with Jacobian J_c) normal to the link; |v_n| is smoothed below
+    `_ABS_SMOOTHING_SPEED`. cd is the drag coefficient, r the link's radius and l its length."""
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
     required_excitation = "how fast it moves"

@@ -58,10 +58,10 @@ class Law(EffectBase):
     """Torque as a smooth function F = f(x) on an arm joint, or on every joint that bends a segment.
 
     x is the joint's own angle, speed, load or command, or the time since the start of the recording (an internal
-    coordinate s with ds/dt = 1). The command is the torque that the servo requests, after saturation; for a DC motor it
-    is the torque of the duty cycle without back-EMF. At a segment, the load of a joint is the torque of its spring. f
-    is a natural cubic spline through values at equally spaced knots, which are the parameters; for two quantities it is
-    a sum of two splines. Beyond the knots f is constant. A law of the command is zero while the motor is off."""
+    coordinate s with ds/dt = 1). f is a natural cubic spline whose parameters are its values at equally spaced knots,
+    and constant beyond the knots; for two quantities it is a sum of two splines. The command is the torque that the
+    servo requests, after saturation; for a DC motor it is the torque of the duty cycle without back-EMF. A law of the
+    command is zero while the motor is off. At a segment, the load of a joint is the torque of its spring."""
 
     knots: Mapping[str, Array] | None = None  # knots of every quantity
 
@@ -170,9 +170,10 @@ def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]
 def quantity_values_along(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
-    """Values (N, joints) of a quantity at a location at all midpoints of a rollout. NaN without a command.
+    """Values (N, joints) of `quantity`, such as speed or load, at the midpoints of the N steps of a rollout.
 
-    `nodes` holds `state` (N + 1, nx), `torque` (N, nu), `multipliers` (N, m) and the `time_step` [s] as an array."""
+    Columns are the joints of `location`. A command is NaN while the motor is off. `nodes` holds `state` (N + 1, nx),
+    `torque` (N, nu), the constraint `multipliers` (N, m) and the `time_step` [s] as an array."""
     n, h = system.n_coordinates, float(nodes["time_step"])
     if quantity == "time":
         return np.asarray((np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h, float)
@@ -213,9 +214,9 @@ def quantity_values_along(
 
 
 def make_law(location: str, system: System, tables: Sequence[LawTable], torque_scale: float = math.inf) -> Law:
-    """Make a law at a joint or segment from its tables. `torque_scale` is its expected size [N m].
+    """Make a law at a joint or segment from its tables. `torque_scale` is the expected size of its torque [N m].
 
-    Raises `ConfigError` if no law, or no law of these quantities, is possible at the location."""
+    Raises `ConfigError` if the location allows no law, or no law of these quantities."""
     label, possible = f"law@{location}", allowed_law_quantity_names(system, location)
     if not possible:
         places = (*segment_names(system), *arm_joint_names(system))

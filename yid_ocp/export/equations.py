@@ -81,10 +81,10 @@ def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, 
 def export_step_functions(
     symbols: NamedStepEquations, folder: str | os.PathLike[str], theta: Array, time_step: float
 ) -> tuple[Path, ...]:
-    """Write a step's CasADi functions as `NAME.casadi` files and as `equations.c`, with `names.json`.
+    """Write a step's CasADi functions as `NAME.casadi` files and as `equations.c`, and return the written files.
 
-    `names.json` contains the parameters' names and values `theta`, and the time step [s]. `folder` is made if absent.
-    Returns the written files. Raises `OutputError` if the folder or a file cannot be written."""
+    `names.json` contains the parameters' names and values `theta`, and the time step [s]. `folder` is created if
+    absent. Raises `OutputError` if the folder or a file cannot be written."""
     folder, functions, written = make_folder(folder), _exported_step_functions(symbols), []
     for function in functions:
         written.append(folder / f"{function.name()}.casadi")
@@ -110,8 +110,8 @@ def write_equation_sheet(
 ) -> None:
     """Write a step's equations as a LaTeX document. Raises `OutputError` if the file cannot be written.
 
-    Parameters in `free` stay symbols, and a table lists their values. Others are replaced by their values from
-    `theta`."""
+    Parameters in `free` stay symbols, and a table lists their values. All other parameters are replaced by their values
+    in `theta`."""
     system = symbols.equations.system
     values = dict(zip(system.parameters.names, map(float, theta), strict=True))
     lines = [rf"\section*{{One step of {escape_latex(system.mechanism.name)}}}", *_rules(symbols, time_step)]

@@ -32,8 +32,8 @@ _WORLD_FRAME = "world"
 class RosTopicTimeSeries:
     """Time series of one ROS topic at times t (M,) [s]. A time without any finite value gets no message.
 
-    For joints, `values` holds `position`, `velocity` and `effort`, each (M, len(names)). For other kinds it holds `xyz`
-    (M, 3), for a wrench the forces."""
+    `values` holds `position`, `velocity` and `effort` of joints, each (M, len(names)), or, for any other kind, `xyz`
+    (M, 3), which are the forces of a wrench."""
 
     topic: str
     kind: _SignalKind

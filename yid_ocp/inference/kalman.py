@@ -71,9 +71,10 @@ class KalmanStepMatrices:
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
-        """Smoothed measurement noise (r, c) and the costate before the step (nx, c), from the costate after the step.
+        """Step backwards through one filter step: smoothed measurement noise (r, c) and the costate before it (nx, c).
 
-        `white` are the normalized innovations. The smoothed state is the filter's prediction + P costate."""
+        `white` are the normalized innovations and `costate` is the costate after the step. The smoothed state is the
+        filter's prediction + P costate, with the covariance P."""
         pulled = self.transition._propagate_costate_back(costate)
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
         return noise, pulled + self.observation.T @ noise
@@ -92,8 +93,9 @@ def kalman_matrices_and_next_covariance(
 ) -> tuple[KalmanStepMatrices, Array, float]:
     """Compute a filter step's gains, the next state covariance without process noise, and log det S.
 
-    `covariance` is P (nx, nx) before the measurement, `observation` is H (r, nx), and S = I + H P H'. If rounding makes
-    S indefinite, only its diagonal is used, and log det S is returned as infinity."""
+    `covariance` is P (nx, nx) before the measurement, `observation` is H (r, nx), and S = I + H P H' is the covariance
+    of the innovation. If rounding makes S indefinite, only its diagonal is used, and log det S is returned as infinity.
+    """
     cross = observation @ covariance
     whitening, log_determinant = np.zeros((0, 0)), 0.0
     if len(observation):
@@ -148,11 +150,11 @@ class KalmanSteps:
     def normalized_innovations_and_next_mean(
         self, mean: Array, measured: Array, shift: Array, push: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """Normalized innovations (r, c), state means (nx, c) after all steps, and means before each step (k, nx, c).
+        """Filter all steps: normalized innovations (r, c), final means (nx, c), and means before each step (k, nx, c).
 
         `mean` is the mean before all steps, `measured` (r, c) the measurements. `push` (k, m, c) is added to the
         parameters during a step's transition. `shift` (k, nx - ns) is added to the parameters of the first column after
-        it."""
+        the step."""
         if (library := _library()) is not None:
             return self._compiled_columns(library, measured, mean, shift, push)
         white, seen, ns = np.empty_like(measured), np.empty((len(self.moves), *mean.shape)), self.moves.shape[1]
@@ -165,7 +167,7 @@ class KalmanSteps:
         return white, mean, seen
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
-        """Smoothed measurement noise (r, c), costates (nx, c) before all steps, and costates after each (k, nx, c).
+        """Smooth all steps: measurement noise (r, c), first costates (nx, c), and costates after each step (k, nx, c).
 
         `white` are the normalized innovations, `costate` is the costate after the last step."""
         if (library := _library()) is not None:
@@ -207,8 +209,8 @@ def prepare_kalman_steps(
 ) -> tuple[KalmanSteps, Array]:
     """Prepare successive filter steps. Returns them and the state covariance (nx, nx) after the last step.
 
-    The last columns of the moves (k, ns, ns + m + noises) are the effect of unit noises on the states. `variance` (k,
-    nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`."""
+    The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states.
+    `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`."""
     count, library, covariance = np.diff(row_start), _library(), covariance.copy()
     white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)
     moves, decay, variance, observation = map(np.ascontiguousarray, (moves, decay, variance, observation))

@@ -26,8 +26,8 @@ class NominalTrajectory:
     """Trajectory of an episode with its measurements, about which the residual is linearized.
 
     Measurements are shifted by their delays to the times at which they were true. `initial_state_by_angles` and
-    `initial_state_by_torque` (nx, nu) are derivatives with respect to the driven joints' first angles and torques. They
-    are zero if the initial state does not follow from these."""
+    `initial_state_by_torque` (nx, nu) are derivatives of the initial state with respect to the driven joints' first
+    angles and torques. They are zero if the initial state does not depend on these."""
 
     model_functions: ModelFunctions
     theta: Array
@@ -70,8 +70,8 @@ class ResidualDerivativesAtNodes:
     ) -> ResidualDerivativesAtNodes:
         """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
 
-        A sensor of velocities, accelerations or constraint forces depends on four nodes; the first one is before the
-        sample's node. Raises `DataError` for such a sensor unless `with_neighbours` is set."""
+        `with_neighbours` is required for a sensor of velocities, accelerations or constraint forces, which depends on
+        four nodes (the first one is before the sample's node). Raises `DataError` without it."""
         step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
         found: list[IntArray] = []
@@ -129,9 +129,10 @@ class ResidualDerivativesAtNodes:
         return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Residual derivatives (r, d) in d directions, from `by_node` (K, nx, d) of states and `effort` (K, nc, d).
+        """Residual derivatives (r, d) along d directions, from the derivatives of states and efforts at K nodes.
 
-        The K nodes begin with node `first`. A residual beyond them uses the last node."""
+        `by_node` (K, nx, d) is the derivative of the states, `effort` (K, nc, d) that of the efforts. The K nodes begin
+        with node `first`. A residual beyond them uses the last node."""
         found = np.zeros((len(self.node), by_node.shape[2]))
         for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
             used = np.flatnonzero(by_state.any(axis=1) | by_effort.any(axis=1))

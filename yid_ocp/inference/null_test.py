@@ -114,8 +114,8 @@ def residual_chi2_null_test(
 ) -> NullTestResult:
     """Test whether a whitened residual (nr,) is noise alone after a fit of `parameters` parameters.
 
-    Rows that belong to no series (priors) are ignored. `level` is the false-discovery rate of the windows, `window` the
-    length [s]."""
+    Rows that belong to no series (priors) are ignored. `level` is the false-discovery rate over time windows of length
+    `window` [s]."""
     count = sum(len(s.residual_indices) for s in series)
     degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)
     effective = max(degrees - parameters, 1.0)

@@ -362,9 +362,9 @@ def select_and_smooth_unknowns(
 def force_log_likelihood_coefficients(
     model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
-    """Coefficients g (J,) and L (J, J) of an unknown's log likelihood g'f - f'L f / 2, where f are its values.
+    """Log likelihood g'f - f'L f / 2 of the values f (J,) of one unknown in J intervals: returns g (J,) and L (J, J).
 
-    `unknown` is the index of the unknown, in whose reference f is expressed. Free parameters, states and all other
+    `unknown` is the index of the unknown; f is in units of its reference. Free parameters, states and all other
     unknowns are integrated out; `variance` gives the variances of their groups [squared reference]."""
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))
@@ -512,9 +512,9 @@ def gap_locations_from_effect_closures(
 ) -> tuple[GapLocation, ...]:
     """Divide the gap among locations: closed parts belong to the effects' locations, the smoother divides the rest.
 
-    `before` and `rest` are the locations of the nominal model and of the model with the effects. `closed` is the part
-    of the gap that the effects at each location close. `windows` are the time windows of locations at which the
-    smoother has no unknown (`world`, `clock`)."""
+    `before` holds the locations found for the nominal model, `rest` those for the model with the effects. `closed` is
+    the part of the gap that the effects at each location close. `windows` are the time windows of locations at which
+    the smoother has no unknown (`world`, `clock`)."""
     known = {place.location: place for place in before}
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
     for place in rest:
@@ -537,9 +537,10 @@ def z_scores_of_smoothed_unknowns(
     recording: int = 0,
     informed_fraction: float = 0.5,
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Interval edges (J + 1,) [s], names of the unknowns, and z scores (J, nd): posterior mean over standard deviation.
+    """Return the z scores (J, nd) of nd smoothed unknowns in J intervals: posterior mean over standard deviation.
 
-    A score is NaN unless 1 - posterior/prior variance is above `informed_fraction`."""
+    The result is the interval edges (J + 1,) [s], the names of the unknowns, and the scores. A score is NaN if the data
+    reduced the variance of the unknown by a fraction of `informed_fraction` or less."""
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -267,9 +267,10 @@ def recording_models_with_unknown_forces(
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
     interval: float = _MIN_INTERVAL,
 ) -> tuple[LinearResidualModel, ...]:
-    """Linearize every recording's residual about `x` in unknown forces, offsets and biases.
+    """Linearize every recording's residual with respect to unknown forces, offsets and biases.
 
-    `evaluation` is that at `x` with a Jacobian. Unknowns are constant over intervals of at least `interval` [s]."""
+    `evaluation` is the evaluation at the unknowns `x`, with a Jacobian. The unknown forces, offsets and biases are
+    constant over intervals of at least `interval` [s]."""
     assert evaluation.jacobian is not None
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])
     found = []

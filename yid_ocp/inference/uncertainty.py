@@ -57,8 +57,8 @@ class GoodnessOfFit:
 class ParameterEstimate:
     """Estimate of one parameter: value, standard deviation, bounds and verdict.
 
-    The 95 % `interval` is set if a standard deviation is not sufficient. At a bound it is one-sided. If the cost is not
-    quadratic, it comes from the profile likelihood. None is an open end."""
+    The 95 % `interval` is given if the standard deviation does not describe the uncertainty: at a bound, where it is
+    one-sided, and for a cost that is not quadratic, where it is a profile-likelihood interval. None is an open end."""
 
     value: float
     std: float  # infinite without information on the parameter
@@ -111,8 +111,8 @@ def assess_goodness_of_fit(
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
     """Covariance of the unknowns (nx, nx) from data and stated priors, and chi2 per degree of freedom.
 
-    Directions without information in the data get the variance (1e8 x scale)^2 instead of an infinite one. A prior's
-    error counts with at least its stated standard deviation, even if other stated deviations are too large."""
+    Directions without information in the data get the variance (1e8 x scale)^2 instead of an infinite variance. The
+    standard deviation of a prior is never scaled below its stated value, even if other stated values are too large."""
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
     spread, chi2 = unknowns_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
@@ -311,9 +311,9 @@ def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str
 def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
     """Copy an estimate with a 95 % profile-likelihood interval, with which std and verdict become consistent.
 
-    With two open ends the verdict is not_identifiable. With one open end it is at best weak, and std is infinite. An
-    open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
-    `parameter_verdict`). Otherwise the wider side counts as two standard deviations and decides the verdict. It
+    An open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
+    `parameter_verdict`). With two open ends the verdict is not_identifiable. With one open end it is at best weak, and
+    std is infinite. Without open ends, half the wider side acts as the standard deviation: it decides the verdict, and
     replaces std if std is less than half of it."""
     low, high = interval
     if low is None and entry.value - entry.lower <= scale:
@@ -342,8 +342,8 @@ def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
     """Typical magnitude of each free parameter from priors, bounds, similar parameters or initial values.
 
-    The first available value counts: the prior's standard deviation, half the distance of finite bounds, the median of
-    parameters of the same kind (such as `bend`) or unit, the scale of the unknown."""
+    It is the first of these that is available: the prior's standard deviation, half the distance of finite bounds, the
+    median of parameters of the same kind (such as `bend`) or unit, the scale of the unknown."""
 
     def kind(name: str) -> str:
         return name.rpartition(".")[2]
@@ -375,9 +375,9 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
 def parameter_estimates(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array, fit: GoodnessOfFit | None
 ) -> dict[str, ParameterEstimate]:
-    """Estimate all parameters from the covariance (nx, nx) and evaluation at `x`. Local ones are listed by recording.
+    """Make the estimates of all parameters from the unknowns `x`, their covariance (nx, nx) and the evaluation at `x`.
 
-    If `x` is not a fit, `fit` is None, and misfit and bounds are ignored."""
+    Local parameters are listed by recording. If `x` is not a fit, `fit` is None, and misfit and bounds are ignored."""
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
     sizes, theta = typical_parameter_magnitudes(problem, x), problem.theta_and_initial_state_deviation(x, 0)[0]

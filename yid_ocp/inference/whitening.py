@@ -98,8 +98,8 @@ class WhiteningFilter:
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.
 
-        The columns of `rows` are a residual in units of sensor noise, then its derivatives. `push` (N, nu, c) is the
-        tracking filter's correction of the torque and its derivatives [N m]."""
+        The first column of `rows` is a residual in units of sensor noise, the others are its derivatives. `push` (N,
+        nu, c) is the tracking filter's correction of the torque and the derivatives of this correction [N m]."""
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
             result[part.rows], mean, _ = self._updated(part, mean, rows[part.rows], push)
@@ -310,12 +310,12 @@ def _behind_effects(
 def problem_whitened_at(
     problem: EstimationProblem, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
 ) -> EstimationProblem:
-    """Whiten a problem's residuals by sensor and process noise, linearized at `x`.
+    """Return a problem whose residuals are whitened by sensor and process noise, linearized at `x`.
 
-    Returns the problem itself if it has no process noise, or if the rollout fails at `x`. If it is already whitened,
-    the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number of
-    linearizations (2 at a fit). `equilibrium_guesses` are configurations from which the search for equilibria starts.
-    """
+    The problem itself is returned if it has no process noise, or if the rollout fails at `x`. If it is already
+    whitened, the new filter is linearized about the motion and torques that the old filter smooths. `rounds` is the
+    number of linearizations (2 at a fit). `equilibrium_guesses` are configurations from which the search for equilibria
+    starts."""
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
 
@@ -336,11 +336,12 @@ def problem_whitened_at(
 def problem_with_whitened_held_out(
     problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
 ) -> EstimationProblem:
-    """Whiten held-out residuals by sensor and input noise, linearised at the unknowns `x`.
+    """Return a problem that whitens the residuals of held-out recordings by sensor and input noise.
 
-    Each filter is linearised again about the motion that the present filter smooths. If there is none, a filter is
-    built first. With `keep_weights`, such a first filter keeps its weights, which is sufficient for torque offsets. If
-    a rollout fails, only sensor noise is used."""
+    Each held-out recording gets a Kalman filter that is linearised at the unknowns `x`, about the motion that the
+    recording's previous filter smooths. A recording without a filter first gets one that is linearised about its
+    rollout. With `keep_weights`, the gains of this first filter are kept, which suffices for torque offsets. A
+    recording whose rollout fails is weighted by sensor noise only."""
     x, episodes, made = np.asarray(x, float), [], []
     known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
     for held, (before, (own, theta, offset)) in zip(problem.held_out, known, strict=True):
@@ -391,9 +392,10 @@ def _with_errors(
 
 
 def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-    """Constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
+    """Estimate the constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
 
-    The entry is None if torques are taken as exact, or without a whitening filter (see `problem_whitened_at`)."""
+    The entry of a recording is None if its torques are exact, or if it has no whitening filter (`problem_whitened_at`).
+    """
     x = np.asarray(x, float)
     found: list[tuple[Array, Array] | None] = []
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):

@@ -145,7 +145,7 @@ def compile_and_load_library(
     """Load the shared library of a C source, compiled or from the cache. Returns None if no compiler works.
 
     The cache key is the hash of `source`, the flags, the compiler, the processor and CasADi's version. With `make`,
-    `source` is only the key. `make` is called if the library is not in the cache, and returns the C text or None.
+    `source` is only part of the key, and `make` returns the C text (or None) if the library is not in the cache.
     `level` replaces the default optimisation flag."""
     target = _library_file(source, level or _optimization_flag(), make)
     if target is None:
@@ -160,8 +160,7 @@ def compile_and_load_library(
 def compiled_casadi_function(function: ca.Function) -> ca.Function:
     """Compile a CasADi function to C, without optimisation. Returns the function unchanged if no compiler works.
 
-    The compiled function cannot be differentiated. This suits functions of many operations that run for seconds in all.
-    """
+    This suits large functions whose calls take seconds in all. The compiled function cannot be differentiated."""
     target = _library_file(casadi_c_source(function.name(), (function,)), _NO_OPTIMIZATION_FLAG)
     if target is None:
         return function

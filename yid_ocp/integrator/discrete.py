@@ -71,10 +71,10 @@ class _ConstraintImpulses:
 
 @dataclass(frozen=True)
 class DiscreteEquations:
-    """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system.
+    """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system, from node 0 to node 1.
 
-    The digits 0 and 1 denote the step's two nodes. q (n, 1) are coordinates, z (nz, 1) internal coordinates and p (n,
-    1) momenta [N m s]. The system has m constraints, nu inputs and ntheta parameters."""
+    q (n, 1) are coordinates, z (nz, 1) internal coordinates and p (n, 1) momenta [N m s]; the digit 0 or 1 in a name
+    denotes the node. The system has m constraints, nu inputs and ntheta parameters."""
 
     system: System
     force_split: ForceSplit

@@ -36,10 +36,11 @@ _PointEvaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """Thread-safe stepping kernel in CasADi's interpreter and NumPy. It has the methods of `CompiledKernel`.
+    """Thread-safe stepping kernel in CasADi's interpreter and NumPy, for machines without a compiler.
 
-    A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
-    constraint equations, then p1, then the effort of the prescribed coordinates."""
+    It has the methods of `CompiledKernel`. A point is a column of all `DiscreteEquations.arguments`. The outputs are
+    the rows of the balance, internal and constraint equations, then p1, then the effort of the prescribed coordinates.
+    """
 
     def __init__(self, model: StepModel) -> None:
         self._model = model
@@ -231,7 +232,7 @@ class InterpretedKernel:
         names: tuple[str, ...],
         by: CostDerivativesByRolloutVariables,
     ) -> RolloutCostGradient:
-        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds the cost's partial derivatives.
+        """Compute the gradient of a cost J along a rollout by the adjoint method. `by` holds J's partial derivatives.
 
         costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k."""
         by_state, by_multipliers, by_effort = by

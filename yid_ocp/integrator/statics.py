@@ -55,10 +55,10 @@ _MAX_HOLD_DEFLECTION = 0.02  # larger deflections of a holding spring mean a pos
 
 
 class EquilibriumSolver:
-    """Newton solver for a system's static equilibrium. Driven joints are held, prescribed joints are given.
+    """Newton solver for the static equilibrium of a system whose driven and prescribed joints have given positions.
 
-    `known_coordinates` are the indices of the given coordinates (driven, then prescribed), `free_coordinates` those of
-    the unknown coordinates."""
+    `known_coordinates` are the indices of these coordinates (driven, then prescribed), `free_coordinates` the indices
+    of the unknown coordinates."""
 
     def __init__(self, step: Step) -> None:
         self.step = step
@@ -87,20 +87,21 @@ class EquilibriumSolver:
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
     ) -> Equilibrium:
-        """Find the equilibrium for given driven and prescribed coordinates. If Newton fails, return its best point.
+        """Find the equilibrium for given driven and prescribed coordinates, or the best point if Newton's method fails.
 
         Parameters
         ----------
         configuration : array_like, shape (nk,)
             Known coordinates, driven then prescribed [rad or m].
         torque : array_like, shape (nu,), optional
-            Measured torque at this configuration [N m]; the holding spring then only compensates noise. For servos, the
-            commands; the search then starts from `configuration`. A joint with `MOTOR_OFF_COMMAND` is held until motion
-            begins.
+            Measured torque at this configuration [N m]; the spring that holds a driven joint then only compensates
+            noise. For servos, the commands; the search then starts from `configuration`. A joint with
+            `MOTOR_OFF_COMMAND` is held until motion begins.
         guess : array_like, shape (n,), optional
             Configuration to start from; default: the undeformed object.
         names : sequence of str
-            Parameters with respect to which the equilibrium is differentiated."""
+            Parameters with respect to which the equilibrium is differentiated.
+        """
         step, system = self.step, self.step.system
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
         theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))

@@ -120,10 +120,10 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives A (nx, nx), B_u (nx, nu), B_theta (nx, len(names)) of the next state by state, input, parameters.
+        """Jacobians of the next state with respect to the state, the input and the parameters `names` (default: all).
 
-        They follow from the implicit function theorem. Arguments are as in `__call__`; `names` are by default all of
-        theta."""
+        Returns A (nx, nx), B_u (nx, nu) and B_theta (nx, len(names)), computed by the implicit function theorem. The
+        other arguments are as in `__call__`."""
         sizes = self.sizes
         chosen = tuple(self.system.parameters.names if names is None else names)
         nx, nu, nt = sizes["nx"], sizes["nu"], len(chosen)
@@ -175,6 +175,8 @@ def compile_step(
 ) -> Step:
     """Build the step map of a system, as compiled C code if there is a compiler.
 
+    Raises `ModelError` if the time step is not positive, or the force split or constraint force is unknown.
+
     Parameters
     ----------
     time_step : float
@@ -187,12 +189,8 @@ def compile_step(
     use_compiler : bool
         If False, or if the machine has no compiler (with one log message), the step is interpreted.
     tolerance : float, optional
-        Newton's tolerance on the coordinates [rad or m]; default: from the time step.
-
-    Raises
-    ------
-    ModelError
-        The time step is not positive, or the force split or constraint force is unknown."""
+        Correction of the coordinates at which Newton's method stops [rad or m]; default: from the time step.
+    """
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
     library = None
     if use_compiler:
@@ -244,7 +242,9 @@ def simulate(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> Rollout:
-    """Simulate a system over `steps` steps. Sensitivities are computed along `directions`, if given.
+    """Simulate a system over `steps` steps. Derivatives are computed along `directions`, if given.
+
+    Raises `ModelError` if an array has the wrong shape.
 
     Parameters
     ----------
@@ -261,12 +261,8 @@ def simulate(
     -------
     Rollout
         (q, p, z) at every node, shape (N + 1, nx), multipliers (N, m) [N s], efforts (N, nc) and torques (N, nu) [N m].
-        If Newton fails, `status` reports it, and the later entries are NaN.
-
-    Raises
-    ------
-    ModelError
-        An array has the wrong shape."""
+        If Newton's method fails, `status` reports it, and the later entries are NaN.
+    """
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return simulate_rollouts(step, [inputs])[0]
 
@@ -347,12 +343,12 @@ def moving_observable_state_mask(
     seen: BoolArray | None = None,
     disturbed: BoolArray | None = None,
 ) -> BoolArray:
-    """Mask of the states that move and affect other states, efforts or sensors, shape (nx,).
+    """Mask (nx,) of the states that move and affect other states, efforts or sensors.
 
-    Internal states of a neutral effect are excluded. Only the first and the last step of the rollout are examined.
+    Internal states of a neutral effect are thus excluded. Only the first and the last step of the rollout are examined.
     `loads` are extra excitations as in `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend
-    on directly. With `disturbed` (nx,), states with an error at the start, states that neither these
-    nor errors of torques reach are excluded too."""
+    on directly. `disturbed` (nx,) marks states with an initial error; if given, states are also excluded that neither
+    these errors nor torque errors reach."""
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))
     ends = [
@@ -385,13 +381,13 @@ def step_derivatives_along_rollout(
     loads: tuple[Array, Array] | None = None,
     chosen: slice = _ALL_STEPS,
 ) -> Iterator[tuple[Array, Array]]:
-    """Iterate over the derivatives of a rollout's steps, in blocks of k steps. Prescribed coordinates are held fixed.
+    """Yield the derivatives of a rollout's steps, in blocks of k steps. Prescribed coordinates are held fixed.
 
-    Yields two arrays per block: the derivatives of the next state, (k, nx, d), and those of the efforts at prescribed
-    coordinates and of the constraint forces, (k, nc + m, d). The d = nx + c + e columns are the state (including the
-    feedback, if given), the c torque directions `inputs` (N, nu, c) and e loads. `loads` are additions to the nt = n +
-    nz + m step equations, (nt, e), and to the next momentum, (n, e), the same in all steps. `chosen` is a range of
-    consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular."""
+    Each block has two arrays: the derivatives of the next state, (k, nx, d), and the derivatives of the efforts at
+    prescribed coordinates and of the constraint forces, (k, nc + m, d). The d = nx + c + e columns are the state
+    (including the feedback, if given), the c torque directions `inputs` (N, nu, c) and e loads. `loads` are additions
+    to the nt = n + nz + m step equations, (nt, e), and to the next momentum, (n, e), the same in all steps. `chosen` is
+    a range of consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular."""
     if loads is None:
         rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
         loads = np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0))

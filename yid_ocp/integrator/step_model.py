@@ -28,9 +28,11 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 
 @dataclass(frozen=True, eq=False)
 class StepModel:
-    """Equations, functions and index tables of one step, from which a kernel is built.
+    """Equations, functions and index tables of one time step, from which a kernel is built.
 
-    `sizes` holds n, nz, m, nu, nc, nx and ntheta; `time_step` is h [s]; `tolerance` is Newton's [rad or m]."""
+    `sizes` holds the numbers of coordinates (n), internal coordinates (nz), constraints (m), inputs (nu), prescribed
+    coordinates (nc), states (nx = 2 n + nz) and parameters (ntheta). `time_step` is in s. Newton's method stops at a
+    correction below `tolerance` [rad or m]."""
 
     system: System
     equations: DiscreteEquations
@@ -94,7 +96,7 @@ _INSTABILITY_HINT = (
 
 @dataclass(frozen=True)
 class RolloutStatus:
-    """Convergence of a rollout: status code, Newton's last correction [rad or m] and totals over all steps.
+    """Convergence of a rollout: status code, last correction of Newton's method [rad or m] and totals over all steps.
 
     `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
     the values after the last step."""
@@ -126,10 +128,10 @@ class RolloutStatus:
 
 @dataclass(frozen=True)
 class SensitivityDirections:
-    """The d directions in which a rollout is differentiated. The first directions are those of the named parameters.
+    """The d directions along which a rollout is differentiated. The first directions are those of the named parameters.
 
     The tangents are the derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path
-    (N + 1, nc, d) along the directions."""
+    (N + 1, nc, d) along these directions."""
 
     parameter_names: tuple[str, ...]
     initial_state_tangents: Array
@@ -149,7 +151,7 @@ class SensitivityDirections:
 
 @dataclass(frozen=True)
 class TrackingFeedback:
-    """Time-varying feedback of the tracking filter. The torque is u_k = ubar_k - K_k (x_k[index] - xbar_k).
+    """Feedback that keeps driven arms near their measured motion, u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     `state_indices` (nb,) selects entries of the state (q, p, z). `gain` (N, nu, nb) holds K_k [N m/rad for a
     coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries."""
@@ -161,11 +163,10 @@ class TrackingFeedback:
 
 @dataclass(frozen=True)
 class RolloutInputs:
-    """Inputs of one rollout, with feedback and directions of differentiation.
+    """Inputs of one rollout: parameters, initial state, torques, prescribed path, feedback, sensitivity directions.
 
-    `theta` has the shape (ntheta,), the initial state (q, p, z) the shape (nx,). The torque (N, nu) [N m] is the
-    nominal motor torque of every step. The prescribed path (N + 1, nc) holds the prescribed coordinates at every node.
-    """
+    Shapes: `theta` (ntheta,), initial state (q, p, z) (nx,), nominal motor torque of every step (N, nu) [N m], and
+    prescribed coordinates at every node (N + 1, nc) [rad or m]."""
 
     theta: Array
     initial_state: Array
@@ -181,8 +182,9 @@ class Rollout:
 
     `state` (N + 1, nx) holds (q, p, z) at every node, q in rad or m, p in N m s or N s. `multipliers` (N, m) are in N
     s. `effort` (N, nc) is the effort of prescribed coordinates at nodes 0..N-1 [N m], `torque` (N, nu) the applied
-    torque [N m]. The effort at node 0 is correct if p_0 contains the impulse of a previous step, as the p_0 of an
-    `Equilibrium` does. After p_0 = dL/dv it is half the effort, because it contains only half a step's impulse."""
+    torque [N m]. The effort at node 0 is correct if p_0 contains the impulse of a previous step, as the initial
+    momentum of an `Equilibrium` does. If p_0 is computed from the velocity v (p_0 = dL/dv), it contains only half a
+    step's impulse, and the effort at node 0 is only half."""
 
     state: Array
     multipliers: Array
@@ -202,8 +204,9 @@ CostDerivativesByRolloutVariables = tuple[Array, Array | None, Array | None]
 class RolloutCostGradient:
     """Gradient of a scalar cost along a rollout by the adjoint method. NaN if a step's equations are singular.
 
-    Derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the
-    prescribed coordinates at every node (N + 1, nc). Those at node 0 are also part of `by_initial_state`."""
+    It has the derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu)
+    and the prescribed coordinates at every node (N + 1, nc). The derivatives at node 0 are also part of
+    `by_initial_state`."""
 
     by_theta: Array
     by_initial_state: Array
@@ -216,8 +219,8 @@ class StepEquationLinearizations:
     """Residuals and Jacobians of the step equations along any trajectory, even one that does not satisfy them.
 
     Each step has nt = n + nz + m equations: momentum balance (n), internal (nz) and constraint (m). `p1` is the
-    momentum p_{k+1} (n) that follows from the other values. Derivatives are with respect to the new values (q_{k+1},
-    z_{k+1}, lam_k), the old values (q_k, z_k), the torque and the chosen parameters. The derivative of the balance with
+    momentum p_{k+1} (n) that follows from the other values. The Jacobians are with respect to the new values (q_{k+1},
+    z_{k+1}, lam_k), the old values (q_k, z_k), the torque and the chosen parameters. The Jacobian of the balance with
     respect to p_k is the identity."""
 
     residual: Array

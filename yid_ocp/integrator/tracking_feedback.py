@@ -26,10 +26,11 @@ _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors of equal weight in
 
 
 def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
-    """Make a proportional tracking feedback on the driven joints, u_k = ubar_k - K (q_k - qbar_k), with diagonal K.
+    """Make a feedback that keeps driven joints near their measured angles, u_k = ubar_k - K (q_k - qbar_k).
 
-    `measured` holds the joint angles qbar at every node, (N + 1, nu) [rad]. `gains` holds one gain, one per joint of an
-    arm, or nu gains [N m/rad]. Raises `ModelError` for another number of gains or a negative gain."""
+    K is diagonal. `measured` holds the joint angles qbar at every node, (N + 1, nu) [rad]. `gains` [N m/rad] holds one
+    gain, one for each joint of an arm, or nu gains. Raises `ModelError` for another number of gains or a negative gain.
+    """
     reference = np.asarray(measured, float)
     nu = step.sizes["nu"]
     values = np.atleast_1d(np.asarray(gains, float))
@@ -49,14 +50,15 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
 def lqr_tracking_feedback(
     step: Step, measured: ArrayLike, torque: ArrayLike, theta: ArrayLike, arms: Step | None = None
 ) -> TrackingFeedback:
-    """Compute a tracking feedback with finite-horizon LQR gains, linearised about the driven arms' measured motion.
+    """Compute a feedback with finite-horizon LQR gains that keeps the driven arms near their measured motion.
 
-    The cost is the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording, with fixed scales
-    for angle, rate and torque (Anderson and Moore 1990, Optimal Control: Linear Quadratic Methods, section 2.4). The
-    model is that of the arms without the object. The gains act on the arms' angles and momenta. The reference momentum
-    follows from the measured angles (N + 1, nu) [rad] and torques (N, nu) [N m] by the arms' DEL equations. It is
-    therefore comparable with the model's momentum. The angles must be smooth enough for numerical differentiation.
-    `arms` is the result of `compile_driven_arms_only_step`, compiled if absent."""
+    The gains act on the arms' angles and momenta. They minimise the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 +
+    |du|^2/torque^2 over the recording, with fixed scales for angle, rate and torque (Anderson and Moore 1990, Optimal
+    Control: Linear Quadratic Methods, section 2.4). The model is that of the arms without the object, linearised about
+    the measured motion. The reference momentum follows from the measured angles (N + 1, nu) [rad] and torques (N, nu)
+    [N m] by the arms' DEL equations, and is therefore comparable with the model's momentum. The angles must be smooth
+    enough for numerical differentiation. `arms` is the result of `compile_driven_arms_only_step`, compiled if absent.
+    """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arm_step = compile_driven_arms_only_step(step) if arms is None else arms
@@ -157,12 +159,12 @@ class JointMotionWithSensitivities:
 
 
 class EffectMomentumShift:
-    """Computes by how much effects change the momentum of the recorded motion.
+    """Computes the momentum that effects add to the recorded motion, so that the feedback does not oppose it.
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
-    effect such as an armature, or a torque other than the recorded one, changes the momentum of the motion. The
-    feedback would counteract this change: at a wrist, whose momentum gain times h/2 is near one, by half of the effect.
-    `parameter_names` are the effect parameters on which the momentum depends if the torques are known."""
+    effect such as an armature, or a torque other than the recorded torque, changes the momentum of the motion. Without
+    this shift the feedback would oppose it: at a wrist, whose momentum gain times h/2 is near one, by half of the
+    effect. `parameter_names` are the effect parameters on which the momentum depends if the torques are known."""
 
     def __init__(self, step: Step) -> None:
         e, system = step.equations, step.system
@@ -280,11 +282,11 @@ class EffectMomentumShift:
 
 
 def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative of the applied torque (recorded plus feedback) by an error of the recorded torque, (..., nu, nu).
+    """Derivative of the applied torque (recorded plus feedback) with respect to an error of the recorded torque.
 
-    The reference momenta of the feedback follow from the recorded torque. The error is assumed to be the same in this
-    step and the previous one. `gain` (..., nu, nb) is the feedback gain of the step. `by_torque` (nu, nu) is
-    `EffectMomentumShift.momentum_derivative_by_previous_torque`."""
+    The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
+    is assumed to be the same in this step and the previous one. `gain` (..., nu, nb) is the feedback gain of the step.
+    `by_torque` (nu, nu) is `EffectMomentumShift.momentum_derivative_by_previous_torque`."""
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
 

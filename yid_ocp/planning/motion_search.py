@@ -219,11 +219,11 @@ class TargetMotionSearch:
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> TargetMotionSearchResult:
-        """Optimise the spline coefficients of a motion. `start`, `lower` and `upper` have shape (K, nc).
+        """Optimise the spline coefficients of a motion, (K, nc): K coefficients for each of nc prescribed joints.
 
-        An augmented Lagrangian keeps the limits (Rockafellar 1973, doi:10.1007/BF01580138). An interior trust-region
-        method keeps the bounds (Branch, Coleman, Li 1999, doi:10.1137/S1064827595289108), with `iterations`
-        evaluations."""
+        The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
+        bounds `lower` and `upper` of the coefficients are enforced by an interior trust-region method (Branch, Coleman
+        and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations."""
         low, high = lower.ravel(), upper.ravel()
         x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
         pull = np.zeros((2, len(self._unit)))

@@ -60,7 +60,8 @@ class ParameterizedExperiment:
     ) -> ParameterizedExperiment:
         """Make a planned experiment from a plan's options, at parameter `values` and with the free parameters `names`.
 
-        Raises `ConfigError` if no joint moves or clamps follow points, `ModelError` without equilibrium."""
+        Raises `ConfigError` if there is no joint whose motion can be planned, or if the arms have servos. Raises
+        `ModelError` if no equilibrium is found."""
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_definitions_from_points or not (system.driven or system.prescribed):
             said, allowed = "the model has no joint whose motion could be planned", "a robot whose arms move"

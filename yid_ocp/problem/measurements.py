@@ -45,9 +45,10 @@ class TimeGrid:
 
 
 def recording_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
-    """Make a time grid over the span of the joint samples, or of the first point group without joints.
+    """Make a time grid over the time span of the joint samples or, in a recording without joints, of the first group.
 
-    Raises `DataError` if it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples."""
+    Raises `DataError` if the span is shorter than two steps, or has more than `_MAX_STEPS` steps or too many steps per
+    sample."""
     t = recording.all_groups[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
@@ -132,10 +133,10 @@ class SensorMeasurements:
 
     @cached_property
     def residual_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
-        """Matrix R^(-1/2) (nr, nr) that decorrelates normalised residuals. None if outputs are independent.
+        """Matrix R^(-1/2) (nr, nr) that decorrelates the nr normalised residuals. None if outputs are independent.
 
-        R is the noise correlation of one sample's outputs. The whitening is zero-phase (ZCA; Kessy, Lewin and Strimmer
-        2018, doi:10.1080/00031305.2016.1277159)."""
+        R is the correlation matrix of the noise; only outputs of one sample are correlated. The whitening is zero-phase
+        (ZCA; Kessy, Lewin and Strimmer 2018, doi:10.1080/00031305.2016.1277159)."""
         if self.noise_correlation is None:
             return None
         seen = self.positive_weight_mask

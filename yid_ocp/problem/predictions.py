@@ -209,9 +209,10 @@ def recording_from_prediction(
     seed: int | None = None,
     description: str = "",
 ) -> Recording:
-    """Convert an episode's prediction to a synthetic recording with its sensors' clocks and noise levels.
+    """Convert the prediction `outcome` of an episode to a recording with the sensors' clocks and noise levels.
 
-    `seed` generates the noise that the estimation assumes, including constant torque offsets; None gives no noise."""
+    `theta` are the parameter values of the prediction, which become `true_parameters`. With a `seed`, random noise is
+    added as the estimation assumes it, including constant torque offsets. Without a `seed` there is no noise."""
     rng = None if seed is None else np.random.default_rng(seed)
     system, source = predictor.system, episode.recording
     groups = []

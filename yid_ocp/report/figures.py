@@ -461,9 +461,10 @@ def _even(value: Any) -> Any:
 def candidate_ranking_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, promised: str
 ) -> Figure:
-    """Plot candidates ranked by refitted closure [%] with interval (None: unknown), and by predicted decrease.
+    """Plot each candidate's gap closure after a refit [%], with interval, and the decrease that screening predicts.
 
-    `closed` and `promised` are the titles of the two axes."""
+    `entries` maps each label to (closure, low, high), or None without a refit, and the decrease. `closed` and
+    `promised` are the titles of the two axes."""
     from plotly.subplots import make_subplots
 
     done = {name: closure for name, (closure, _) in entries.items() if closure}

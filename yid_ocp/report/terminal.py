@@ -36,7 +36,8 @@ _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 class SummaryStatement:
     """One sentence of a summary, with its importance.
 
-    A verdict answers the command's question; a conclusion summarises verdicts. A page shows conclusions first."""
+    The kind is `verdict` (answers the question of the command), `conclusion` (summarises several verdicts) or `note`. A
+    report shows conclusions first."""
 
     text: str
     kind: _StatementKind = "note"

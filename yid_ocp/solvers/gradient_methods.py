@@ -208,18 +208,19 @@ class SingleShooting(SolverWithCheckedSettings):
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
 class SteepestDescent(SolverWithCheckedSettings):
-    """Projected steepest descent with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
+    """Projected steepest descent with Armijo backtracking, x <- P(x - s g), on a cost with gradient g.
 
-    The gradient comes from the adjoint and is not scaled, as in the paper (Caldwell et al. 2014). The first trial step
-    s of an iteration is twice the last accepted one (`last`, as in the paper), or the Barzilai-Borwein step
-    (`spectral`). The latter needs far fewer iterations and a `nonmonotone_memory` of about 10, because its steps often
-    pay off later.
+    P projects onto the bounds. The gradient comes from the adjoint method and is not scaled, as in the paper (Caldwell
+    et al. 2014). The first trial step s of an iteration is twice the last accepted step (`last`, as in the paper), or
+    the Barzilai-Borwein step (`spectral`). The spectral step needs far fewer iterations, but may raise the cost for a
+    few of them (`nonmonotone_memory`: about 10).
 
     References
     ----------
     Armijo (1966), Pacific J. Math. 16:1, doi:10.2140/pjm.1966.16.1.
     Bertsekas (1976), IEEE Trans. Automatic Control 21(2):174, doi:10.1109/TAC.1976.1101194 (projection).
-    Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory)."""
+    Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory).
+    """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 200
     gradient_tolerance: Annotated[

@@ -150,14 +150,13 @@ def _resting(
 
 
 def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array) -> Array:
-    """Initial unknown vector (nx,) with every free effect slightly active.
+    """Return an initial unknown vector (nx,) in which the free effects of zero amplitude have a small amplitude.
 
-    At an effect's neutral amplitude, its shape parameters (where a spring is relaxed, how fast a branch creeps) change
-    no measurement, and the derivative by the amplitude depends on their initial values. A wrong shape can keep the
-    amplitude at its bound. Each free, initially neutral effect is therefore tried with several shapes. The linear model
-    at the best shape gives the amplitude, within the expected range. An effect without shape parameters stays neutral,
-    unless its amplitude is unobservable there. Returns `x` if no free effect is neutral or no other start can be rolled
-    out."""
+    At zero amplitude, an effect's shape parameters (rest angle of a spring, relaxation time) have no influence and
+    cannot be estimated, and a poor shape can drive the amplitude to its bound. Several shapes are therefore tried for
+    each such effect. The best shape starts with the amplitude that the linearised model predicts, clipped to the
+    expected range. An effect without shape parameters keeps its zero amplitude, unless the residual's derivative is
+    zero there. Returns `x` unchanged if no effect was changed or if no changed start can be rolled out."""
     place = {name: i for i, name in enumerate(problem.unknown_names)}
     for effect in problem.system.effects:
         if not isinstance(effect, EffectBase):

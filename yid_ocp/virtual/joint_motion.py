@@ -190,8 +190,8 @@ def grasping_joint_angles(
     """Find arm joint angles at which every gripper meets the end of the undeformed object, or a point near it.
 
     Returns the angles [rad or m], in configuration order, of all driven joints and of all non-elastic joints that carry
-    a grasp's holder. Only positions are matched, and the solution nearest to the start is taken. Raises `ModelError` if
-    the grasped points cannot be reached within the joint limits.
+    a gripper. Only positions are matched. Of several solutions the one nearest to the start is taken. Raises
+    `ModelError` if the grasped points cannot be reached within the joint limits.
 
     Parameters
     ----------
@@ -201,8 +201,9 @@ def grasping_joint_angles(
         Start of the search by joint [rad or m]. Default: elbow up for Baxter, else the middle of the joint's range, or
         zero if the joint is unlimited.
     offsets : mapping of grasp to array_like, shape (3,), optional
-        Position of each gripper relative to the undeformed tube end, in the world [m]. Two arms that hold a straight Y
-        are fully stretched, a singular posture; offsets towards each other make the start well defined."""
+        Position of each gripper relative to the undeformed tube end, in the world [m]. Two arms that hold the
+        undeformed Y are fully stretched, which is a singular posture; offsets that bring the grippers closer avoid it.
+    """
     tree = system.numeric_mechanism(values)
     value = ParameterEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})

@@ -256,10 +256,11 @@ def calibrate_camera(
     clock: CameraClockOptions,
     source: str = "sequence",
 ) -> CameraCalibration:
-    """Estimate a camera's pose, depth and clock from frames that show the arm, starting at a pose (4, 4).
+    """Estimate the pose, depth error and clock offset of a depth camera from frames that show the robot's arm.
 
-    `glimpses` are thinned frames that include the robot and its surroundings; `source` names their origin in messages.
-    Raises `DataError` if the arm is not in view, does not match the clouds, or moves too little."""
+    `glimpses` is a subset of the frames, with thinned point clouds of the robot and its surroundings. The search starts
+    at the pose `pose` (4, 4). `source` names the data in error messages. Raises `DataError` if the arm is not in view,
+    does not match the clouds, or moves too little to determine the clock."""
     about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
     told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:

@@ -104,10 +104,10 @@ class ShapeFitOptions:
 
 
 class ShapeFitter:
-    """Fits an object's configuration to camera points. Parameters default to their nominal values.
+    """Fits the bending angles of a flexible object to camera points. Parameters default to nominal values.
 
-    The `loose` joints are fitted with the bends and nearly without prior (`initial_shapes.system_with_free_root`).
-    Raises `DataError` if the system has no object."""
+    The joints in `loose`, such as a free root (`initial_shapes.system_with_free_root`), are fitted too, with an almost
+    flat prior. Raises `DataError` if the system has no object."""
 
     def __init__(
         self,

@@ -330,8 +330,8 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
 def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
     """Load meshes missing from the URDF, by joint index (-1: the world).
 
-    Raises `ConfigError` if a link does not exist or an entry has not one shape, `ModelError` if a file is
-    unreadable."""
+    Raises `ConfigError` if a link does not exist or an entry does not define exactly one shape, and `ModelError` if a
+    file is unreadable."""
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
         where = f"model: extra_meshes: {number}"

@@ -149,9 +149,9 @@ class _Contents:
 class BagOptions(base.SelectionAndUnitOptions):
     """Options of `read_bag`: topics, joints and points, with their names in the recording, and units.
 
-    `joints` is required if the messages of a topic differ in their joints; messages that lack one are skipped. `points`
-    are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`. By default they are all topics of points, poses and
-    transforms except `/tf`, each under the last descriptive part of its name."""
+    Messages that lack one of the `joints` are skipped. `joints` is required if the messages of a topic differ in their
+    joints. `points` are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`. By default they are all topics of
+    points, poses and transforms except `/tf`, each under the last descriptive part of its name."""
 
     joint_topics: Sequence[str] | None = None  # topics of the joint states; all that there are when absent
     # topic of joint states whose positions are commands: `position_command`, held until the next command

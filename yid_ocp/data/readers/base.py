@@ -140,8 +140,8 @@ class SelectionAndUnitOptions:
 def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
     """Convert the recording `raw` to SI units, select joints and points, and validate the result.
 
-    Raises `DataError` for an unknown joint, point, quantity or unit, or a current without torque constants, and the
-    errors of `validated_recording`."""
+    Raises `DataError` for an unknown joint, point, quantity or unit, for a current without torque constants, or if
+    `validated_recording` refuses the result."""
     factors = _factors(options.units or {}, where)
     group = raw.joints
     if group is not None:
@@ -270,8 +270,8 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
-    its periods there. Raises `DataError` if two sources share a joint, if their channels differ, or if they share no
-    time."""
+    its periods around it. Raises `DataError` if two sources share a joint, if their channels differ, or if they share
+    no time."""
     if len(groups) == 1:
         return groups[0][1], ()
     _check_separate(groups, where)

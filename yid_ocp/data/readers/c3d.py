@@ -44,14 +44,15 @@ def read_c3d(
     frame: str = "world",
     description: str = "",
 ) -> Recording:
-    """Read the markers of a C3D file as one point group `points`. Its nominal clock starts at zero.
+    """Read the markers of a C3D file as one point group `points`.
 
-    The file states rate and unit; `units` overrides the unit. A marker that was not seen in a frame (residual -1, NaN,
-    or exactly the origin) is NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `points`
-    maps the markers to keep to their names; by default all labelled markers that were ever seen are kept. `notes` lists
-    omitted content: unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels.
-    Raises `DataError` if `ezc3d` is not installed, if the file cannot be read or has no markers, and the errors of
-    `validated_recording`."""
+    C3D has no time stamps: the times are frame index / rate from zero, a `nominal` clock. The file states rate and
+    unit; `units` overrides the unit. A marker that was not seen in a frame (residual -1, NaN, or exactly the origin) is
+    NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `points` maps the markers to keep
+    to their names; by default all labelled markers that were ever seen are kept. `notes` lists omitted content:
+    unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels. Raises
+    `DataError` if `ezc3d` is not installed, if the file cannot be read or has no markers, or if `validated_recording`
+    refuses the result."""
     path = Path(path)
     digest = file_sha256(path)
     found = _markers(path)

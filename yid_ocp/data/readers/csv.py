@@ -49,8 +49,9 @@ _LISTED = 5  # numbers of bad lines in a note
 class CsvOptions(base.SelectionAndUnitOptions):
     """Options of `read_csv`: meaning of columns, columns to keep, delimiter, header and clock.
 
-    `columns` gives the meaning of columns whose names do not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
-    column name matches any text, which replaces a `*` in the meaning: `*_pos` with `position:*`."""
+    `columns` gives the meaning of columns that `read_csv` does not recognise by name: `t`, `channel:joint`,
+    `axis:point`, or `skip`. A `*` in a column name matches any text and is replaced by this text in the meaning:
+    `*_pos` with `position:*`."""
 
     columns: Mapping[str, str] | None = None
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on

@@ -72,11 +72,11 @@ def read_lerobot_episode(
 
     `observation.state` is the measured position of the joints. If the names of its entries end in `.pos`, `.vel` and
     `.torque`, `.effort` or `.current`, it is position, velocity and effort. `action` is the commanded position. Times
-    are frame index / frame rate, a nominal clock. Angles that cannot be radians, or of robots that LeRobot never
-    records in radians, are refused unless `units` states their unit (often degrees). `notes` lists images and other
-    features. The other options are those of `SelectionAndUnitOptions`; `joints` can omit a gripper that is not in the
-    model. Raises `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode,
-    and the errors of `validated_recording`."""
+    are frame index / frame rate, a nominal clock. `units` must state the unit of angles (often degrees) if they cannot
+    be radians, or if LeRobot never records this robot in radians. `notes` lists images and other features. The other
+    options are those of `SelectionAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
+    `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode, or if
+    `validated_recording` refuses the result."""
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
     names, channels, left = _channels(dataset, table)

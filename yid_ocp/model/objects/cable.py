@@ -133,11 +133,12 @@ def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[st
 def clamped_cable_system(
     lengths: Mapping[tuple[str, str], float], cable: CableTopology, options: CableOptions | None = None
 ) -> System:
-    """Build the system of a cable held by two clamps from the lengths of all its edges [m].
+    """Build the model of a cable that two clamps hold. `lengths` gives the length [m] of each edge (vertex, vertex).
 
-    The twelve coordinates of `clamp_start` and `clamp_end` are prescribed. Frames are all vertices, `junction_CHILD`
-    and `last_edge`. Parameters are those of each segment (`parent.bend`, ...), `clamp_start.length`, `clamp_start.roll`
-    and, for a weld, `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent."""
+    The six coordinates of each clamp, `clamp_start` and `clamp_end`, are prescribed. Frames are all vertices,
+    `junction_CHILD` and `last_edge`. Parameters are those of each segment (`parent.bend`, ...), the length of the first
+    edge `clamp_start.length` [m], its roll angle `clamp_start.roll` [rad] and, if the end clamp is a weld, the roll of
+    the last edge `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent."""
     options = options or CableOptions()
     item = flexible_object(_segments(cable, lengths, options), name="cable")
     if options.has_rest_angle_parameters:

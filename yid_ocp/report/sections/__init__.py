@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Input data of a report: `result` as in result.json, and problem, solution and further objects of a run.
+    """Input data of a report: `result` (content of result.json) and, if available, problem, solution and other objects.
 
     `animations` replaces the animations made from `problem`, `solution` and `held_out`. `section_data` holds other data
-    for the sections of a command. `robot` is the URDF file of the arms' meshes."""
+    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn."""
 
     name: str
     description: str
