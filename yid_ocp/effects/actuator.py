@@ -83,7 +83,7 @@ class _DistortedReading(EffectBase):
 
 
 @EFFECTS.register("encoder_offset")
-class EncoderOffset(_DistortedReading):
+class _EncoderOffset(_DistortedReading):
     """Constant offset of the measured angle. Prescribed path, initial state and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
@@ -98,7 +98,7 @@ class EncoderOffset(_DistortedReading):
 
 
 @EFFECTS.register("series_elasticity")
-class SeriesElasticity(_DistortedReading):
+class _SeriesElasticity(_DistortedReading):
     """Elastic gear with the encoder on the motor side. The measured angle is q + effort/stiffness."""
 
     equation = "measured angle = q + effort/stiffness"
@@ -200,7 +200,7 @@ class _EffortGain(_DistortedEffort):
 
 
 @EFFECTS.register("effort_offset")
-class EffortOffset(_DistortedEffort):
+class _EffortOffset(_DistortedEffort):
     """Constant offset of a joint's recorded effort."""
 
     equation = "measured effort = true + offset"
@@ -229,7 +229,7 @@ class _LateTorque(EffectBase):
 
 
 @EFFECTS.register("effort_delay")
-class EffortDelay(_LateTorque):
+class _EffortDelay(_LateTorque):
     """Delay of a joint's torque: the torque that acts at time t was recorded at t - delay.
 
     At a prescribed arm, the effort recorded at t belongs to the motion at t + delay. A negative delay means that the
@@ -246,7 +246,7 @@ class EffortDelay(_LateTorque):
 
 
 @EFFECTS.register("effort_lag")
-class EffortLag(_LateTorque):
+class _EffortLag(_LateTorque):
     """First-order lag of a joint's torque z behind its command: time_constant dz/dt = command - z.
 
     At a driven joint, the recorded torque is the command and the applied torque lags behind it. At a prescribed joint,
@@ -283,7 +283,7 @@ class _ServoChange(EffectBase):
 
 
 @EFFECTS.register("servo_gain")
-class ServoGain(_ServoChange):
+class _ServoGain(_ServoChange):
     """Scale factor on a servo's requested torque, for a gain, supply voltage or motor other than in the model."""
 
     equation = "demand = scale (gain (u - q) - damping v)"
@@ -298,7 +298,7 @@ class ServoGain(_ServoChange):
 
 
 @EFFECTS.register("supply_voltage")
-class SupplyVoltage(_ServoChange):
+class _SupplyVoltage(_ServoChange):
     """Scale factor on a DC motor's supply voltage. It scales the torque per duty cycle and the torque limit."""
 
     equation = "torque = clip(scale gain (u - q), scale limit) - damping v"
@@ -329,7 +329,7 @@ class _BackEmf(_ServoChange):
 
 
 @EFFECTS.register("current_limit")
-class CurrentLimit(_ServoChange):
+class _CurrentLimit(_ServoChange):
     """Current limit of a DC motor, where current = motor torque / published torque constant kt.
 
     Unlike the duty limit, it also limits braking torque. The internal parameter is limit^-16, so that its neutral value
@@ -348,7 +348,7 @@ class CurrentLimit(_ServoChange):
 
 
 @EFFECTS.register("servo_delay")
-class ServoDelay(_ServoChange):
+class _ServoDelay(_ServoChange):
     """Delay of a servo's commands, added to its nominal delay."""
 
     equation = "the command that acts at t was given at t - servo_delay - delay"
@@ -362,7 +362,7 @@ class ServoDelay(_ServoChange):
 
 
 @EFFECTS.register("servo_saturation")
-class ServoSaturation(_ServoChange):
+class _ServoSaturation(_ServoChange):
     """Additional smooth torque limit of a servo, with torque = demand / (1 + |demand/limit|^16)^(1/16).
 
     The internal parameter is limit^-16. Its neutral value zero means that there is no additional limit, and its

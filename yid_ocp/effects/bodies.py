@@ -60,7 +60,7 @@ class _ScaledBodies(EffectBase):
 
 
 @EFFECTS.register("density")
-class Density(_ScaledBodies):
+class _Density(_ScaledBodies):
     """Scale factor on all masses and inertias of a segment."""
 
     equation = "masses and inertias times scale"
@@ -114,7 +114,7 @@ def _tips_and_link_ends(system: System) -> tuple[str, ...]:
 
 
 @EFFECTS.register("point_mass")
-class PointMass(EffectBase):
+class _PointMass(EffectBase):
     """Point mass fixed to a frame. It adds the energies T += 1/2 mass |v|^2 and V += -mass g.x."""
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
@@ -252,7 +252,7 @@ def _segments_with_length(system: System) -> tuple[str, ...]:
 
 
 @EFFECTS.register("length_scale")
-class LengthScale(EffectBase):
+class _LengthScale(EffectBase):
     """Scale factor on the link lengths of a segment. Its mass is unchanged."""
 
     equation = "link lengths times scale"
@@ -266,7 +266,7 @@ class LengthScale(EffectBase):
 
 
 @EFFECTS.register("rotor_inertia")
-class RotorInertia(EffectBase):
+class _RotorInertia(EffectBase):
     """Rotor inertia of a motor, reflected to its joint. It adds the kinetic energy 1/2 armature v^2."""
 
     equation = "T += 1/2 armature v^2"
@@ -284,7 +284,7 @@ class RotorInertia(EffectBase):
 
 
 @EFFECTS.register("aerodynamic_drag")
-class AerodynamicDrag(EffectBase):
+class _AerodynamicDrag(EffectBase):
     """Quadratic air drag on a segment's links, F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
     v_n is the velocity of a link's centre (with Jacobian J_c) normal to the link; |v_n| is smoothed below
@@ -325,7 +325,7 @@ def _world(system: System) -> tuple[str, ...]:
 
 
 @EFFECTS.register("gravity_scale")
-class GravityScale(EffectBase):
+class _GravityScale(EffectBase):
     """Additional weight of the object as a fraction of its full weight. Its inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
@@ -346,7 +346,7 @@ class GravityScale(EffectBase):
 
 
 @EFFECTS.register("gravity_tilt")
-class GravityTilt(EffectBase):
+class _GravityTilt(EffectBase):
     """Rotation of gravity by rx about the world's x axis, then by ry about its y axis."""
 
     equation = "g = Ry(ry) Rx(rx) g_0"
