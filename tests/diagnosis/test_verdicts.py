@@ -127,7 +127,7 @@ def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench,
     assert (finding.verdict, finding.stated_and_finer_time_step) == (verdict, steps)
     told = finding.to_dict()
     assert told["gap"]["finer_time_step"] == (steps and steps[1])
-    assert ("Steps of 0.04 s made a gap of their own" in told["summary"]) is (steps is not None)
+    assert ("The discretisation error of 0.04 s steps looks like a gap" in told["summary"]) is (steps is not None)
     assert ("the nominal model at 0.02 s" in names) is (steps is not None)
 
 

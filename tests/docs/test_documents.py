@@ -115,7 +115,7 @@ def test_names_in_the_pages_exist(repository):
 
 def test_the_page_of_checks_lists_every_issue_with_its_description(page):
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", page("data_checks"), re.MULTILINE)
-    assert dict(rows[3:]) == dict(ISSUE_CAUSE_DESCRIPTIONS)  # behind the three weights
+    assert dict(rows[3:]) == dict(ISSUE_CAUSE_DESCRIPTIONS)  # behind the three severities
 
 
 def test_the_tutorial_runs(page, run_script, repository, shipped_optimization):

@@ -336,7 +336,7 @@ ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = {
     "clock_offset": "the clock of one group is late or early",
     "clock_drift": "the clocks of two groups run apart",
     "clock_jump": "the clock jumps",
-    "gap": "a gap in the data that drive the model",
+    "gap": "samples are missing in the data that drive the model",
     "dropped_samples": "many samples are missing",
     "few_samples": "too few samples",
     "standstill": "nothing moves",

@@ -110,8 +110,8 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
     text = [_gap(finding)]
     if finding.stated_and_finer_time_step is not None:
         stated, used = (f"{step:.4g}" for step in finding.stated_and_finer_time_step)
-        remedy = f"set problem.time_step: {used} for other commands"
-        text.append(f"Steps of {stated} s made a gap of their own: all of this is about steps of {used} s ({remedy}).")
+        used = f"this result is for {used} s (set problem.time_step: {used} for other commands)"
+        text.append(f"The discretisation error of {stated} s steps looks like a gap: {used}.")
     if finding.verdict not in ("insufficient_data", "no_gap"):
         text.append(_places(finding))
     if finding.accepted_effects:
