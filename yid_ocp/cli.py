@@ -369,7 +369,11 @@ class _Parser(argparse.ArgumentParser):
             noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
             details = unknown_name_error_arguments(chosen[2], known, self._help())
             raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
-        raise ConfigError(message, where=self.prog, allowed=self.format_usage().strip(), hint=self._help())
+        where, allowed = self.prog, "the arguments that --help lists"
+        if wrong := re.fullmatch(r"argument (\S+): invalid (\w+) value: (.*)", message, re.DOTALL):
+            message, where = f"{wrong[3]} is not allowed", f"{self.prog} {wrong[1]}"
+            allowed = {"int": "a whole number", "float": "a number"}[wrong[2]]
+        raise ConfigError(message, where=where, allowed=allowed, hint=self._help())
 
     def _help(self) -> str:
         return f"see {self.prog} --help"
@@ -535,7 +539,7 @@ def _failed(error: Exception, as_json: bool) -> int:
         return _wrong(OutputError(what, where=str(error.filename or ""), allowed=allowed, hint=hint), as_json)
     if isinstance(error, ValueError) and "embedded null" in str(error):  # what Python says of a NUL in a path
         what, allowed = "a path has a null character", "paths without null characters"
-        return _wrong(ConfigError(what, allowed=allowed, hint="correct the path"), as_json)
+        return _wrong(ConfigError(what, where="command line", allowed=allowed, hint="correct the path"), as_json)
     if isinstance(error, MemoryError):
         what, hint = f"there is not enough memory: {error}", "shorten the run, or use fewer links or workers"
         allowed = "a run that fits into the free memory"

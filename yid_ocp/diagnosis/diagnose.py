@@ -568,10 +568,12 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
     residuals, slopes = [], []
     for i, (episode, result) in enumerate(problem.predict_held_out(problem.vector(fit.values), True)):
         if isinstance(result, str):
-            what = f"the held-out recording cannot be predicted: {result}"
-            raise DataError(
-                what, where=f"recording '{episode.name}'", hint="hold out a recording that the nominal model can follow"
+            what, allowed = (
+                f"the held-out recording cannot be predicted: {result}",
+                "recordings that the model can follow",
             )
+            hint = "hold out another recording"
+            raise DataError(what, where=f"recording '{episode.name}'", allowed=allowed, hint=hint)
         rows = problem.whitened_held_out_prediction_residual(i, episode, result)
         assert rows.jacobian is not None
         residuals.append(rows.residual)

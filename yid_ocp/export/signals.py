@@ -76,7 +76,11 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
             with atomic_write(path) as temporary:
                 os.replace(file, temporary)
     except OSError as error:
-        raise OutputError(f"the file cannot be written: {os_error_reason(error)}", where=str(path)) from error
+        what, hint = (
+            f"the file cannot be written: {os_error_reason(error)}",
+            "choose another folder, or free space",
+        )
+        raise OutputError(what, where=str(path), hint=hint) from error
     return shift
 
 

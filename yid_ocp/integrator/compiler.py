@@ -65,7 +65,7 @@ def _compiler_path() -> str | None:
         what, where = f"there is no compiler '{wanted}'", "the environment variable CC"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
-        _LOG.warning("no C compiler: everything works without compiled code, about ten times slower")
+        _LOG.warning("no C compiler was found: all computations run without compiled code, about ten times slower")
     return path
 
 
@@ -217,7 +217,7 @@ def _kept(folder: Path, key: str) -> Path | None:
             own = stat.S_ISREG(info.st_mode) and _is_mine_alone(info)
             if own and path.stem.partition("-")[2] == file_sha256(path)[:32] and _is_ours(path):
                 return path
-        _LOG.warning("compiled code in the cache is damaged or not your own, and is made again: %s", path)
+        _LOG.warning("compiled code in the cache is damaged or of another user, and is compiled again: %s", path)
         with contextlib.suppress(OSError):
             path.unlink()
     return None

@@ -33,7 +33,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     Plotly's script is embedded, so the page works alone and offline, unless `write_shared_plotly_script` left a copy in
     the page's folder or up to two levels above. Without the extra `report`, a warning is logged and no page written."""
     if not _installed():
-        log.warning("no report: install it with  pip install 'yid-ocp[report]'")
+        log.warning("no report is written, because jinja2 is not installed: pip install 'yid-ocp[report]'")
         return False
     import jinja2
 

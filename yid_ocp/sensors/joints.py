@@ -251,7 +251,7 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
     order = NOISE_DIFFERENCE_ORDER
     if len(values) <= order:
         what, allowed = f"{len(values)} samples are too few to estimate the noise of {group}", f"more than {order}"
-        raise DataError(what, where=where, allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
+        raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
     mean_square = np.mean(np.diff(values, order, axis=0) ** 2, axis=0)
     return np.asarray(np.sqrt(mean_square / scipy.special.comb(2 * order, order)))
 

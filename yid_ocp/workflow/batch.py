@@ -126,7 +126,7 @@ def run_batch(
                 file_sha256(path)
         except YidError as error:
             results[member.name] = TaskResult(member.name, error=f"{type(error).__name__}: {error}")
-            log.warning("%s cannot begin: %s", member.name, error.what)
+            log.warning("%s cannot start: %s", member.name, error.what)
             continue
         own = {"name": member.name, "config": member.config_file, "settings": list(member.overrides)}
         more = {"inputs": inputs, "command": command, "folder": str(folder / _RUNS_FOLDER)}

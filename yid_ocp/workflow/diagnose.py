@@ -314,7 +314,7 @@ class _SingleJsonFileRefitStore:
                 write_strict_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
-                    log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)
+                    log.warning("finished refits cannot be stored (%s); the diagnosis continues", error)
                 self._warned = True
 
     def delete_file(self) -> None:

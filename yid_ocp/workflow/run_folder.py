@@ -181,7 +181,7 @@ def _publish(folder: RunFolder, lock: FileLock) -> None:
                 raise OutputError(what, where=str(target), hint=hint) from error
             target = folder.final_path.with_name(f"{folder.final_path.name}-{number}")
     if target != folder.final_path:
-        log.warning("%s was taken while the run went on: its folder is %s", folder.final_path, target)
+        log.warning("another run created %s in the meantime; the results are in %s", folder.final_path, target)
     folder.path = target
 
 
