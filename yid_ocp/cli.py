@@ -279,8 +279,7 @@ def _print_completion_script(arguments: argparse.Namespace) -> int:
     try:
         print(import_module("argcomplete").shellcode(["yid-ocp"], shell=arguments.shell).strip())
     except ImportError as error:
-        what = "completion needs the package argcomplete"
-        raise missing_package_error(ConfigError, what, "completion") from error
+        raise missing_package_error(ConfigError, "completion needs the package argcomplete", "completion") from error
     return 0
 
 

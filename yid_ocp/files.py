@@ -113,8 +113,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     Raises `OutputError` if the folder is missing or the file cannot be written."""
     if path.is_dir() or not path.parent.is_dir():
-        what = "the folder to write to does not exist"
-        allowed = "a file in an existing folder"
+        what, allowed = "the folder to write to does not exist", "a file in an existing folder"
         hint = "make the folder first"
         if path.is_dir():
             what, allowed, hint = "this path is a folder", "the name of a file", f"write {path / 'NAME'}{path.suffix}"
@@ -126,9 +125,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
-        hint = "choose another folder, or free disk space"
         what = f"the file cannot be written ({os_error_reason(error)})"
-        raise OutputError(what, where=str(path), hint=hint) from error
+        raise OutputError(what, where=str(path), hint="choose another folder, or free disk space") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -110,8 +110,7 @@ class RecordedExperiment:
         if isinstance(said, float):
             return np.full(group.position.shape, said)
         if group.std is None:
-            where = f"sensors.{group.name}.std"
-            raise missing_noise_level_error(f"group '{group.name}'", where, group.name, "m")
+            raise missing_noise_level_error(f"group '{group.name}'", f"sensors.{group.name}.std", group.name, "m")
         return group.std
 
 

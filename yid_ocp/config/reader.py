@@ -78,8 +78,7 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
     if data is None:
         data = CommentedMap()
     if not isinstance(data, CommentedMap):
-        hint = "start with the file that `yid-ocp init` writes"
-        allowed = "a mapping with sections such as `model:`"
+        hint, allowed = "start with the file that `yid-ocp init` writes", "a mapping with sections such as `model:`"
         raise ConfigError("the file does not hold keys and values", where=origin, allowed=allowed, hint=hint)
     places: dict[_KeyPath, str] = {}
     return _unwrap(data, (), places, origin), places
@@ -137,8 +136,7 @@ def _loaded(text: str, origin: str) -> Any:
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
     """Plain Python values instead of the YAML reader's types. Their lines are stored in `places`."""
     if len(path) > _MAX_DEPTH:
-        allowed = "aliases of other entries"
-        hint = "replace the aliases by their content"
+        allowed, hint = "aliases of other entries", "replace the aliases by their content"
         raise ConfigError("an alias refers to itself", where=origin, allowed=allowed, hint=hint)
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
@@ -275,8 +273,7 @@ class _Reader:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
             keys = list(sections.variant_options(sections.default_variant))
-            what = f"{self._name(path)} = {_shown(raw)} is not a section"
-            hint = _key_meant(self._name(path), keys)
+            what, hint = f"{self._name(path)} = {_shown(raw)} is not a section", _key_meant(self._name(path), keys)
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.selected_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:
@@ -293,9 +290,8 @@ class _Reader:
             if name in raw:
                 values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
             elif option.default_value is MISSING:
-                what = f"the key '{name}' is missing"
                 allowed, hint = options.describe_type(option.type_hint), f"add {'.'.join(map(str, (*path, name)))}"
-                raise ConfigError(what, where=self.where(path), allowed=allowed, hint=hint)
+                raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=allowed, hint=hint)
         return kind(**values)
 
     def _leaf(self, hint: Any, raw: Any, path: _KeyPath) -> Any:

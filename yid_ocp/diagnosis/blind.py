@@ -237,9 +237,8 @@ class BlindCaseGenerator:
         self.conditions = replace(conditions or SyntheticMeasurementConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
-            what, where = "MuJoCo can represent none of the candidates", "diagnosis.candidates"
-            hint = "add one of the allowed kinds"
-            raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_EFFECT_KINDS), hint=hint)
+            what, hint = "MuJoCo can represent none of the candidates", "add one of the allowed kinds"
+            raise ConfigError(what, where="diagnosis.candidates", allowed=", ".join(INJECTABLE_EFFECT_KINDS), hint=hint)
 
     def _rng(self, *path: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, ALLOWED_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
@@ -349,9 +348,8 @@ class BlindCaseGenerator:
             left_out = (injected[0].kind,) if wanted.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, wanted.category, injected, multiple, truth, wanted.experiment)
             return BlindCase(name, tuple(estimate), held_out, left_out), label
-        what, where = f"none of {MAX_CASE_DRAWS} motions can be simulated", f"{name} of {wanted.experiment}"
-        allowed = "a motion that MuJoCo can simulate"
-        hint = "use another --seed: one seed always draws the same motions"
+        what, allowed = f"none of {MAX_CASE_DRAWS} motions can be simulated", "a motion that MuJoCo can simulate"
+        where, hint = f"{name} of {wanted.experiment}", "use another --seed: one seed always draws the same motions"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:

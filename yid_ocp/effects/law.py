@@ -225,10 +225,8 @@ def make_law(location: str, system: System, tables: Sequence[LawTable], torque_s
     definitions, entries = [], []
     for table in tables:
         if table.quantity not in possible:
-            allowed = ", ".join(possible)
-            what = f"a law at {location} cannot depend on '{table.quantity}'"
-            hint = "set depends_on to an allowed quantity"
-            raise ConfigError(what, where=label, allowed=allowed, hint=hint)
+            allowed, what = ", ".join(possible), f"a law at {location} cannot depend on '{table.quantity}'"
+            raise ConfigError(what, where=label, allowed=allowed, hint="set depends_on to an allowed quantity")
         for k, (at, torque) in enumerate(zip(table.knots, table.torque, strict=True)):
             said = f"torque at {at:.4g} {LAW_QUANTITY_UNITS[table.quantity]}"
             name, size = f"{table.quantity}{k}", min(torque_scale, 1e6)
@@ -269,9 +267,8 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
         knots, torque, std = np.array(rows[quantity]).T
         gaps = np.diff(knots)
         if len(knots) < 4 or np.any(gaps <= 0) or np.ptp(gaps) > _SPACING_RTOL * float(np.mean(gaps)):
-            what, allowed = f"the knots of {quantity} are not a grid", "four or more evenly spaced, increasing numbers"
-            hint = "interpolate the table at evenly spaced values"
-            raise DataError(what, where=str(path), allowed=allowed, hint=hint)
+            what, hint = f"the knots of {quantity} are not a grid", "interpolate the table at evenly spaced values"
+            raise DataError(what, where=str(path), allowed="four or more evenly spaced, increasing numbers", hint=hint)
         tables.append(LawTable(quantity, knots, torque, std))
     return tuple(tables)
 

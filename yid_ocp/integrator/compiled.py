@@ -309,8 +309,7 @@ def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]
     library = compiler.compile_and_load_library(told, source)
     if library is None:
         what, where = "the C compiler failed for the derivatives by parameters", "the environment variable CC"
-        allowed, hint = "a C compiler, or CC=none for no compiled code", "set CC=none"
-        raise ModelError(what, where=where, allowed=allowed, hint=hint)
+        raise ModelError(what, where=where, allowed="a C compiler, or CC=none for no compiled code", hint="set CC=none")
     function = ca.external("by_theta", library._name)
     sizes = model.sizes
     rows = (sizes["n"] + sizes["nz"] + sizes["m"], sizes["n"], sizes["nc"])

@@ -38,10 +38,8 @@ class Parameter:
                 ("below its lower", self.lower) if self.value < self.lower else ("above its upper", self.upper)
             )
             what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
-            where = f"parameter {self.name}"
-            allowed = f"{self.lower:g} to {self.upper:g} {self.unit}"
-            hint = "change the value, or widen the bounds under `parameters`"
-            raise ConfigError(what, where=where, allowed=allowed, hint=hint)
+            where, hint = f"parameter {self.name}", "change the value, or widen the bounds under `parameters`"
+            raise ConfigError(what, where=where, allowed=f"{self.lower:g} to {self.upper:g} {self.unit}", hint=hint)
 
 
 class Parameters(ReprMixin):

@@ -119,8 +119,7 @@ class MotorOptions:
         if self.preset is not None and self.kind != "dc":
             what = f"the motor has kind: {self.kind} and the preset '{self.preset}'"
             hint = "set model.arms.servo.motor.kind: dc, or leave the preset out"
-            where = "model.arms.servo.motor.preset"
-            raise ConfigError(what, where=where, allowed="preset with kind: dc", hint=hint)
+            raise ConfigError(what, where="model.arms.servo.motor.preset", allowed="preset with kind: dc", hint=hint)
 
 
 @dataclass(frozen=True)

@@ -56,9 +56,8 @@ def _example_robot_urdf(robot: str) -> Path:
     roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
     folder = next((root for root in roots if root.is_dir()), None)
     if folder is None:
-        what, allowed = "the package example-robot-data is not installed", "package:NAME if it is installed"
-        hint = "pip install example-robot-data"
-        raise ModelError(what, where=f"package:{robot}", allowed=allowed, hint=hint)
+        what, hint = "the package example-robot-data is not installed", "pip install example-robot-data"
+        raise ModelError(what, where=f"package:{robot}", allowed="package:NAME if it is installed", hint=hint)
     files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.urdf"))}
     by_stem: dict[str, list[str]] = {}
     for name, path in files.items():
@@ -210,9 +209,8 @@ def _parsed(file: Path) -> SimpleNamespace:
         raise
     except Exception as error:  # a malformed file raises many kinds
         reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "what", error)
-        what = f"the URDF cannot be read: {reason}"
         allowed, hint = "a URDF file with links and joints", "check it with check_urdf, or export it again"
-        raise ModelError(what, where=str(file), allowed=allowed, hint=hint) from error
+        raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 
 
 def _read_inertial(element: ElementTree.Element | None) -> SimpleNamespace | None:
@@ -319,9 +317,8 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
     for name, mimic in following.items():
         if wanted is not None and name in wanted:
             what = f"joint '{name}' follows '{mimic.joint}' (mimic) and cannot move on its own"
-            allowed = "joints without <mimic>"
             hint = f"leave it out of the joints; it is then locked where '{mimic.joint}' is locked"
-            raise ModelError(what, where=where, allowed=allowed, hint=hint)
+            raise ModelError(what, where=where, allowed="joints without <mimic>", hint=hint)
         if mimic.joint not in joints:
             what = f"joint '{name}' follows (mimic) a joint '{mimic.joint}' that does not exist"
             raise ModelError(what, where=where, **unknown_name_error_arguments(str(mimic.joint), joints))
@@ -338,9 +335,8 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
     """Name of the root link, after a check of all joints and links and of the names of wanted joints."""
     for joint in robot.joints:
         if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
-            allowed = "revolute, continuous, prismatic, fixed"
             what, hint = f"joint '{joint.name}' has the type '{joint.type}'", "replace it by joints of these types"
-            raise ModelError(what, where=where, allowed=allowed, hint=hint)
+            raise ModelError(what, where=where, allowed="revolute, continuous, prismatic, fixed", hint=hint)
         if joint.type in _MOVABLE_JOINT_TYPES and np.linalg.norm(joint.axis) < 1e-9:
             allowed, hint = "an axis other than 0 0 0", "write the axis, or set the type of the joint to fixed"
             raise ModelError(f"joint '{joint.name}' has a zero axis", where=where, allowed=allowed, hint=hint)
@@ -398,8 +394,7 @@ def _walk(
     loose = sorted(set(links) - set(frames) - dropped)
     if loose:
         what = f"link '{loose[0]}' is not connected to the root link '{root}'"
-        hint = "connect it by a joint, or delete it"
-        raise ModelError(what, where=where, allowed="one tree of links", hint=hint)
+        raise ModelError(what, where=where, allowed="one tree of links", hint="connect it by a joint, or delete it")
     return joints, bodies, frames
 
 

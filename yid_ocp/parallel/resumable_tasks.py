@@ -385,8 +385,7 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
     """Refuse workers with other versions, with several threads, or without this package or access to the same files."""
     for address, count in client.nthreads().items():
         if count > 1:
-            what = f"a worker runs {count} tasks at once in one process"
-            allowed = "one task at a time in every process"
+            what, allowed = f"a worker runs {count} tasks at once in one process", "one task at a time in every process"
             hint = "start workers with --nthreads 1, and --nworkers for as many as the machine has processors"
             raise WorkerError(what, where=address, allowed=allowed, hint=hint)
     here = software_fingerprint()

@@ -49,8 +49,7 @@ def _max_threads() -> int:
     said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
         where, hint = f"the environment variable {_THREADS_VARIABLE}", "unset the variable, or set a number"
-        what = f"the number of threads is '{said}'"
-        raise ConfigError(what, where=where, allowed="a whole number from 1", hint=hint)
+        raise ConfigError(f"the number of threads is '{said}'", where=where, allowed="a whole number from 1", hint=hint)
     own = int(said) if said else available_processor_count()
     return min(own, getattr(_THREAD_SHARE, "count", own))
 

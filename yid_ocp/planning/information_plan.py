@@ -135,9 +135,8 @@ def _chosen(
             said = unknown_name_error_arguments(name, problem.system.parameters.names)
             raise ConfigError(f"there is no parameter '{name}'", where="plan.identify", **said)
         if name not in problem.free:
-            what = f"'{name}' is not a free parameter"
             hint, allowed = f"set parameters.{name}.free: true", ", ".join(problem.free)
-            raise ConfigError(what, where="plan.identify", allowed=allowed, hint=hint)
+            raise ConfigError(f"'{name}' is not a free parameter", where="plan.identify", allowed=allowed, hint=hint)
     return wanted, ()
 
 

@@ -163,9 +163,8 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
             row = int(np.argmax(over))
             what = f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}"
             what += f", at {where[row]:.4g} m"
-            allowed = f"{low[row]:.4g} to {high[row]:.4g} m"
             hint = "enlarge the box, or list the frames to keep in it under plan.frames_in_box"
-            raise ConfigError(what, where="plan.box", allowed=allowed, hint=hint)
+            raise ConfigError(what, where="plan.box", allowed=f"{low[row]:.4g} to {high[row]:.4g} m", hint=hint)
 
 
 def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> TargetMotionPlan:

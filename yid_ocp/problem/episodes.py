@@ -229,8 +229,7 @@ def prepare_episode(
     grid = recording_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         what = "the arms of the model are driven, but the recording has no joints"
-        where = f"recording '{recording.name}'"
-        hint = "import the joints too, or set model.arms.mode: prescribed"
+        where, hint = f"recording '{recording.name}'", "import the joints too, or set model.arms.mode: prescribed"
         raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
     low_pass = LowPassFilter(options.path_cutoff)
     path = prescribed_coordinates_at_nodes(
@@ -366,6 +365,5 @@ def _samples(
     if not any(s.n_residuals for s in samples):
         what, where = "no sensor of the model has a measurement in the recording", f"recording '{recording.name}'"
         allowed = "points on frames of the model, or channels of its joints"
-        hint = "check `sensors` and the names of the recorded points"
-        raise DataError(what, where=where, allowed=allowed, hint=hint)
+        raise DataError(what, where=where, allowed=allowed, hint="check `sensors` and the names of the recorded points")
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples

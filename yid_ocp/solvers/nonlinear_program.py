@@ -333,9 +333,8 @@ class NonlinearProgram(ReprMixin):
         alike = [key for key in blocks if key.startswith(f"{name}[")]
         if len(alike) == 1:
             return blocks[alike[0]]
-        message = f"the program has {len(alike)} blocks '{name}'"
         said = unknown_name_error_arguments(name, alike or blocks)
-        raise SolverError(message, where=f"nlp['{name}']", **said)
+        raise SolverError(f"the program has {len(alike)} blocks '{name}'", where=f"nlp['{name}']", **said)
 
     def __getitem__(self, name: str) -> ca.MX:
         """Block of variables or parameters as an MX matrix of its shape."""

@@ -268,7 +268,6 @@ def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[i
     miss = np.abs(result.fun[: gap.numel_out(0)]).max()
     if miss > 1e-7:
         where = ", ".join(f"{grasp.holder_frame} -> {grasp.held_frame}" for grasp in system.grasps)
-        allowed, hint = "grasps within reach and within the joint limits", "move the object, or give another seed"
-        what = f"the arms miss the grasped points by {1e3 * miss:.3g} mm"
-        raise ModelError(what, where=where, allowed=allowed, hint=hint)
+        hint, what = "move the object, or give another seed", f"the arms miss the grasped points by {1e3 * miss:.3g} mm"
+        raise ModelError(what, where=where, allowed="grasps within reach and within the joint limits", hint=hint)
     return at(result.x)

@@ -361,9 +361,8 @@ def _bodies(
                 elements[j].set("gravcomp", format_xml_numbers([1 - weights[joint.name]]))
             SubElement(elements[j], "inertial", _inertial(body))
         elif not any(_shares_body(tree, k) and tree.joints[k].parent_index == j for k in range(len(tree.joints))):
-            allowed = "joints that move a mass"
             what, hint = f"nothing that '{joint.name}' moves has a mass", "give its link a mass, or lock the joint"
-            raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
+            raise ModelError(what, where=f"joint '{joint.name}'", allowed="joints that move a mass", hint=hint)
     return elements
 
 
@@ -390,9 +389,8 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
         numbers |= {"stiffness": [terms.stiffness], "springref": [terms.constant_force / terms.stiffness]}
     if terms.cubic_stiffness:
         if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
-            what = f"the spring at '{joint.name}' has a cubic part"
+            what, hint = f"the spring at '{joint.name}' has a cubic part", "leave the cubic part or the rest angle out"
             allowed = "no cubic part with a rest angle; otherwise MuJoCo 3.6 or newer (polynomial stiffness)"
-            hint = "leave the cubic part or the rest angle out"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         numbers["stiffness"] = [terms.stiffness, 0.0, terms.cubic_stiffness]
     others = {"armature": [terms.armature], "frictionloss": [terms.dry_friction]}
@@ -486,14 +484,12 @@ def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bo
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():
         if value._is_zero_at_parameter_values(compliance):
-            allowed, hint = "a compliance above zero", "leave the effect out"
-            what = f"the compliance of joint '{joint}' is zero"
-            raise ModelError(what, where=f"joint '{joint}'", allowed=allowed, hint=hint)
+            hint, what = "leave the effect out", f"the compliance of joint '{joint}' is zero"
+            raise ModelError(what, where=f"joint '{joint}'", allowed="a compliance above zero", hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):
-            allowed = f"{joint}.servo_dead_band: 0"
             what, hint = f"the servo of '{joint}' has a dead band", f"set {joint}.servo_dead_band to 0"
-            raise ModelError(what, where=f"joint '{joint}'", allowed=allowed, hint=hint)
+            raise ModelError(what, where=f"joint '{joint}'", allowed=f"{joint}.servo_dead_band: 0", hint=hint)
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
         what, allowed, hint = "the recorded time is scaled", "a time scale of 1", "leave the effect on the clock out"
         raise ModelError(what, where="effects of the model", allowed=allowed, hint=hint)

@@ -156,9 +156,8 @@ def simulate_in_mujoco(
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
         allowed = f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
-        where = f"motion of {', '.join(motion.joints) or 'nothing'}"
         what, hint = "the motion has other joints than the driven ones", "give a motion of the driven joints"
-        raise ModelError(what, where=where, allowed=allowed, hint=hint)
+        raise ModelError(what, where=f"motion of {', '.join(motion.joints) or 'nothing'}", allowed=allowed, hint=hint)
     mujoco = import_mujoco()
     model = mujoco_model_from_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
@@ -348,8 +347,7 @@ def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
         step(held, data, nstep=block)
     what = f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)"
     hint = "give every coordinate more damping, and enough stiffness to carry the weight"
-    allowed = "an object that comes to rest"
-    raise ModelError(what, where="settling before the motion", allowed=allowed, hint=hint)
+    raise ModelError(what, where="settling before the motion", allowed="an object that comes to rest", hint=hint)
 
 
 def _play(

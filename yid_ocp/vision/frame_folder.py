@@ -300,8 +300,7 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: CameraIntrinsic
     for name in names:
         kind = Path(name).suffix.lower()
         if kind not in known:
-            what = f"'{name}' is neither a cloud nor a depth image"
-            hint = "remove the row, or convert the file"
+            what, hint = f"'{name}' is neither a cloud nor a depth image", "remove the row, or convert the file"
             raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known), hint=hint)
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
             what, hint = "the intrinsics of the camera are missing, which depth images need", "add `intrinsics`"

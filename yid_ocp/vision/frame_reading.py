@@ -174,8 +174,7 @@ def _depth(content: Any, per_metre: float, where: str) -> Array:
     if step < width * pixel.itemsize or len(data) < height * step:
         what = f"the image has {len(data)} bytes for {width} x {height} pixels"
         allowed = f"at least {height * max(step, width * pixel.itemsize)} bytes"
-        hint = "record the bag again, or leave this frame out"
-        raise DataError(what, where=where, allowed=allowed, hint=hint)
+        raise DataError(what, where=where, allowed=allowed, hint="record the bag again, or leave this frame out")
     image = np.ndarray((height, width), pixel, data, strides=(step, pixel.itemsize))
     return image.astype(np.float64) * (size * per_metre)
 
@@ -242,8 +241,7 @@ def read_frames(
     if place.exists():
         bags = ", ".join(_BAG_SUFFIXES)
         allowed = f"a folder with {STAMP_FILE}, a bag ({bags}) or an Azure Kinect's {_AZURE_KINECT_SUFFIX}"
-        what, hint = "this is not a sequence of frames", "check the path"
-        raise DataError(what, where=str(place), allowed=allowed, hint=hint)
+        raise DataError("this is not a sequence of frames", where=str(place), allowed=allowed, hint="check the path")
     allowed = "a folder of frames, a bag or a video"
     raise DataError("there is no such file or folder", where=str(place), allowed=allowed, hint="check the path")
 

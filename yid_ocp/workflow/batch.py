@@ -71,9 +71,8 @@ def batch_runs_from_configs(
     for i, path in enumerate(paths):
         if not path.is_file():
             near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            what = "there is no such configuration file"
             hint = nearest_name_question(path.name, near) or "check the path"
-            raise ConfigError(what, where=str(path), allowed="a YAML file", hint=hint)
+            raise ConfigError("there is no such configuration file", where=str(path), allowed="a YAML file", hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
             what, allowed = "the configuration is given twice", "every configuration once"
             raise ConfigError(what, where=str(path), allowed=allowed, hint="leave one of them out")

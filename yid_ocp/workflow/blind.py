@@ -193,8 +193,7 @@ class _Proof:
             for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
                 part.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            what = f"the folder cannot be made: {error.strerror}"
-            hint = "choose another --out in a writable folder"
+            what, hint = f"the folder cannot be made: {error.strerror}", "choose another --out in a writable folder"
             raise OutputError(what, where=str(self.folder), hint=hint) from error
         for name, text in configs.items():
             write_text(self.config_file(name), text)

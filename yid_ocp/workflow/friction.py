@@ -39,8 +39,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
                 allowed = "two recordings or more in which the motors are on"
                 hint = "list more under recordings.estimate or recordings.held_out"
                 what = "a law is tested on recordings that are not fitted, but there is only one recording"
-                where = settings.describe_location("recordings")
-                raise DataError(what, where=where, allowed=allowed, hint=hint)
+                raise DataError(what, where=settings.describe_location("recordings"), allowed=allowed, hint=hint)
             solution = solve(problem, run.solver, restarts=False)
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")

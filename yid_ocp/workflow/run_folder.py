@@ -177,8 +177,7 @@ def _publish(folder: RunFolder, lock: FileLock) -> None:
         except OSError as error:
             if not os.path.lexists(target) or number > _NAMES:
                 what = f"the run is complete but its folder cannot be renamed: {os_error_reason(error)}"
-                hint = f"rename {temporary}, which has the results"
-                raise OutputError(what, where=str(target), hint=hint) from error
+                raise OutputError(what, where=str(target), hint=f"rename {temporary}, which has the results") from error
             target = folder.final_path.with_name(f"{folder.final_path.name}-{number}")
     if target != folder.final_path:
         log.warning("another run created %s in the meantime; the results are in %s", folder.final_path, target)
@@ -202,8 +201,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
             allowed = "no folder of this name, or the folder of an interrupted run"
-            hint = "move it, or choose another --out"
-            what = "the hidden folder for this run was not made by a run"
+            hint, what = "move it, or choose another --out", "the hidden folder for this run was not made by a run"
             raise OutputError(what, where=str(temporary), allowed=allowed, hint=hint)
         lock = _locked(temporary)
         if lock is None:

@@ -111,9 +111,8 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
 def read_result_file(file: Path) -> dict[str, Any]:
     """Read any command's result.json. Raises `DataError` if it cannot be read or has an old format."""
     if not is_file(file):
-        hint = "give the run folder that `solve` or `diagnose` printed"
-        what, allowed = f"there is no finished run in {file.parent}", "a run folder with result.json"
-        raise DataError(what, where=str(file), allowed=allowed, hint=hint)
+        hint, allowed = "give the run folder that `solve` or `diagnose` printed", "a run folder with result.json"
+        raise DataError(f"there is no finished run in {file.parent}", where=str(file), allowed=allowed, hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
         what, hint = "the file is not a result of a run", "run the command again"
@@ -329,9 +328,8 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     known = [_stored_predictions(folder, roles) for folder in folders]
     pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
     if not pairs:
-        hint = "compare runs that use the same sensors"
         what, allowed = "the runs have no predicted channel in common", "one common channel or more"
-        raise DataError(what, where=str(folders[1]), allowed=allowed, hint=hint)
+        raise DataError(what, where=str(folders[1]), allowed=allowed, hint="compare runs that use the same sensors")
     pairs.sort(key=lambda pair: "estimate" in roles[pair[0].recording])
     channels = [
         {

@@ -99,8 +99,7 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
             what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
             raise ConfigError(what, where=where, allowed=error.allowed, hint=error.hint or hint) from error
         line = None if path is None else _line(error, path)
-        what = f"the {name} raised {type(error).__name__}: {error}"
-        where = f"{where} (line {line})" if line else where
+        what, where = f"the {name} raised {type(error).__name__}: {error}", f"{where} (line {line})" if line else where
         raise ConfigError(what, where=where, allowed="a file that Python can import", hint=hint) from error
 
 

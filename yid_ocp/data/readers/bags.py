@@ -421,9 +421,8 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
         names = tuple(name for entry in found for name in entry.names)
         kept = [message for message in messages if set(names) <= set(message.content.name)]
         if not kept or not names:
-            what = f"no message of '{command}' has all joints"
             allowed, hint = f"commands of {', '.join(names) or 'the joints'}", "choose another --command-topic"
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+            raise DataError(f"no message of '{command}' has all joints", where=where, allowed=allowed, hint=hint)
         found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), kept, True))
     return found, tuple(notes)
 

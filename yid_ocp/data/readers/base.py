@@ -217,9 +217,8 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
         own = [value for pattern, value in constants.items() if fnmatch.fnmatchcase(name, pattern)]
         if not own:
             what = f"the effort of '{name}' is a current, but its torque constant is not given"
-            allowed = "a torque constant for every joint [N m/A]"
             hint = f"--torque-constants {name}=0.1, or '*=0.1' for all"
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+            raise DataError(what, where=where, allowed="a torque constant for every joint [N m/A]", hint=hint)
         ratio = [value for pattern, value in gears.items() if fnmatch.fnmatchcase(name, pattern)]
         factors[j] = own[-1] * (ratio[-1] if ratio else 1.0)
     return factors

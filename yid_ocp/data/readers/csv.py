@@ -295,9 +295,8 @@ def _read_table(
     if len(bad) > _MOST_BAD * n_lines:
         what = f"{len(bad)} of {n_lines} lines are not rows of {len(names)} numbers"
         where = f"{path}, line {bad[0]}" + (" and later lines" if len(bad) > 1 else "")
-        allowed = f"at most {_MOST_BAD:.0%} of the lines"
         hint = "set the --delimiter, or leave columns of text out: --columns NAME=skip (see --preview)"
-        raise DataError(what, where=where, allowed=allowed, hint=hint)
+        raise DataError(what, where=where, allowed=f"at most {_MOST_BAD:.0%} of the lines", hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
@@ -354,8 +353,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         pattern = re.escape(key).replace(r"\*", "(.*)")
         found = {name: match for name in header if (match := re.fullmatch(pattern, name))}
         if not found:
-            what = f"there is no column '{key}'"
-            raise DataError(what, where=where, **unknown_name_error_arguments(key, header))
+            raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: dict[str, _Meaning] = {}
@@ -371,9 +369,8 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
-            allowed = "one column for every meaning"
             hint = f"leave one out: --columns {name}={base.SKIPPED_COLUMN_MEANING}"
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+            raise DataError(what, where=where, allowed="one column for every meaning", hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:
         allowed, hint = "a column named t or time, in seconds", "name the column of times: --columns NAME=t"

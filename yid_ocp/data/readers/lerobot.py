@@ -183,8 +183,7 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
             found = {name: _matrix(table[name].combine_chunks(), name, dataset.folder) for name in columns}
         except (arrow.ArrowException, OSError, KeyError, ValueError) as error:
             what = "the table of the episode cannot be read: it is damaged or not a parquet file"
-            hint = "download or copy the file again"
-            allowed = f"a parquet file with {', '.join(columns)}"
+            hint, allowed = "download or copy the file again", f"a parquet file with {', '.join(columns)}"
             raise DataError(what, where=str(file), allowed=allowed, hint=hint) from error
         if len(found["frame_index"]):
             return found, file
