@@ -159,7 +159,7 @@ def straight(file: h5py.File, rows: int = 1, unit: str = "m") -> h5py.File:
 
 
 MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
-    "no format": (lambda f: f.attrs.pop("format"), "does not say its format", ""),
+    "no format": (lambda f: f.attrs.pop("format"), "the file has no format", ""),
     "other format": (lambda f: f.attrs.modify("format", "yid-recording/2"), "'yid-recording/2'", ""),
     "format no text": (lambda f: f.attrs.create("format", 1), "the value 1 is not text", ""),
     "format not UTF-8": (lambda f: f.attrs.create("format", np.bytes_(b"\xff\xfe")), "not UTF-8", ""),

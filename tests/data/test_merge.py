@@ -79,7 +79,7 @@ def test_what_cannot_be_aligned_is_refused() -> None:
         merge_recordings([ROBOT, other])
     assert "--clock-offset camera=SECONDS" in caught.value.hint
     assert merge_recordings([ROBOT, other], {"camera": -1e9}).points[0].t[0] == 0.0
-    with pytest.raises(DataError, match="no file of these"):
+    with pytest.raises(DataError, match="not one of the files"):
         merge_recordings([ROBOT, camera()], {"kamera": 1.0})
     with pytest.raises(DataError, match="the joint 'a' is in robot and in twin"):
         merge_recordings([ROBOT, replace(ROBOT, name="twin")])

@@ -65,7 +65,7 @@ def _read(path: Path) -> str:
     try:
         return read_input_text(path, _MAX_BYTES)
     except DataError as error:
-        what, hint = f"the configuration cannot be read: {error.what}", error.hint
+        what, hint = error.what, error.hint
         if isinstance(error.__cause__, FileNotFoundError):
             what = "there is no such configuration file"
             if path.parent.is_dir():

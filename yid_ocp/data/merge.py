@@ -44,8 +44,8 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     where = ", ".join(names)
     for name in offsets:
         if name not in names:
-            what = f"a clock offset is given for '{name}', which is no file of these"
-            raise DataError(what, where="clock_offsets", **unknown_name_error_arguments(name, names))
+            what = f"a clock offset is given for '{name}', which is not one of the files"
+            raise DataError(what, where="--clock-offset", **unknown_name_error_arguments(name, names))
     lead = next((recording for recording in recordings if recording.joints is not None), recordings[0])
     first = _with_times_shifted(lead, offsets.get(lead.name, 0.0))
     shifted, notes = list[Recording](), list[str]()

@@ -309,7 +309,8 @@ class Recording(ReprMixin):
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
-        require_data(start < stop and kept, what, f"recording '{self.name}'", f"start < stop, {allowed}")
+        where, hint = f"recording '{self.name}'", "choose start and stop within the recording"
+        require_data(start < stop and kept, what, where, f"start < stop, {allowed}", hint)
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
         channels = tuple(group for group in kept if isinstance(group, SensorChannelGroup))
@@ -332,7 +333,8 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
         points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any machine.
         `marker_reference_pose` does not match the first group of points."""
     origin = where or f"recording '{recording.name}'"
-    require_data(recording.all_groups, "the recording has no group", origin, "joints, points, points_<name>")
+    allowed, hint = "joints, points, points_<name>", "add joints or points"
+    require_data(recording.all_groups, "the recording has no group", origin, allowed, hint)
     texts = (("description", recording.description), ("source", recording.source))
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))
     for key, value in recording.true_parameters.items():
@@ -343,12 +345,14 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     names = [group.name for group in recording.points]
     for group in recording.points:
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
-        require_data(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
-        require_data(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
+        what, hint = f"a group of points is called '{group.name}'", f"rename it, such as points_{group.name}"
+        require_data(legal, what, origin, "points, points_<name>", hint)
+        once = names.count(group.name) == 1
+        require_data(once, f"two groups of points are called '{group.name}'", origin, "every name once", "rename one")
         _validate_points(group, f"{origin}: {group.name}")
     for channels in recording.channel_groups:
         repeated = sum(group.name == channels.name for group in recording.channel_groups) > 1
-        require_data(not repeated, f"two groups are called '{channels.name}'", origin)
+        require_data(not repeated, f"two groups are called '{channels.name}'", origin, "every name once", "rename one")
         _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
@@ -410,7 +414,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         what += f"(joint '{joints.names[column]}', t = {joints.t[row]:g} s)"
         hint = f"check the unit of the channel; import the original data again with --units {channel}=UNIT"
         if unit == "rad":
-            hint = f"these look like degrees: import the original data again with --units {channel}=deg"
+            hint = f"if the unit is degrees, import the original data again with --units {channel}=deg"
         require_data(size.max() <= _LARGEST[unit], what, place, f"at most {_LARGEST[unit]:g} {unit}", hint)
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
@@ -449,7 +453,10 @@ def _validate_points(group: PointGroup, where: str) -> None:
 
 
 def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
-    largest, hint = float(np.abs(positions).max(initial=0.0)), "these look like millimetres: convert them to metres"
+    largest, hint = (
+        float(np.abs(positions).max(initial=0.0)),
+        "if the unit is millimetres, convert the values to metres",
+    )
     what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
     require_data(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
 
@@ -495,14 +502,14 @@ def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str
 
 
 def _check_pose(pose: Array, where: str) -> None:
-    _check_shape(pose, (4, 4), where, "(4, 4)")
+    _check_shape(pose, (4, 4), where, "a rigid transform")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
     require_data(np.isfinite(pose).all(), "the pose has a value that is not finite", where, allowed)
     last_is_unit, orthonormal = (
         np.allclose(array, expected, rtol=0, atol=1e-6)
         for array, expected in ((pose[3], np.eye(4)[3]), (rotation.T @ rotation, np.eye(3)))
     )
-    require_data(last_is_unit, f"the last row of the pose is {pose[3]}", where, allowed)
+    require_data(last_is_unit, f"the last row of the pose is {pose[3].tolist()}", where, allowed)
     require_data(orthonormal, "the axes of the pose are not orthonormal", where, allowed)
     require_data(np.linalg.det(rotation) > 0, "the pose is a reflection", where, allowed)
 

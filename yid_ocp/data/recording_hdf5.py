@@ -106,7 +106,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         key: _text(file.attrs[key], f"{origin}, attribute {key}") if key in file.attrs else ""
         for key in ("format", "description", "source", "truth", "notes")
     }
-    what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
+    what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file has no format"
     hint = "update yid_ocp if a newer version wrote the file; else import the original data with this version"
     require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT, hint)
     joints, points, straight, channels, gain = None, [], None, [], {}
@@ -255,7 +255,9 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
     else:
         what = answer[1:]
     if what:
-        allowed = f"an undamaged {noun} file, without links to other files"
+        allowed = (
+            f"an undamaged {noun} file of at most {files.MAX_INPUT_NUMBERS / 1e6:.0f} million numbers, without links"
+        )
         hint = "copy it again from its source; if the copy fails as well, export or import the original data again"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
 

@@ -119,8 +119,7 @@ def diagnose(
     ------
     ConfigError, ModelError, DataError, SolverError
         A candidate does not fit the system; a held-out recording is also estimated on; there is no noise level; the
-        nominal model cannot be rolled out, or its residual is not whitened.
-    """
+        nominal model cannot be rolled out, or its residual is not whitened."""
     # small matrices: threads of the linear algebra library cost more than they save
     with threadpoolctl.threadpool_limits(1):
         clock = {"": time.perf_counter()}

@@ -147,7 +147,7 @@ def read_urdf(
     for joint in robot.joints:
         if joint.child in dropped and joint.name in named:
             what = f"joint '{joint.name}' carries the excluded link '{joint.child}'"
-            hint = "exclude the joint or the link only"
+            hint = f"keep the link, or leave '{joint.name}' out of the joints"
             raise ModelError(what, where=where, allowed="joints whose links are not excluded", hint=hint)
     following = _mimicked(robot, joints, locked, where)
     if joints is None:

@@ -343,8 +343,7 @@ def solve(
     Returns
     -------
     Solution
-        Its status and message report non-convergence, which raises no error.
-    """
+        Its status and message report non-convergence, which raises no error."""
     # small matrices: threads of the linear algebra library cost more than they save
     with threadpoolctl.threadpool_limits(1):
         if initial_unknowns is None:

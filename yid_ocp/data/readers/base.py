@@ -77,7 +77,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
             said = unknown_name_error_arguments(word, chain(*_TO_SI.values()))
-            raise DataError(f"the unit '{word}' is unknown", where="units", **said)
+            raise DataError(f"the unit '{word}' is unknown", where="--units", **said)
         for quantity in (quantity for quantity, si in _QUANTITIES.items() if si == of):
             _set_unit(units, quantity, word)
     return units | exact
@@ -86,7 +86,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
 def _set_unit(units: dict[str, str], quantity: str, unit: str) -> None:
     if units.setdefault(quantity, unit) != unit:
         what, hint = f"'{quantity}' has two units, {units[quantity]} and {unit}", f"leave one out: {quantity}={unit}"
-        raise DataError(what, where="units", allowed="one unit for every quantity", hint=hint)
+        raise DataError(what, where="--units", allowed="one unit for every quantity", hint=hint)
 
 
 def _spaceless(unit: str) -> str:
@@ -217,7 +217,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
         own = [value for pattern, value in constants.items() if fnmatch.fnmatchcase(name, pattern)]
         if not own:
             what = f"the effort of '{name}' is a current, but its torque constant is not given"
-            hint = f"--torque-constants {name}=0.1, or '*=0.1' for all"
+            hint = f"add --torque-constants {name}=0.1, or '*=0.1' for all joints"
             raise DataError(what, where=where, allowed="a torque constant for every joint [N m/A]", hint=hint)
         ratio = [value for pattern, value in gears.items() if fnmatch.fnmatchcase(name, pattern)]
         factors[j] = own[-1] * (ratio[-1] if ratio else 1.0)

@@ -308,7 +308,7 @@ def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> Non
     if not any(header):
         raise DataError("the table is empty", where=str(path), allowed=_ALLOWED, hint="export it again")
     if options.header and all(_is_number(cell) for cell in header):
-        hint = "--no-header --columns t,position:JOINT,... with one meaning for every column"
+        hint = "add --no-header --columns t,position:JOINT,... with one meaning for every column"
         raise DataError("the table has no header row", where=f"{path}, line 1", allowed=_ALLOWED, hint=hint)
     if len(header) == 1:
         others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]

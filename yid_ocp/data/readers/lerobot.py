@@ -205,7 +205,7 @@ def _files(dataset: _Dataset, episode: int) -> list[Path]:
         pass
     where = f"{dataset.folder / 'meta' / 'info.json'}: data_path"
     allowed = "a path in the dataset with {episode_chunk:03d} and {episode_index:06d}"
-    hint = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    hint = "write data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
     raise DataError(f"data_path is '{pattern}'", where=where, allowed=allowed, hint=hint)
 
 
