@@ -82,7 +82,7 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
 def test_no_such_configuration(cli, pendulum):
     folder = pendulum.parent
     assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
-    assert_refused(cli("check", folder), "cannot be read")
+    assert_refused(cli("check", folder), "this is a folder", "a YAML file")
     (folder / "list.yaml").write_text("- 1\n")
     assert_refused(cli("solve", folder / "list.yaml"), "keys and values")
     (folder / "latin.yaml").write_bytes(b"description: \xe9\n")
