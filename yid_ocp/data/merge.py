@@ -9,7 +9,6 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import signal
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import median_sample_period
@@ -146,6 +145,8 @@ def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
 
 def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) -> float:
     """Delay of one speed relative to another on an even clock [s]; each has values and the time of the first sample."""
+    from scipy import signal  # slow to import
+
     (x, x_start), (y, y_start) = a, b
     lags = signal.correlation_lags(len(y), len(x))
     ones_x, ones_y = np.ones(len(x)), np.ones(len(y))

@@ -526,7 +526,7 @@ def fit_nominal_model(
     begun = composed
     # a single recording that is both fitted and held out has no solution yet
     if solution is not None or not composed.is_split_in_blocks:
-        found = solve(problem, GaussNewton(max_iterations=30)) if solution is None else solution
+        found = solve(problem, GaussNewton(max_iterations=30), verdicts=False) if solution is None else solution
         if found.evaluation is None:
             raise failed_rollout_error(f"its fit fails: {found.message}", "nominal model")
         start = dict(zip(found.unknown_names, map(float, found.x), strict=True))

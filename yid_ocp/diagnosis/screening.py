@@ -185,8 +185,6 @@ def _pinv(matrix: Array) -> Array:
 
 def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannel]) -> Array:
     """X' Omega X under the noise's known autocorrelation."""
-    import scipy.signal  # slow to import
-
     total = np.zeros((columns.shape[1], columns.shape[1]))
     least = 1e-6 * float(np.max(np.abs(columns), initial=0.0))
     for s in series:
@@ -195,6 +193,8 @@ def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannel]) -> 
             continue
         seen = x
         if len(rho) > 1:
+            import scipy.signal  # slow to import
+
             both = np.concatenate([rho[:0:-1], rho])[:, None]
             seen = scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(rho) - 1 :][: len(x)]
         total += x.T @ seen

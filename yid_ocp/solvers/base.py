@@ -318,6 +318,7 @@ def solve(
     callback: IterationCallback | None = None,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     restarts: bool = True,
+    verdicts: bool = True,
 ) -> Solution:
     """Fit an estimation problem and return estimates with uncertainties and verdicts.
 
@@ -339,6 +340,8 @@ def solve(
         Criteria for a residual that exceeds noise.
     restarts : bool
         Whether a poor fit is repeated from other initial values.
+    verdicts : bool
+        Whether loosely known parameters are evaluated at the ends of their intervals. If not, verdicts are provisional.
 
     Returns
     -------
@@ -353,7 +356,7 @@ def solve(
         search = _MultiStartSearch(problem, solver or SOLVERS[_DEFAULT_SOLVER](), callback, start)
         if restarts:
             search.restart(start, limits)
-        return search.solution(limits)
+        return search.solution(limits, verdicts)
 
 
 @dataclass(frozen=True)
@@ -441,12 +444,12 @@ class _MultiStartSearch:
         same = replace(best.result, stopped_by_callback=near.stopped_by_callback)
         return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
 
-    def solution(self, limits: ExcessResidualCriteria) -> Solution:
+    def solution(self, limits: ExcessResidualCriteria, verdicts: bool) -> Solution:
         """Solution of the best fit, with its uncertainty."""
         result, finish, problem = self._best.result, self._best.evaluation, self._best.weighted
         fit = assess_goodness_of_fit(problem, finish, limits)
         covariance = misfit_robust_covariance(problem, finish, fit)
-        estimates = parameter_estimates(problem, result.x, finish, covariance, fit)
+        estimates = parameter_estimates(problem, result.x, finish, covariance, fit if verdicts else None)
         found = *self._status_and_message(), problem.unknown_names, result.x, covariance, estimates, finish.cost, fit
         history = tuple(entry for one in self._fits for entry in one.history)
         count, seconds = sum(one.n_evaluations for one in self._fits), time.perf_counter() - self._begun
