@@ -115,12 +115,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "only time": ("t,label\n0,1\n", {"columns": {"label": "skip"}}, "the recording has no group", ""),
     "column not there": (GOOD, {"columns": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
     "meaning of a column": (GOOD, {"columns": {"q_a": "angle:a"}}, "meaning 'angle:a' of column", "q_a=position:JOINT"),
-    "meaning without joint": (
-        GOOD,
-        {"columns": {"q_a": "position"}},
-        "meaning 'position' of",
-        "q_a=position:NAME",
-    ),
+    "meaning without joint": (GOOD, {"columns": {"q_a": "position"}}, "meaning 'position' of", "q_a=position:NAME"),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
     "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' holds 'fast'", ""),
     "joint missing in a channel": ("t,q_a,q_b,effort_a\n0,1,1,1\n", {}, "no column for effort of 'b'", ""),
@@ -147,11 +142,7 @@ def test_csv_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
     absent = tmp_path / "absent.csv"
-    for file, message in (
-        (path, "not a table in UTF-8"),
-        (tmp_path, "this is a folder"),
-        (absent, "no such file"),
-    ):
+    for file, message in ((path, "table in UTF-8"), (tmp_path, "this is a folder"), (absent, "no such file")):
         with pytest.raises(DataError, match=message):
             read_csv(file)
 
