@@ -1,7 +1,6 @@
 """Command-line interface: commands, their arguments and shell completion.
 
-`workflow` implements the commands. A command's module is imported when it runs; `--help` loads no numerical library.
-"""
+`workflow` implements the commands. A command's module is imported when it runs; `--help` loads no numerical library."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Levenberg-Marquardt method for dense least-squares problems of some dozen coordinates, such as chain shapes.
 
-docs/design/solvers.md compares it with SciPy's method.
-"""
+docs/design/solvers.md compares it with SciPy's method."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 The mean of estimates x_i of the same n parameters with covariances C_i is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. If the
 parameters are constant over k runs, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. If chi2 is
 larger, the standard deviations of the mean are multiplied by sqrt(chi2/dof), Birge's ratio (Birge 1932, Physical Review
-40:207, doi:10.1103/PhysRev.40.207).
-"""
+40:207, doi:10.1103/PhysRev.40.207)."""
 
 from __future__ import annotations
 

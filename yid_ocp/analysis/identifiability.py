@@ -163,8 +163,7 @@ def identifiability(
     Returns
     -------
     IdentifiabilityResult
-        For p free parameters: verdicts and standard deviations, correlations and Fisher information, shape (p, p).
-    """
+        For p free parameters: verdicts and standard deviations, correlations and Fisher information, shape (p, p)."""
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in (own for own in wanted if own not in names):

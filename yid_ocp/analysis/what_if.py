@@ -129,8 +129,7 @@ def what_if(
     Returns
     -------
     ExperimentRanking
-        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat].
-    """
+        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat]."""
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)

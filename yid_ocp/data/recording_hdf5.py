@@ -1,8 +1,7 @@
 """Read and write recordings as HDF5 files (format `yid-recording/1`), with safe access to any HDF5 file.
 
 The HDF5 library follows links into other files, and ends the process if the disk is full or a file is damaged in
-certain ways. Such errors cannot be caught. Files are therefore written atomically and first read by another process.
-"""
+certain ways. Such errors cannot be caught. Files are therefore written atomically and first read by another process."""
 
 from __future__ import annotations
 

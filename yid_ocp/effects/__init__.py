@@ -1,7 +1,6 @@
 """The library of unmodelled effects and their possible locations. A new kind is one file.
 
-The class of a kind states its equation, quantities, units, bounds and ranges. `docs/howto/extending.md` adds a kind.
-"""
+The class of a kind states its equation, quantities, units, bounds and ranges. `docs/howto/extending.md` adds a kind."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 For inputs of the model (torques and angles of driven joints, angles of prescribed joints) an effect acts through
 `corrected_reading`. For the effort of a prescribed joint, which is compared with the record, it acts through
-`distorted_reading`.
-"""
+`distorted_reading`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Errors of cameras, clocks, wrist sensors and inertial units.
 
 A group of points belongs to a camera if its sensor has a pose. Recorded points are in the world frame, and so are the
-offsets and rotations here. Of the camera's pose, only position and viewing direction matter.
-"""
+offsets and rotations here. Of the camera's pose, only position and viewing direction matter."""
 
 from __future__ import annotations
 

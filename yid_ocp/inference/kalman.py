@@ -3,8 +3,7 @@
 References
 ----------
 Bryson and Frazier (1963), Smoothing for linear and nonlinear dynamic systems, Aeronautical Systems Division report
-TDR-63-119. Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5.
-"""
+TDR-63-119. Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5."""
 
 from __future__ import annotations
 

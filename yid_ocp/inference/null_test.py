@@ -3,8 +3,7 @@
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
 (white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2). A chi-squared variable
 with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each fitted parameter removes one degree of
-freedom.
-"""
+freedom."""
 
 from __future__ import annotations
 

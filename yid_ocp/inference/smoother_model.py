@@ -7,8 +7,7 @@ at one of its points that acts on all joints between this point and the ground. 
     x_{k+1} = A_k x_k + E_k d_j,   y_k = C_k x_k + b_j + noise,
 
 where the unknowns d and b are constant over an interval j. States inside an interval are eliminated, so that the cost
-of later steps is linear in the number of intervals.
-"""
+of later steps is linear in the number of intervals."""
 
 from __future__ import annotations
 

@@ -25,8 +25,7 @@ References
 ----------
 Golub and Pereyra (1973), SIAM J. Numerical Analysis 10:2, doi:10.1137/0710036. Bryson and Frazier (1963), Smoothing
 for linear and nonlinear dynamic systems, Aeronautical Systems Division report TDR-63-119.
-Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), System Identification, section 7.4.
-"""
+Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), System Identification, section 7.4."""
 
 from __future__ import annotations
 

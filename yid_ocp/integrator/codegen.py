@@ -1,7 +1,6 @@
 """Generate CasADi functions, index tables and C code from symbolic step equations.
 
-Batched kernels, and functions of very many instructions, are written with the SIMD arithmetic of `simd.c`.
-"""
+Batched kernels, and functions of very many instructions, are written with the SIMD arithmetic of `simd.c`."""
 
 from __future__ import annotations
 

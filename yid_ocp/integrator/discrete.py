@@ -16,8 +16,7 @@ lam_{k-1}) and a term of order h^2, so both have order two.
 
 The first equation holds for free coordinates. At a prescribed coordinate its left side is -h times the effort that the
 motion requires at node k. Both equations of a compliant coordinate are multiplied by its compliance, and so is its
-momentum p [rad s]. The spring force (1/compliance) thus stays finite, and the order stays two.
-"""
+momentum p [rad s]. The spring force (1/compliance) thus stays finite, and the order stays two."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """The stepping kernel for machines without a C compiler, in CasADi and NumPy with a plain Newton method.
 
-It shares only the `DiscreteEquations` with `kernel.c`, so that each kernel is a check of the other.
-"""
+It shares only the `DiscreteEquations` with `kernel.c`, so that each kernel is a check of the other."""
 
 from __future__ import annotations
 

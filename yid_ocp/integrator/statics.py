@@ -100,8 +100,7 @@ class EquilibriumSolver:
         guess : array_like, shape (n,), optional
             Configuration to start from; default: the undeformed object.
         names : sequence of str
-            Parameters with respect to which the equilibrium is differentiated.
-        """
+            Parameters with respect to which the equilibrium is differentiated."""
         step, system = self.step, self.step.system
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
         theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))

@@ -189,8 +189,7 @@ def compile_step(
     use_compiler : bool
         If False, or if the machine has no compiler (with one log message), the step is interpreted.
     tolerance : float, optional
-        Correction of the coordinates at which Newton's method stops [rad or m]; default: from the time step.
-    """
+        Correction of the coordinates at which Newton's method stops [rad or m]; default: from the time step."""
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
     library = None
     if use_compiler:
@@ -261,8 +260,7 @@ def simulate(
     -------
     Rollout
         (q, p, z) at every node, shape (N + 1, nx), multipliers (N, m) [N s], efforts (N, nc) and torques (N, nu) [N m].
-        If Newton's method fails, `status` reports it, and the later entries are NaN.
-    """
+        If Newton's method fails, `status` reports it, and the later entries are NaN."""
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return simulate_rollouts(step, [inputs])[0]
 

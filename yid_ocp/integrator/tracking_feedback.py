@@ -1,8 +1,7 @@
 """Tracking filter of driven arms: a feedback about the measured motion with LQR gains.
 
 The discrete momentum contains half the impulse of the previous step. An effect, or a torque other than the recorded
-one, therefore changes the momentum that belongs to a given motion.
-"""
+one, therefore changes the momentum that belongs to a given motion."""
 
 from __future__ import annotations
 

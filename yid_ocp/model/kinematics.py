@@ -2,8 +2,7 @@
 
 A spatial velocity consists of the angular velocity and the linear velocity of the body point at the world origin. A
 wrench consists of the moment about the world origin and the force. With both in one fixed frame, the derivatives of the
-Lagrangian have the closed forms of `MultibodyLagrangianDerivatives`, which make the compiled step cheap.
-"""
+Lagrangian have the closed forms of `MultibodyLagrangianDerivatives`, which make the compiled step cheap."""
 
 from __future__ import annotations
 

@@ -192,8 +192,7 @@ class Effect:
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """Added delay [s] of a channel: recorded minus true time of a sample. `channel` is as in `distorted_reading`.
 
-        `camera` marks points of a camera. For `torque.JOINT`, a torque that drives the model, it is the delay of its
-        action."""
+        `camera` marks points of a camera. For `torque.JOINT`, a driving torque, it is the delay of its action."""
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:

@@ -1,7 +1,6 @@
 """Threads and processes on this machine: parallel maps, merged calls, shared caches and process pools.
 
-Merged calls: items run in parallel until all of them wait for a function, which is then called once for all.
-"""
+Merged calls: items run in parallel until all of them wait for a function, which is then called once for all."""
 
 from __future__ import annotations
 

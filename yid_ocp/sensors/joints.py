@@ -233,8 +233,7 @@ joint_angle_noise_std = partial(_joint_noise_std, group=JOINT_POSITION_GROUP_NAM
 """Noise standard deviation of joints' encoders, stated or estimated, shape (len(names),) [rad].
 
 Unless the settings give the noise, the encoder's resolution adds the variance step^2/12. The step is the recording's
-`position_resolution` or, if not stated, is estimated from the gaps between values.
-"""
+`position_resolution` or, if not stated, is estimated from the gaps between values."""
 joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME)
 """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
 

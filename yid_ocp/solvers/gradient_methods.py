@@ -219,8 +219,7 @@ class SteepestDescent(SolverWithCheckedSettings):
     ----------
     Armijo (1966), Pacific J. Math. 16:1, doi:10.2140/pjm.1966.16.1.
     Bertsekas (1976), IEEE Trans. Automatic Control 21(2):174, doi:10.1109/TAC.1976.1101194 (projection).
-    Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory).
-    """
+    Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory)."""
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 200
     gradient_tolerance: Annotated[

@@ -184,9 +184,8 @@ class ShapeFitter:
     def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
         """Fit the object's shape in one frame, from the guesses `starts` and the robot's configuration `q_known` (n,).
 
-        The fit has two stages. The cheap passes on skeleton nodes run from every guess (default: the undeformed shape).
-        The passes on points run from the best result. `sight` is the filtered cloud. Raises `DataError` if it is
-        empty."""
+        The cheap passes on skeleton nodes run from every guess (default: the undeformed shape). The passes on points
+        run from the best result. `sight` is the filtered cloud. Raises `DataError` if it is empty."""
         if not len(sight.points) or not len(sight.skeleton_nodes):
             what, allowed = "the cloud has no points or no skeleton nodes", "one point and one node or more"
             raise DataError(what, where="sight", allowed=allowed, hint="check the filters, or give another cloud")

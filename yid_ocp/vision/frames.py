@@ -9,8 +9,7 @@ With x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and theta = atan r, a point has the pixel
 References
 ----------
 Brown (1971), Photogrammetric Engineering 37:855. Kannala & Brandt (2006), doi:10.1109/TPAMI.2006.153. Names and order
-of the coefficients: sensor_msgs/CameraInfo of ROS (REP 104).
-"""
+of the coefficients: sensor_msgs/CameraInfo of ROS (REP 104)."""
 
 from __future__ import annotations
 

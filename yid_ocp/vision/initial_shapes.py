@@ -6,8 +6,7 @@ tips of the object in every way that agrees with the path lengths between them. 
 
 References
 ----------
-Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, doi:10.1007/PL00007210.
-"""
+Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, doi:10.1007/PL00007210."""
 
 from __future__ import annotations
 

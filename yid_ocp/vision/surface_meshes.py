@@ -5,8 +5,7 @@ disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
 
 References
 ----------
-Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations (5) and (10).
-"""
+Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations (5) and (10)."""
 
 from __future__ import annotations
 

@@ -28,8 +28,7 @@ from yid_ocp.solvers.base import EpisodeAndPrediction
 def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
     """Estimated torque offset of every recording, held-out ones too, and joint: `value`, `std`, `prior_std` [N m].
 
-    The problem's whitening filters are fixed near `x` (nx,). Without filters or offsets in the model the result is
-    empty."""
+    The problem's whitening filters are fixed near `x` (nx,). Empty without filters or offsets in the model."""
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
     known = list(zip(problem.episodes, whitening.torque_biases_and_stds_by_recording(problem, x), strict=True))

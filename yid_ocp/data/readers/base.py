@@ -269,8 +269,7 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
-    its periods around it. Raises `DataError` if two sources share a joint, if their channels differ, or if they share
-    no time."""
+    its periods around it. Raises `DataError` if two sources share a joint, differ in channels, or share no time."""
     if len(groups) == 1:
         return groups[0][1], ()
     _check_separate(groups, where)

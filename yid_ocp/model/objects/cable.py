@@ -10,8 +10,7 @@ edge with five equations (position and direction, free roll) or six.
 
 Motion capture measures neither force nor mass: if masses, rigidities and dampings are multiplied by one factor, the
 motion does not change. The linear density is therefore fixed at a nominal value, and every result is relative to it: a
-bending rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight.
-"""
+bending rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight."""
 
 from __future__ import annotations
 
