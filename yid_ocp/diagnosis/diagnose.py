@@ -54,6 +54,7 @@ from yid_ocp.errors import DataError, SolverError, failed_rollout_error
 from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
+    path_noise_spread,
     residual_channel_indices,
     residual_chi2_null_test,
     residuals_exceed_noise,
@@ -558,7 +559,9 @@ def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits:
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
-    return _null_test(fit.problem, fit.evaluation.residual, len(fit.values), limits)
+    spread = path_noise_spread(fit.problem, fit.problem.vector(fit.values))
+    residual = whiten_with_extra_errors(fit.evaluation.residual, spread)
+    return _null_test(fit.problem, residual, len(fit.values), limits)
 
 
 def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
@@ -577,9 +580,22 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
         assert rows.jacobian is not None
         residuals.append(rows.residual)
         slopes.append(rows.jacobian[:, :shared])
+    x, own = problem.vector(fit.values), problem.with_episodes(problem.held_out, ())
+
+    def predicted(moved: EstimationProblem) -> Array | None:
+        other = problem.with_episodes(problem.episodes, moved.episodes)
+        parts = []
+        for i, (episode, result) in enumerate(other.predict_held_out(x)):
+            if isinstance(result, str):
+                return None
+            parts.append(other.whitened_held_out_prediction_residual(i, episode, result).residual)
+        return np.concatenate(parts)
+
     spread = np.vstack(slopes) @ unknowns_covariance_factor(problem, fit.evaluation)[:shared]
+    if (by_path := path_noise_spread(own, x, predicted)).size:
+        spread = np.hstack([spread, by_path])
     residual = whiten_with_extra_errors(np.concatenate(residuals), spread)
-    return _null_test(problem.with_episodes(problem.held_out, ()), residual, 0, limits)
+    return _null_test(own, residual, 0, limits)
 
 
 def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnknownsResult:

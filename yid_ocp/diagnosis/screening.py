@@ -26,12 +26,13 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.null_test import ResidualChannel, chi2_p_value, residual_channel_indices
-from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import redraw_prescribed_path_noise
-from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.inference.null_test import (
+    ResidualChannel,
+    chi2_p_value,
+    path_noise_spread,
+    residual_channel_indices,
+)
 
-_N_PATH_NOISE_DRAWS = 32  # draws of encoders' noise, which give the variance of a score to a quarter
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
 
@@ -114,7 +115,7 @@ def linearize_candidates(
         if k == 0:
             basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
             residual = data - basis @ (basis.T @ data)
-            scatter = _path_noise_residuals(trial, trial.vector(values), evaluation, series)
+            scatter = path_noise_spread(trial, trial.vector(values))[: len(data)]
         moved = jacobian[:, places]
         moved = moved - basis @ (basis.T @ moved)
         edges = np.cumsum([len(effect.amplitude_names) for effect in chosen])[:-1]
@@ -125,29 +126,6 @@ def linearize_candidates(
             noise = _covariance_of_scores(columns, series) + driven @ driven.T + by_priors
             signatures.append(_EffectSignature(effect, grids[effect.label][k], columns, noise, by_priors))
     return AllCandidatesLinearization(residual, tuple(signatures))
-
-
-def _path_noise_residuals(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, series: Sequence[ResidualChannel]
-) -> Array:
-    """Changes of points' residuals by the noise of encoders that move prescribed arms, (nr, K), one column a draw.
-
-    They are divided by the root of K, so that the product with their transpose is a covariance. A lightly damped object
-    rings with that noise, which is neither white nor an error of the model. K is 0 where arms are driven."""
-    before, _ = linearization_without_weak_priors(problem, evaluation)
-    points = {group.name for episode in problem.episodes for group in episode.recording.points}
-    rows = np.concatenate([s.residual_indices for s in series if s.group in points] or [np.zeros(0, int)])
-    if not len(rows) or not problem.system.prescribed or not problem.system.unprescribed_coordinate_indices:
-        return np.zeros((len(before), 0))
-    rng, found = np.random.default_rng(0), []
-    for _ in range(_N_PATH_NOISE_DRAWS):
-        drawn = [redraw_prescribed_path_noise(own, problem.system, problem.options, rng) for own in problem.episodes]
-        trial = problem.with_episodes(drawn, ()).evaluate(x, False, evaluation.equilibrium_guesses)
-        if trial.ok:
-            after, _ = linearization_without_weak_priors(problem, replace(trial, jacobian=evaluation.jacobian))
-            found.append(np.zeros(len(before)))
-            found[-1][rows] = (after - before)[rows]
-    return np.stack(found, axis=1) / np.sqrt(len(found)) if found else np.zeros((len(before), 0))
 
 
 def _basis(matrix: Array) -> Array:

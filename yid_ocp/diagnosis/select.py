@@ -6,7 +6,7 @@ doi:10.1214/aos/1176347265)."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -114,7 +114,7 @@ def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> li
     else:
         near = [fit for fit in fits if _is_predicting_as_well(fit, best)]
         near.sort(key=lambda fit: (fit.effect_parameter_count, _chi2(fit)))
-    return sorted(near, key=lambda fit: not _is_plausible(fit.effects[-1], fit, limits))
+    return sorted(near, key=lambda fit: not _is_plausible(fit.effects[-1], fit, limits, in_shape=True))
 
 
 def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool:
@@ -131,26 +131,22 @@ def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool
     return bool(lost <= tie * best.chi2_per_sample or (lost <= error and ratios.mean() <= spread))
 
 
-def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether an effect is significant, and no parameter is clearly outside its prior range."""
-    return _is_within_range(effect, fit, limits, effect.prior_ranges) and _is_significant(effect, fit, limits)
-
-
-def _has_plausible_size(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether no amplitude is clearly outside its prior range; a larger one corrects other effects' errors."""
-    return _is_within_range(effect, fit, limits, effect.amplitude_names)
-
-
-def _is_within_range(effect: EffectBase, fit: RefitStatistics, limits: Thresholds, names: Iterable[str]) -> bool:
-    """Whether parameters can lie within their prior ranges, widened by a width or a factor."""
+def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds, *, in_shape: bool) -> bool:
+    """Whether no amplitude is clearly outside its prior range, widened by a width or a factor, nor a shape if asked."""
     room = limits.prior_range_margin_in_widths
-    for name in names:
+    for name in effect.prior_ranges if in_shape else effect.amplitude_names:
         low, high = effect.prior_ranges[name]
         unsure, width = limits.min_z * fit.std.get(name, 0.0), room * (high - low)
         least = low / (1 + room) if low > 0 else low - width
         if not least - unsure <= fit.values[name] <= high + width + unsure:
             return False
     return True
+
+
+def _has_plausible_sizes(fit: RefitStatistics, base: Sequence[EffectBase], limits: Thresholds) -> bool:
+    """Whether all effects of a fit beyond those of `base` have plausible amplitudes."""
+    known = {effect.label for effect in base}
+    return all(_is_plausible(e, fit, limits, in_shape=False) for e in fit.effects if e.label not in known)
 
 
 def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
@@ -252,12 +248,14 @@ def select_effects(
         if moved and not base and not search.note_skip_past_deadline("candidates from the earlier run's parameters"):
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
-            pairs = refit_with_each_effect(
-                search, (), _pairs_to_refit(search, alone, base[0]), nominal.values, "together"
-            )
-            fits += [fit for fit in pairs if _is_plausible(fit.effects[0], fit, limits)]
+            pairs = _pairs_to_refit(search, alone, base[0])
+            fits += [
+                fit
+                for fit in refit_with_each_effect(search, (), pairs, nominal.values, "together")
+                if _is_significant(fit.effects[0], fit, limits)
+            ]
         # an effect of implausible size would correct errors of earlier effects
-        fits = [fit for fit in fits if not base or _has_plausible_size(fit.effects[-1], fit, limits)]
+        fits = [fit for fit in fits if not base or _has_plausible_sizes(fit, base, limits)]
         near = _near_best_models(fits, limits) if fits else []
         first = first or [*near[:1], *sorted((fit for fit in fits if fit is not near[0]), key=_chi2)]
         better = next((fit for fit in near if _is_needed(current, fit, fit.effects[-1], limits)), None)
@@ -325,9 +323,7 @@ def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choi
     tried = [pair for pair in tried if pair[0][0].label != label]
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
-    near = _near_best_models(
-        [own, *(fit for fit in others if _has_plausible_size(fit.effects[-1], fit, limits))], limits
-    )
+    near = _near_best_models([own, *(fit for fit in others if _has_plausible_sizes(fit, rest, limits))], limits)
     better = next((fit for fit in near if _is_needed(without, fit, fit.effects[-1], limits)), own)
     if better is not own:
         search.progress.begin_stage(f"put {better.effects[-1].label} in the place of {label}")

@@ -8,8 +8,8 @@ freedom."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.special
@@ -18,11 +18,14 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.problem.options import ExcessResidualCriteria
+from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
+from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter, twice_applied_effort_filter
+from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, joint_angle_noise_std
 from yid_ocp.sensors.mounted import MountedSensor
 
 RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
+_N_PATH_NOISE_DRAWS = 32  # draws of encoder noise, which give the variance of a score to a quarter
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
@@ -136,6 +139,53 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     spread = spread[:, np.isfinite(spread).all(axis=0)]
     columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
+
+
+def path_noise_spread(
+    problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
+) -> Array:
+    """Spread F (nr, K) of the points' residuals by the noise of encoders that move prescribed arms, a draw a column.
+
+    F F' is the covariance that this noise adds. A lightly damped object rings with it, which is neither white nor an
+    error of the model. `predicted` returns the residual of a problem with redrawn episodes, None where it fails; by
+    default that at the unknowns `x`. K is 0 where no prescribed joints move an object."""
+
+    def evaluated(own: EstimationProblem) -> Array | None:
+        found = own.evaluate(x, False)
+        return found.residual if found.ok else None
+
+    residual_of = predicted or evaluated
+    before = residual_of(problem)
+    points = {group.name for episode in problem.episodes for group in episode.recording.points}
+    rows = [c.residual_indices for c in residual_channel_indices(problem) if c.group in points]
+    moves_object = problem.system.prescribed and problem.system.unprescribed_coordinate_indices
+    if before is None or not rows or not moves_object:
+        return np.zeros((0 if before is None else len(before), 0))
+    rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
+    for _ in range(_N_PATH_NOISE_DRAWS):
+        drawn = [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
+        after = residual_of(problem.with_episodes(drawn, ()))
+        if after is not None:
+            found.append(np.zeros(len(before)))
+            found[-1][at] = (after - before)[at]
+    return np.stack(found, axis=1) / np.sqrt(len(found)) if found else np.zeros((len(before), 0))
+
+
+def _with_path_noise_redrawn(episode: Episode, problem: EstimationProblem, rng: np.random.Generator) -> Episode:
+    """The episode moved by its recorded angles with one more draw of their encoders' noise. Measurements stay."""
+    joints, system, options = episode.recording.joints, problem.system, problem.options
+    names = () if joints is None else tuple(name for name in system.prescribed if name in joints.names)
+    if joints is None or not names:
+        return episode
+    encoders = options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
+    std = joint_angle_noise_std(joints, names, encoders, episode.name)
+    position = joints.position.copy()
+    position[:, [joints.names.index(name) for name in names]] += std * rng.standard_normal((len(position), len(names)))
+    moved = replace(episode.recording, joints=replace(joints, position=position))
+    low_pass, clamps = LowPassFilter(options.path_cutoff), options.clamp_pose_definitions_from_points
+    path = prescribed_coordinates_at_nodes(moved, system, episode.grid, low_pass, clamps)
+    start = np.concatenate([episode.initial_known_coordinates[: len(system.driven)], path[0]])
+    return replace(episode, prescribed_path=path, initial_known_coordinates=start)
 
 
 def residuals_exceed_noise(

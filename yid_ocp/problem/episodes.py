@@ -273,25 +273,6 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     return replace(episode, tracking_feedback=loop)
 
 
-def redraw_prescribed_path_noise(
-    episode: Episode, system: System, options: ProblemOptions, rng: np.random.Generator
-) -> Episode:
-    """The episode moved by its recorded angles with one more draw of their encoders' noise. Measurements stay."""
-    joints = episode.recording.joints
-    names = () if joints is None else tuple(name for name in system.prescribed if name in joints.names)
-    if joints is None or not names:
-        return episode
-    encoders = options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
-    std = joint_angle_noise_std(joints, names, encoders, episode.name)
-    position = joints.position.copy()
-    position[:, [joints.names.index(name) for name in names]] += std * rng.standard_normal((len(position), len(names)))
-    moved = replace(episode.recording, joints=replace(joints, position=position))
-    low_pass, clamps = LowPassFilter(options.path_cutoff), options.clamp_pose_definitions_from_points
-    path = prescribed_coordinates_at_nodes(moved, system, episode.grid, low_pass, clamps)
-    start = np.concatenate([episode.initial_known_coordinates[: len(system.driven)], path[0]])
-    return replace(episode, prescribed_path=path, initial_known_coordinates=start)
-
-
 def truncate_episode(episode: Episode, steps: int) -> Episode:
     """Truncate an episode to its first `steps` steps and the measurements in them."""
     steps = min(steps, episode.grid.steps)
