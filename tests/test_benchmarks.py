@@ -16,8 +16,6 @@ from yid_ocp.diagnosis.events import ForceOrFaultEvent
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.parallel import WorkerConfig
 
-# -- run.py: ratios within one run ------------------------------------------------------------------------------------
-
 
 @pytest.fixture(scope="module")
 def run(benchmark_module):
@@ -46,9 +44,6 @@ def test_a_regression_is_a_ratio_that_grew_beyond_the_tolerance(run):
     assert "limit 20 s" in found[2]
 
 
-# -- ablation.py: what each rule is worth -----------------------------------------------------------------------------
-
-
 def test_a_rule_is_worth_the_cases_that_change_without_it(benchmark_module, monkeypatch, tmp_path):
     ablation, asked = benchmark_module("ablation"), []
     ways = [("effect a@b", [True, False]), ("effect a@b", [False, True]), ("unknown -", [False, False])]
@@ -63,9 +58,6 @@ def test_a_rule_is_worth_the_cases_that_change_without_it(benchmark_module, monk
     assert dict(found) == {"cases": 9, "not_judged": 1, "lost": 1, "gained": 1, "otherwise": 1}
     assert asked == [["diagnosis.min_z=0"]]
     assert set(ablation.NEUTRAL) <= {entry.name for entry in fields(Thresholds)}
-
-
-# -- coverage.py: whether standard deviations are true ----------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +137,6 @@ def test_standard_deviations_of_a_few_twins(coverage, tmp_path):
     assert coverage.in_band(float(values @ values), len(values))
 
 
-# -- events.py: pushes that are found ---------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def events(benchmark_module):
     return benchmark_module("events")
@@ -185,9 +174,6 @@ def test_injected_pushes_of_a_real_double_pendulum_are_found(events):
     assert score.apart >= 3
 
 
-# -- false_alarms.py: clean twins and those with an effect ------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def alarms(benchmark_module, coverage):
     return benchmark_module("false_alarms", coverage=coverage)
@@ -220,9 +206,6 @@ def test_noise_is_no_gap_and_an_offset_beyond_what_is_stated_is_named(alarms, tm
     twins = alarms.diagnosed(made, "[kelvin_voigt, joint_viscous, effort_offset]", workers, tmp_path)
     assert [twin.error for entries in twins.values() for twin in entries] == ["", ""]
     assert alarms.shortcomings(twins) == []
-
-
-# -- kills.py and step_order.py ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

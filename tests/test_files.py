@@ -121,8 +121,6 @@ def test_where_two_processes_differ_is_said():
     assert software_fingerprint_differences({**here, "numpy": "2"}, here) == ["numpy unknown instead of 2"]
 
 
-# -- files from outside -----------------------------------------------------------------------------------------------
-
 OPENERS = {"open", "read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "read_csv"}
 OPENERS |= {"parse", "iterparse", "from_xml_path", "File", "ParquetFile", "read_table", "c3d", "AnyReader", "Reader"}
 OPENERS |= {"imread", "read_image", "read_point_cloud", "read_triangle_mesh"}

@@ -35,8 +35,6 @@ from yid_ocp.parallel import resumable_tasks as parallel_tasks
 from yid_ocp.parallel.threads_and_processes import _max_threads as threads_of_process
 from yid_ocp.version import software_fingerprint
 
-# -- what tasks do ----------------------------------------------------------------------------------------------------
-
 
 def counted(number: int, calls: Path | str) -> dict[str, Any]:
     """Twice a number; every call leaves a line in a file that does not count as an input."""
@@ -89,9 +87,6 @@ def threads(monkeypatch):
     monkeypatch.setattr(parallel_tasks, "_give_back", lambda: None)  # of the many objects of a test run
     with ThreadPoolExecutor(max_workers=2) as pool:
         yield pool
-
-
-# -- kept and resumed -------------------------------------------------------------------------------------------------
 
 
 def test_results_come_in_the_order_of_the_tasks_and_progress_is_told_of_each(tmp_path, threads):
@@ -195,9 +190,6 @@ def test_paths_are_absolute_for_workers_elsewhere(tmp_path, threads, monkeypatch
     assert found.value == [str(tmp_path / "text")] * 2
 
 
-# -- what is wrong ----------------------------------------------------------------------------------------------------
-
-
 def test_a_failing_task_is_recorded_tried_again_and_the_others_go_on(tmp_path, threads, caplog):
     broken, folder = tmp_path / "broken", tmp_path / "results"
     found = run_tasks(fragile, tasks_of(5, broken=str(broken)), folder, threads)
@@ -263,9 +255,6 @@ class Breaking(InlineExecutor):
 def test_an_executor_that_breaks_leaves_what_was_done(tmp_path):
     found = run_tasks(slow, tasks_of(3), tmp_path, Breaking())
     assert [(entry.value, entry.error) for entry in found] == [(0, ""), *[(None, "the executor broke")] * 2]
-
-
-# -- processes --------------------------------------------------------------------------------------------------------
 
 
 def test_one_process_and_two_find_the_same(tmp_path):
@@ -358,9 +347,6 @@ def test_an_interrupted_or_killed_run_leaves_its_results_and_no_process(tmp_path
     assert wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 20)
     names = [json.loads(path.read_text())["name"] for path in (tmp_path / "results").glob("*.json")]
     assert names == ["0.0"]
-
-
-# -- items at work side by side, whose questions are answered together -------------------------------------------------
 
 
 class Answers:

@@ -528,8 +528,6 @@ def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     assert choose_cable_memory_fit(problem, None, found).solution is found
 
 
-# -- what is predicted ------------------------------------------------------------------------------------------------
-
 ENTRY = {
     "recording": "run",
     "rmse": {"points.a": 0.02, "points.b": 0.01, "points": 0.016},

@@ -252,9 +252,6 @@ def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
     assert len(set(ISSUE_CAUSE_DESCRIPTIONS.values())) == len(ISSUE_CAUSE_DESCRIPTIONS)
 
 
-# -- gaps -------------------------------------------------------------------------------------------------------------
-
-
 def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_in_motion():
     parts = split_recording_at_gaps(without(made(), 3.0, 5.0), (), True)
     assert [(p.joints.t[0], p.joints.t[-1]) for p in parts.recordings] == [(0.0, 2.99), (5.01, 8.0)]

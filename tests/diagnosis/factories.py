@@ -42,9 +42,6 @@ def cases(names: str, rows: Mapping[str, object]):
     return pytest.mark.parametrize(names, list(rows.values()), ids=list(rows))
 
 
-# -- effects ----------------------------------------------------------------------------------------------------------
-
-
 class Local(EffectBase):
     """One that says nothing of other places."""
 
@@ -81,9 +78,6 @@ def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTe
     return NullTestResult(chi2, degrees, p, dict(channels), tuple(windows))
 
 
-# -- screening --------------------------------------------------------------------------------------------------------
-
-
 def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) -> _EffectSignature:
     """A signature; its noise is white unless given, and no stated priors contribute."""
     columns = np.asarray(columns, float)
@@ -116,9 +110,6 @@ def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
     seen = [visible(entry.effect) for entry in scores] if seen is None else seen
     joint = SimpleNamespace(ranked_pairs=lambda among: iter(pairs))
     return ScreeningResult(tuple(seen), tuple(scores), table or alike(labels, np.eye(len(labels))), joint)
-
-
-# -- refits -----------------------------------------------------------------------------------------------------------
 
 
 def loss(*means: float, count=100.0, channels=None) -> HeldOutLoss:
@@ -165,8 +156,6 @@ def carried(name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> Eff
     return EffectAmplitudeTransferCheck("friction@elbow", name, "N m", values[0], stds[0], values[1], stds[1], agrees)
 
 
-# -- smoother ---------------------------------------------------------------------------------------------------------
-
 FORCE, OTHER_FORCE = SmoothedUnknownGroup("T1", "force"), SmoothedUnknownGroup("T2", "force")
 READ_FORCE, BIAS = SmoothedUnknownGroup("elbow", "force", True), SmoothedUnknownGroup("camera", "bias")
 OFFSET = SmoothedUnknownGroup("left", "offset")
@@ -199,9 +188,6 @@ def smoothed(
         **dict(zip(("chi2_before", "chi2_after", "dof_before", "dof_after"), (*chi2, *degrees), strict=True)),
         log_evidence=dict.fromkeys(("none", "both", "plant", "sensor"), 0.0) | dict(evidence or {}),
     )
-
-
-# -- the whole finding ------------------------------------------------------------------------------------------------
 
 
 def place(location="T1", share=1.0, observable=True, windows=()) -> GapLocation:

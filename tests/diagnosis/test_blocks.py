@@ -32,9 +32,6 @@ def test_the_held_out_blocks_begin_where_the_others_do(swinging):
     assert finding.gap_locations[0].location == "elbow"
 
 
-# -- recordings that are not followed to their end --------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Held:
     """A recording of so many steps of 10 ms, of which a model follows `until`."""

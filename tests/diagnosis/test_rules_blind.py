@@ -32,8 +32,6 @@ from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles
 KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
 
 
-# -- the ensemble -----------------------------------------------------------------------------------------------------
-
 DAMPER = effect("kelvin_voigt@T1", amplitude("tau", expected=(0.0, 0.2), unit="s"))
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
 TILT = effect("gravity_tilt@world", *(amplitude(n, lower=-1.0, expected=(-0.5, 0.5)) for n in ("rx", "ry")))
@@ -213,8 +211,6 @@ def test_what_is_detectable_survives_as_plain_data(drawn):
     assert other._inside(np.random.default_rng(1), 3.0) == drawn()._inside(np.random.default_rng(1), 3.0)
 
 
-# -- the plan ---------------------------------------------------------------------------------------------------------
-
 WEIGHTS = {"a": 0.4, "b": 0.2, "bare": 0.1}
 WHOLE = frozenset({"a", "b"})
 
@@ -296,9 +292,6 @@ def test_parameters_with_priors_are_drawn_in_their_order_so_that_a_seed_draws_th
 def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
     found = counted(plan_blind_cases(100, 1, {"bare": 1.0}), lambda e: e.category)
     assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
-
-
-# -- sizes ------------------------------------------------------------------------------------------------------------
 
 
 def detectable(of, columns, **shapes):

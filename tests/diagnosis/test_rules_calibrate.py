@@ -153,9 +153,6 @@ def test_every_rule_is_of_a_threshold() -> None:
     assert wide.significance_level > 1 > Thresholds().significance_level
 
 
-# -- the calibration that is kept beside the code --------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def kept():
     return json.loads((files("yid_ocp") / "data" / "defaults" / "thresholds.json").read_text("utf-8"))

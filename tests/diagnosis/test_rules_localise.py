@@ -67,9 +67,6 @@ def test_touching_spans_are_one_stretch(spans, expected):
     assert merge_time_intervals(spans) == expected
 
 
-# -- what effects close -----------------------------------------------------------------------------------------------
-
-
 T1, T2, T3 = place("T1"), place("T2"), place("T3")
 
 
@@ -108,9 +105,6 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
     assert found == {"T1": seen, "world": residual, "T2": (), "T3": ()}
     [whole] = gap_locations_from_effect_closures([place("T2")], {"T2": 1.0}, [], residual)
     assert whole.time_windows == residual
-
-
-# -- the map ----------------------------------------------------------------------------------------------------------
 
 
 @cases(

@@ -51,8 +51,6 @@ def said(verdict="effect", effects=(), which=None, where=(), confusable=(), clos
     }
 
 
-# -- marks ------------------------------------------------------------------------------------------------------------
-
 RIGHT, WRONG, RUBS = "kelvin_voigt@T1", "density@T2", "joint_coulomb@elbow"
 NULL, SINGLE, PAIR = label("null"), label("single", KV), label("pair", KV, DRY)
 OUTSIDE, LEFT_OUT = label("outside", GUST), label("left_out", KV)
@@ -144,9 +142,6 @@ def test_a_parameter_a_fifth_off_is_within_95_percent_or_not(value, std, inside)
 def test_parameters_that_cannot_be_compared_are_left_out(injected, effects, values):
     found = score_blind_case(label("single", injected), said("effect", effects, values=dict.fromkeys(effects, values)))
     assert found.errors == {}
-
-
-# -- rates ------------------------------------------------------------------------------------------------------------
 
 
 def marked(category, **changed):
@@ -283,8 +278,6 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     assert asked == [["held out"], ("settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
 
 
-# -- judged again -----------------------------------------------------------------------------------------------------
-
 WEAK, STRANGE = effect("joint_viscous@elbow", amplitude("b")), effect("joint_spring@elbow", amplitude("stiffness"))
 
 
@@ -379,9 +372,6 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
         "not_judged -",
     )
     assert "| of.it | 2 | 1 |" in (tmp_path / "other/table.md").read_text()
-
-
-# -- slices -----------------------------------------------------------------------------------------------------------
 
 
 def written_slice(tmp_path, part, cases, **changes):

@@ -103,9 +103,6 @@ def solved(monkeypatch):
     return made
 
 
-# -- where weights stand ----------------------------------------------------------------------------------------------
-
-
 def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
     problem = Problem(lambda values: 1.0)
     refit_with_effects(problem, [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
@@ -149,8 +146,6 @@ def test_a_refit_that_explains_much_but_not_all_is_half_done(before, after, half
     # compared with the same model without the effect
     assert all((asked["k"], asked[A], asked[S]) == (3.0, 0.25, 0.5) for asked in problem.asked)
 
-
-# -- refits -----------------------------------------------------------------------------------------------------------
 
 START = {"k": 5.0, "k[run]": 6.0, "start.q.k[run]": 7.0, A: 0.75, S: 0.9}
 
@@ -243,9 +238,6 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
     assert found.values[A] == pytest.approx(0.75)
 
 
-# -- what is remembered -----------------------------------------------------------------------------------------------
-
-
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
     store = Memory({"friction@elbow": StoredFit(values, std, {FRICTION.label: 0.2}, "long ago")})
@@ -333,9 +325,6 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     batches.clear()
     assert len(refit_with_each_effect(RefitContext("problem", LIMITS, Heard()), (), tried, {})) == 6
     assert batches == [[*"abcdef"]]
-
-
-# -- held-out recordings ----------------------------------------------------------------------------------------------
 
 
 def episode(name="other", steps=100, time_step=0.01, of=()):

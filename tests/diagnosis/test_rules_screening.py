@@ -54,9 +54,6 @@ def test_shapes_are_tried_evenly_over_their_range(expected, count, values):
     assert all(len(entry) == 1 for entry in found)
 
 
-# -- projection and noise ---------------------------------------------------------------------------------------------
-
-
 def toeplitz(colour, count):
     lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     return np.where(lags < len(colour), np.array(colour)[np.minimum(lags, len(colour) - 1)], 0.0)
@@ -110,9 +107,6 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
-# -- what could be seen -----------------------------------------------------------------------------------------------
-
-
 @cases(
     "columns, noise, expected, size, seen",
     {
@@ -159,9 +153,6 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
     ):
         [found] = _candidate_detectable_amplitudes(point([0.0], *pair), z=2.0)
         assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
-
-
-# -- scores -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_score_is_that_of_the_lagrange_multiplier_test():
@@ -255,9 +246,6 @@ def test_scores_are_of_visible_candidates_and_the_most_promising_first():
     assert [s.predicted_chi2_decrease for s in found] == pytest.approx([9.0, 4.0])
 
 
-# -- what stands in for what ------------------------------------------------------------------------------------------
-
-
 def test_a_signature_explained_by_another():
     a = effect("a@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
     b = effect("b@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
@@ -289,9 +277,6 @@ def test_candidates_alike_explain_the_signature_from_the_limit_on():
     assert table.confusable_with("a", 0.9) == ("b", "d")
     assert table.confusable_with("a", 0.5) == ("b", "c", "d")
     assert table.confusable_with("b", 0.9) == ()
-
-
-# -- two at once -------------------------------------------------------------------------------------------------------
 
 
 def test_two_that_hide_in_each_other_show_as_a_pair():

@@ -31,9 +31,6 @@ from yid_ocp.errors import SolverError
 LIMITS = Thresholds()
 
 
-# -- losses -----------------------------------------------------------------------------------------------------------
-
-
 @cases(
     "squares, counts, mean, gap",
     {
@@ -100,8 +97,6 @@ def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
     assert error == pytest.approx(math.sqrt(3) * 10.0 / 30.0)
     assert held_out_improvement(after, before) == pytest.approx((-gained, error))
 
-
-# -- the choice -------------------------------------------------------------------------------------------------------
 
 SMALL = effect("small@x", amplitude())
 LARGE = effect("large@x", amplitude("a"), amplitude("b"))
@@ -213,9 +208,6 @@ def test_a_value_that_may_as_well_lie_within_is_not_out_of_its_range():
         assert _is_plausible(of, found, LIMITS, in_shape=False)
 
 
-# -- the shortlist ----------------------------------------------------------------------------------------------------
-
-
 FEW = _make_joint_score_model(point([0.0]))
 
 
@@ -271,8 +263,6 @@ def test_the_best_of_every_place_of_the_gap_is_refitted():
     assert shortlisted(scores, table, ("y", "z")) == ["a", "b"]
     assert shortlisted(scores[1:], table, ("y",)) == []
 
-
-# -- one effect after the other ---------------------------------------------------------------------------------------
 
 A, B, C = EFFECTS = [effect(f"{name}@x", amplitude()) for name in "abc"]
 

@@ -55,9 +55,6 @@ def seen(tests, scores=(), offsets=False):
     return NominalEvidence(fit(), *tests, screening(scores), offsets)
 
 
-# -- is there a gap ---------------------------------------------------------------------------------------------------
-
-
 @cases(
     "before, held_out, gap",
     {
@@ -110,8 +107,6 @@ def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(of, p, st
     ranked = (score(of("zero", "elbow", Parameters(())), p=p), score(effect("friction@wrist"), p=0.9))
     assert seen((outcome(), outcome()), ranked, stated).has_gap(LIMITS) is gap
 
-
-# -- the verdict ------------------------------------------------------------------------------------------------------
 
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)
 NO_INTERVAL, MUCH = closed(0.9, math.nan, math.nan), closed(0.95, 0.9, 0.98)
@@ -196,9 +191,6 @@ def test_what_effects_explain_of_what_can_be_explained(costs, decrease, part):
     assert _explained_fraction(nominal, last, None) == 1.0
 
 
-# -- on which side ----------------------------------------------------------------------------------------------------
-
-
 @cases(
     "weight, plant, sensor, both, side",
     {
@@ -231,8 +223,6 @@ def test_the_side_of_a_gap_by_evidence(weight, plant, sensor, both, side):
 def test_the_part_of_a_gap_that_can_be_explained_at_all(chi2, degrees, part):
     assert smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable_gap_fraction == pytest.approx(part)
 
-
-# -- whether effects come out the same on other recordings -------------------------------------------------------------
 
 SPRING = effect("spring@elbow", amplitude("k", lower=-9.0, expected=(0.0, 10.0)), shape("s"))
 SHIFT = effect("shift@grasp", *(amplitude(n, lower=-9.0, expected=(-1.0, 1.0), unit="m") for n in "xy"))

@@ -174,8 +174,6 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     assert test.p_value > 1e-3
 
 
-# -- effects that take most of a torque's error with them ------------------------------------------------------------
-
 STRONG, REST = 0.6, 2.0
 
 
@@ -215,9 +213,6 @@ def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
     # and what is looked for beside it stands on the same ground
     beside = linearize_candidates(made, [spring], found.values)
     assert 0.95 < float(beside.projected_residual @ beside.projected_residual) / (2 * found.cost) < 1.001
-
-
-# -- torques are regressors with errors -------------------------------------------------------------------------------
 
 
 def with_absent(step: Step, effect: str) -> Step:

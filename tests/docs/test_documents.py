@@ -122,8 +122,6 @@ def test_the_tutorial_runs(page, run_script, repository, shipped_optimization):
     run_script("\n".join(blocks(page("tutorial"), "python")), repository)
 
 
-# -- program.md -------------------------------------------------------------------------------------------------------
-
 CHECKS = """
 values = ca.Function("k", [mine.w], [k])(found["x"])
 assert solver.stats()["success"]
@@ -146,9 +144,6 @@ def test_the_program_runs(page, run_script, repository):
     named = set(re.findall(r"`nlp\.(\w+)", page("program")))
     assert {"w", "p", "f", "g", "hessian", "solver_arguments"} <= named
     assert named <= {*NonlinearProgram.__dataclass_fields__, *vars(NonlinearProgram)}
-
-
-# -- inspection.md ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -175,9 +170,6 @@ def test_the_script_of_the_inspection_runs(page, repository, monkeypatch, capsys
     monkeypatch.chdir(repository)
     exec(compile(script, "inspection.md", "exec"), {})
     assert "d del[T1_0_x] / d T1.bend = -h/2*0.5*(q0[T1_0_x] + q1[T1_0_x])" in capsys.readouterr().out
-
-
-# -- extending.md -----------------------------------------------------------------------------------------------------
 
 
 def test_the_worked_example_of_an_effect_runs(page, run_script, tmp_path):
@@ -224,9 +216,6 @@ def test_the_methods_of_an_effect_that_the_page_names_exist(page):
             assert getattr(EFFECTS[kind], name) is not getattr(EffectBase, name)
 
 
-# -- notebooks --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["first_steps", "lab_day"])
 def test_the_notebook_runs_and_shows_what_it_was_made_with(repository, monkeypatch, name):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
@@ -248,9 +237,6 @@ def test_the_notebook_runs_and_shows_what_it_was_made_with(repository, monkeypat
         assert any("text" in o for o in old.outputs) == any("text" in o for o in new.outputs), old.source
         shown = [output["data"]["text/html"] for output in new.outputs if "text/html" in output.get("data", {})]
         assert all("<table" in text for text in shown)
-
-
-# -- links and the site -----------------------------------------------------------------------------------------------
 
 
 def anchors(text: str) -> set[str]:

@@ -79,9 +79,6 @@ def swing(system, effects, angle: float, steps: int):
     return rollout.state[:, index]
 
 
-# -- the object's material --------------------------------------------------------------------------------------------
-
-
 def test_kelvin_voigt_takes_energy_out_at_its_damping_ratio() -> None:
     system, tau, steps = link(prescribed=()), 0.01, 320
     q = swing(system, [make_effect("kelvin_voigt", "T1", system, {"tau": tau})], 0.1, steps)
@@ -126,9 +123,6 @@ def test_rest_curvature_is_where_the_object_comes_to_rest() -> None:
     bent = system.with_effects([make_effect("rest_curvature", "T1", system, {"qx": 0.1, "qy": -0.2})])
     rest = EquilibriumSolver(compile_step(bent, H, use_compiler=False)).solve([], bent.parameters.vector())
     assert rest.state[:6] == pytest.approx([0.1, -0.2, 0.0] * 2)
-
-
-# -- masses, lengths, gravity, air ------------------------------------------------------------------------------------
 
 
 about_x = partial(link, prescribed=("T1_0_x", "T1_0_y", "T1_0_z"))
@@ -182,9 +176,6 @@ def test_drag_of_a_turning_link() -> None:
     effort, _ = follow(system, [make_effect("aerodynamic_drag", "T1", system, {"cd": cd})], turning(rate))
     force = 0.5 * 1.2 * cd * 2 * RADIUS * LENGTH * (rate * LENGTH / 2) ** 2
     assert effort - follow(system, [], turning(rate))[0] == pytest.approx(force * LENGTH / 2, rel=1e-3)
-
-
-# -- springs where the model is rigid ---------------------------------------------------------------------------------
 
 
 def rest_of(system: System, *effects):
@@ -262,9 +253,6 @@ def test_a_grasp_offset_moves_the_held_point() -> None:
     assert rest[foot] == pytest.approx(0.013)
 
 
-# -- arm joints -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("kind", "values", "extra"),
     [
@@ -278,9 +266,6 @@ def test_friction_works_against_the_motion(kind, values, extra, rate) -> None:
     system = hinge()
     effort, _ = follow(system, [make_effect(kind, "left_a", system, values)], turning(rate))
     assert effort == pytest.approx(extra(rate), rel=1e-6, abs=1e-9)
-
-
-# -- friction that holds at rest, by Dahl's equation -------------------------------------------------------------------
 
 
 TAU = 0.8
@@ -368,9 +353,6 @@ def test_where_it_begins_is_estimated_with_every_recording() -> None:
     assert initial_internal_state_offset_bounds(whole, [name]).tolist() == [1.0]
     known = whole.parameters.vector({"joint_presliding@left_a.tau_c": 0.1})
     assert estimated_initial_state_names(whole, options, (), known) == (name,)
-
-
-# -- what sensors read ------------------------------------------------------------------------------------------------
 
 
 def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:

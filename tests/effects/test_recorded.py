@@ -230,9 +230,6 @@ def test_the_filter_follows_the_momentum_of_the_effects(driven) -> None:
     assert other == pytest.approx(without, rel=1e-9)
 
 
-# -- all effects at once ----------------------------------------------------------------------------------------------
-
-
 FEW_STEPS = 4
 
 

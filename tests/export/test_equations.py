@@ -150,9 +150,6 @@ def test_a_large_jacobian_is_left_to_the_reader(symbols, monkeypatch):
     assert "rows_by_unknowns" not in [function.name() for function in _exported_step_functions(symbols)]
 
 
-# -- the LaTeX sheet ---------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def held(urdf_folder):
     """A driven shoulder, an elbow with a spring and an effect with inner coordinates on a rod that is held."""

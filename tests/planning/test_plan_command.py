@@ -165,9 +165,6 @@ def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, ca
     assert result["from"]["parameters"]["point_mass@tip.mass"] == 0.1
 
 
-# -- the goal `information` -------------------------------------------------------------------------------------------
-
-
 def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path):
     outcome = run_plan(load_config(informing), tmp_path / "out")
     assert outcome.is_successful, outcome.result["message"]

@@ -133,8 +133,6 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     assert counted @ counted == pytest.approx(plain @ np.linalg.solve(covariance, plain), rel=1e-9)
 
 
-# -- clocks -----------------------------------------------------------------------------------------------------------
-
 BENCH = """<mujoco>
   <option timestep="0.00025" integrator="implicitfast"/>
   <worldbody>

@@ -25,9 +25,6 @@ from yid_ocp.problem.signal_filters import LowPassFilter, twice_applied_effort_f
 PLAIN = LowPassFilter(math.inf)
 
 
-# -- torques ----------------------------------------------------------------------------------------------------------
-
-
 def driven(effort, t=None, kind="command"):
     effort = np.asarray(effort, float).reshape(-1, 1)
     t = 0.1 * np.arange(len(effort)) if t is None else np.asarray(t, float)
@@ -164,9 +161,6 @@ def test_sensors_are_known_by_what_was_recorded(made, expected):
     assert recorded_signal_kinds([with_efforts, made]) == expected | both
 
 
-# -- prescribed paths -------------------------------------------------------------------------------------------------
-
-
 def moving(*names):
     return SimpleNamespace(prescribed=names)
 
@@ -250,9 +244,6 @@ def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
     np.testing.assert_allclose(found, np.outer(TimeGrid(0.5, 0.1, 20).node_times, [1.0, 2.0, 0.0]), atol=2e-3)
     held = _smoothed_point_path(made, "o", TimeGrid(2.9, 0.1, 3), PLAIN)
     np.testing.assert_allclose(held[2], held[3])
-
-
-# -- the low-pass filter ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frequency", [0.5, 5.0, 10.0, 20.0])

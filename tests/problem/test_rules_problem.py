@@ -41,8 +41,6 @@ def make(free_step):
     return build
 
 
-# -- the unknown vector -----------------------------------------------------------------------------------------------
-
 LAYOUT = UnknownVectorLayout(("a", "b"), ("l",), ("q.x", "p.x"), ("one", "two"))
 
 
@@ -85,9 +83,6 @@ def test_start_bounds_and_values_by_name(make):
     found = problem.vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
     changed = {"elbow.stiffness": 9.0, "shoulder.stiffness": 0.0, "start.q.elbow[run_1]": 0.5}
     assert problem.named_values(found) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0), **changed}
-
-
-# -- priors and scales ------------------------------------------------------------------------------------------------
 
 
 def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, free_step):
@@ -164,9 +159,6 @@ def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(m
     width = upper[2] - lower[2]
     assert problem.unknown_scales[2] == pytest.approx(0.1 * width if math.isfinite(width) else 1.0)
     np.testing.assert_allclose(make(values={"elbow.rest": -0.4}).unknown_scales, [6.0, 3.0, 0.4])
-
-
-# -- rows -------------------------------------------------------------------------------------------------------------
 
 
 def test_the_residual_is_made_of_measurements_then_priors(make):
@@ -251,9 +243,6 @@ def test_a_problem_whose_rollout_fails_says_why(make):
     assert failing.message.startswith("run_1: no equilibrium found")
     cost, gradient, same = problem.cost_and_gradient([1e8])
     assert (cost, gradient.tolist(), same.ok) == (math.inf, [0.0], False)
-
-
-# -- held-out recordings ----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -30,8 +30,6 @@ from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfte
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 from yid_ocp.vision.surface_meshes import load_robot_meshes_by_joint
 
-# -- in motion ---------------------------------------------------------------------------------------------------------
-
 
 def point(system: System, name: str, q: np.ndarray) -> np.ndarray:
     symbols = ca.SX.sym("q", system.n_coordinates)
@@ -211,9 +209,6 @@ def test_what_acts_is_where_it_acts(single_arm):
     assert len(motion.sticks) == len(animated(single_arm, q).sticks)
 
 
-# -- sparsity patterns -------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def drawn(monkeypatch):
     """Figures that were saved."""
@@ -284,9 +279,6 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path):
     with pytest.raises(OutputError, match="cannot be written") as caught:
         draw_sparsity_patterns(tmp_path / "nowhere" / "p.png", [[pattern()]])
     assert str(tmp_path / "nowhere") in str(caught.value.where)
-
-
-# -- of a page ---------------------------------------------------------------------------------------------------------
 
 
 def test_changes_of_very_different_sizes_get_a_logarithmic_axis():

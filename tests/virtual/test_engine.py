@@ -209,9 +209,6 @@ def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, mo
         simulate_in_mujoco(system, TRUTH, motion, SimulationOptions(0.1, time_step=1e-3), injected=Thrown())
 
 
-# -- experiments ------------------------------------------------------------------------------------------------------
-
-
 def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     system, run = SYSTEMS[1], runs(1, 1e-3, 3.0)
     motion = random_multisine_motion(system, TRUTH, seed=7)

@@ -174,9 +174,6 @@ def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
         run_experiment_with_effects(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])
 
 
-# -- outside the library -----------------------------------------------------------------------------------------------
-
-
 class Bench:
     """MuJoCo's model with one effect, whose force is asked for at states of one's choice."""
 

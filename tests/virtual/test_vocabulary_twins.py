@@ -177,9 +177,6 @@ def test_what_lies_uphill_is_found_by_a_refit_from_where_its_screening_leads(kin
     assert found.held_out_loss.chi2_per_sample < 0.01 * start.held_out_loss.chi2_per_sample
 
 
-# -- position servos --------------------------------------------------------------------------------------------------
-
-
 SERVO_POSTURE = {"pan": 0.2, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
 JOINTS = tuple(SERVO_POSTURE)
 SERVO = {"servo_gain": 40.0, "servo_damping": 2.0, "servo_delay": 0.035}

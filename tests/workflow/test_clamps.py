@@ -114,9 +114,6 @@ def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):
         run_simulate(run, tmp_path / "made")
 
 
-# -- earlier runs -----------------------------------------------------------------------------------------------------
-
-
 def folder_of(path, values=(0.02, 5e-5), std=(2e-4, 1e-6), correlation=0.5, **more):
     """A run folder of `solve` as far as a baseline reads it."""
     path.mkdir()
