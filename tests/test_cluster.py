@@ -158,7 +158,7 @@ def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, monke
         return real(**where)
 
     monkeypatch.setattr(distributed, "Client", busy)
-    answer = pytest.raises(WorkerError, match="event loop did not start") if refused else nullcontext()
+    answer = pytest.raises(WorkerError, match="event loop of Dask did not start") if refused else nullcontext()
     with answer, connected(scheduler.address) as (executor, _):
         assert executor.submit(abs, -3).result(timeout=60) == 3
     assert len(asked) == 3
