@@ -44,6 +44,9 @@ class Problem:
     def problem(self):
         return self
 
+    def without_other_places(self, effects):
+        return self
+
     def with_nominal_and_effects_free(self, effects):
         self.freed = tuple(effects)
         return self
