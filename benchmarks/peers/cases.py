@@ -295,7 +295,7 @@ CASES: Mapping[str, Case] = MappingProxyType(
             lambda seed, folder: servo_trial(SERVO_KINDS[seed]),
             True,
         ),
-        "springs": Case("two springs in series, only the end seen", "closed form", (1, 2, 3, 4, 5), _springs),
+        "springs": Case("two springs in series, only the end measured", "closed form", (1, 2, 3, 4, 5), _springs),
         "scaled_torque": Case("torques recorded 15 % too large", "MuJoCo", (1, 2, 3, 4, 5), _scaled_torque),
     }
 )

@@ -15,7 +15,7 @@ BEGIN, END = "<!-- peers: begin -->", "<!-- peers: end -->"
 HELD_OUT = {"springs": (1e3, "mm"), "servo": (1.0, "rad")}  # scale and unit; torques elsewhere
 MARKERS = "osD^v<>PX*"
 HEADER = (
-    "tool", "called known", "largest error of these", "called known, but wrong", "intervals that hold the truth",
+    "tool", "called known", "largest error of these", "called known, but wrong", "intervals that contain the truth",
     "held out", "CPU [s]", "lines",
 )  # fmt: skip
 MADE_BY = {
