@@ -76,8 +76,8 @@ def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
 def raise_on_signals() -> Iterator[None]:
     """Raise `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during a block (context manager).
 
-    An exception can be lost: in garbage collection, in callbacks of libraries, in a call that does not return. It is
-    therefore raised again every `_RERAISE_INTERVAL` seconds. After `_FORCED_EXIT_DELAY` seconds the process is ended
+    The exception is raised again every `_RERAISE_INTERVAL` seconds, because it can be lost in garbage collection, in
+    callbacks of libraries, or in a call that does not return. After `_FORCED_EXIT_DELAY` seconds the process is ended
     with the exit code that shells expect; only the folders of `remove_folder_on_forced_exit` are removed before.
     Signals that the parent process ignores (`nohup`) stay ignored. Outside the main thread the block has no effect."""
     if threading.current_thread() is not threading.main_thread():

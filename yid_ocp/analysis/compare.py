@@ -256,7 +256,7 @@ def explain_paper_estimates(
 ) -> tuple[str, ...]:
     """Explain why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours, one sentence each.
 
-    `estimates` come from recordings of such an experiment, `truth` holds known values. The result is empty if the model
+    `estimates` come from recordings of this experiment, `truth` holds known values. The result is empty if the model
     does not explain the recordings. The explanation is the first of these that applies to synthetic recordings:
 
     - not informed: the recordings do not determine the parameter, or so weakly that its interval contains the published

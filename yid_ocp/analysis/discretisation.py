@@ -256,9 +256,10 @@ def inflate_estimates_by_discretisation(
     found: Mapping[str, EstimateShiftByLinksAndTimeStep],
     sizes: Mapping[str, float],
 ) -> dict[str, ParameterEstimate]:
-    """Include the discretisation shifts `found` of estimates in their standard deviations, intervals and verdicts.
+    """Add the discretisation error to the standard deviations, intervals and verdicts of estimates.
 
-    A verdict can only get worse. `sizes` are typical sizes, as in `inference.uncertainty.parameter_verdict`."""
+    The error is taken from the shifts `found` at finer discretisations. A verdict can only get worse. `sizes` are
+    typical sizes, as in `inference.uncertainty.parameter_verdict`."""
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
         entry = counted[name]
@@ -305,10 +306,10 @@ def step_map_natural_frequencies(
 ) -> NaturalFrequencies:
     """Compute the natural frequencies of a system about an equilibrium, as one integration step reproduces them.
 
-    They are the eigenvalue angles of the linearised step without damping. The driven and prescribed coordinates are
-    fixed at `configuration` [rad or m]. The search for the equilibrium starts at `guess` (n,). `force_split` and
-    `constraint_force` are as in `compile_step`: the midpoint rule lowers a frequency f to atan(pi f h)/(pi h), with the
-    time step h, and the force split affects only the growth of modes."""
+    The frequencies follow from the eigenvalues of the linearised step without damping. The driven and prescribed
+    coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts at `guess` (n,).
+    `force_split` and `constraint_force` are as in `compile_step`: the midpoint rule lowers a frequency f to atan(pi f
+    h)/(pi h), with the time step h, and the force split affects only the growth of modes."""
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: with these held still nothing can swing"

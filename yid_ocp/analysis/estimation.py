@@ -46,21 +46,17 @@ def solve(
     The steps are: the best fit of several starts (`solvers.solve`); a refit without cable memory if the recordings do
     not support it; profile-likelihood intervals of weakly determined parameters; the errors of the discretisations in
     `problem.options.checked_discretisations`, which the standard deviations include. Verdicts are `not_trusted` if the
-    time step is unstable, if clocks drift, or if a prediction without a model has a smaller error.
+    time step is unstable, if clocks drift, or if a prediction without a model has a smaller error. A search that does
+    not converge raises no error; see `status` and `message` of the solution.
 
     Parameters
     ----------
     solver : Solver, optional
         Default: `GaussNewton()`, regardless of the configuration file.
     initial_unknowns : sequence of float, optional
-        Default: those of the problem.
+        Default: the initial unknowns of the problem.
     callback : callable, optional
-        Receives every `Iterate`.
-
-    Returns
-    -------
-    Solution
-        With its `checks`. A search that does not converge raises no error; see `status` and `message`."""
+        Receives every `Iterate`."""
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)

@@ -158,12 +158,7 @@ def identifiability(
     intervals : iterable of str, or "all"
         Parameters for which a profile-likelihood interval is computed.
     limits : ExcessResidualCriteria, optional
-        Criteria by which a residual at a solution exceeds noise.
-
-    Returns
-    -------
-    IdentifiabilityResult
-        For p free parameters: verdicts and standard deviations, correlations and Fisher information, shape (p, p)."""
+        Criteria by which a residual at a solution exceeds noise."""
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in (own for own in wanted if own not in names):

@@ -60,7 +60,7 @@ class _PinocchioComparison:
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
     """Check a system with parameters `theta` against Pinocchio's model of the same joints and bodies.
 
-    They are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations."""
+    The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations."""
     built = system_with_numeric_parameters(system, theta)
     gravity = np.array(ca.DM(built.gravity)).ravel()
     inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))

@@ -49,7 +49,7 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
 def checked_step_linearisation(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> CheckedStepLinearisation:
-    """Linearise a step at a state (nx,), and compare A_k and B_k with central finite differences.
+    """Linearise a step at a state (nx,), and check its Jacobians A_k and B_k by central finite differences.
 
     The torque (nu,) is in N m. `path` (nc,) are the prescribed coordinates before and after the step."""
     n, pair = step.sizes["n"], (path, path) if len(path) else None
@@ -296,8 +296,8 @@ def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | Non
 def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
     """Structural sparsity patterns of the Jacobians of one step, by name.
 
-    `dR_dy` is the Jacobian of the step's residual with respect to its unknowns, `dR_dtheta` that of all rows with
-    respect to the parameters. `A` (state), `B_u` (input) and `B_theta` (parameters) are the Jacobians of the next
+    `dR_dy` is the Jacobian of the step's residual with respect to its unknowns. `dR_dtheta` is the Jacobian of all rows
+    with respect to the parameters. `A` (state), `B_u` (input) and `B_theta` (parameters) are the Jacobians of the next
     state."""
     whole = _mask(symbols.full_jacobian_sparsity_pattern)
     system = symbols.equations.system

@@ -167,10 +167,10 @@ _MAX_LISTED_SYMBOLS = 6  # names of one block that are still listed one by one
 
 @dataclass(frozen=True)
 class SymbolBlock:
-    """A named block of equations or variables of one kind.
+    """A named block of equations or variables of one kind, as a symbolic column (k, 1).
 
-    `labels` has one entry per row of the (k, 1) expression: the name of a joint, grasp equation, internal coordinate or
-    parameter. In the LaTeX template, `#` is replaced by the label."""
+    `labels` has one entry per row: the name of a joint, grasp equation, internal coordinate or parameter. In the LaTeX
+    template, `#` is replaced by the label."""
 
     name: str
     labels: tuple[str, ...]

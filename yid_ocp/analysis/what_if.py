@@ -124,12 +124,7 @@ def what_if(
     considered_changes : collection of str, optional
         Names of changes to consider; default: all.
     evaluate_changes : callable, optional
-        Replacement for `evaluate_experiment_change_sets`, for example in other processes.
-
-    Returns
-    -------
-    ExperimentRanking
-        For each change the number of identifiable parameters, relative standard deviations [1] and the gain [nat]."""
+        Replacement for `evaluate_experiment_change_sets`, for example in other processes."""
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)

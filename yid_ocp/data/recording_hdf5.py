@@ -51,8 +51,8 @@ _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
     """Read and check a `yid-recording/1` file. With `allow_nan_effort`, efforts may contain NaN.
 
-    Raises `DataError` if the file is missing, not HDF5, damaged or of another format, if it has an unknown group,
-    dataset, attribute or unit or lacks a required one, or if `validated_recording` refuses the recording."""
+    Raises `DataError` if the file is missing, not HDF5, damaged or of another format, if a group, dataset, attribute or
+    unit is unknown or missing, or if `validated_recording` refuses the recording."""
     path = Path(path)
     digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"

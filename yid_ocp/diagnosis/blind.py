@@ -69,7 +69,7 @@ def plan_blind_cases(
     chains: frozenset[str] = frozenset(),
     purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
-    """Plan `count` blind cases, distributed over experiments by `weights`, in an order drawn by the seed.
+    """Plan `count` blind cases of several experiments, in an order drawn by the seed.
 
     `weights` holds the share of cases of each experiment. An experiment with less than `_MIN_CASES_PER_EXPERIMENT`
     cases gets none; if all have less, the largest gets all. Objects of the experiments in `chains` can be simulated

@@ -95,6 +95,10 @@ def diagnose(
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: whether it exists, where, its causes, and what closes it.
 
+    Raises `ConfigError` or `ModelError` if a candidate does not fit the system, `DataError` if a held-out recording is
+    also estimated on or there is no noise level, and `SolverError` if the nominal model cannot be rolled out or its
+    residual is not whitened.
+
     Parameters
     ----------
     problem : EstimationProblem
@@ -108,19 +112,14 @@ def diagnose(
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline, optional
         Estimates of earlier runs of the same model (`read_estimates`), used as priors, so that changes since then are
         diagnosed. A problem that already has these priors (`with_baseline_prior`) is used as it is. An
-        `EarlierRunsBaseline` can also hold reference recordings made without the sought effects. The effects found
-        are then removed to predict them.
+        `EarlierRunsBaseline` can also hold reference recordings made without the sought effects; these are predicted
+        with the found effects removed.
 
     Returns
     -------
     DiagnosisResult
         Verdict, effects with parameters in their own units, and fractions of the gap [1]; `to_dict` has all with units.
-
-    Raises
-    ------
-    ConfigError, ModelError, DataError, SolverError
-        A candidate does not fit the system; a held-out recording is also estimated on; there is no noise level; the
-        nominal model cannot be rolled out, or its residual is not whitened."""
+    """
     # small matrices: threads of the linear algebra library cost more than they save
     with threadpoolctl.threadpool_limits(1):
         clock = {"": time.perf_counter()}

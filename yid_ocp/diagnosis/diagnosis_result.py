@@ -61,12 +61,12 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     gap_closure : GapClosure
         Fraction of the held-out gap that the accepted effects close [1], with its 95 % interval.
     explained_fraction : float
-        Decrease of r'r by the effects over the decrease by unknown forces [1].
+        Decrease of the sum of squared whitened residuals by the effects over its decrease by unknown forces [1].
     noise_floor : tuple of AssumedChannelNoiseLevel
         Root mean square error expected from noise alone, in the channel's unit (m, rad or N m).
     smoother_result : SmoothedUnknownsResult or None
         Means and standard deviations (J, nd) per recording of nd unknown forces [N m or N], offsets and biases [m] in J
-        intervals, in units of `reference_std` (nd,). None if there is no gap to locate.
+        time intervals, in units of `reference_std` (nd,). None if there is no gap to locate.
     nominal_model, final_model : RefittedModel
         `values` and `std` by parameter, each in its own unit (`problem.system.parameters[name].unit`).
     nominal_changes : tuple of NominalParameterChange

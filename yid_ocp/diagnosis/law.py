@@ -123,8 +123,8 @@ def find_gap_law(
 ) -> GapLaw | None:
     """Estimate the remaining gap as a torque law, or return None if no location allows a law or no law closes enough.
 
-    `problem` is that of the nominal model, without candidates. `last` is the model with the accepted effects, or the
-    nominal model. `places` are the locations of the gap, the most likely first."""
+    `problem` is the problem of the nominal model, without candidates. `last` is the model with the accepted effects, or
+    the nominal model. `places` are the locations of the gap, the most likely first."""
     places = [p for p in dict.fromkeys(places) if allowed_law_quantity_names(problem.system, p)][:_MAX_PLACES]
     if not places or search.note_skip_past_deadline("a law"):
         return None

@@ -81,7 +81,8 @@ class NominalEvidence:
         """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
 
         Along a signature, some channel must also exceed noise: the sum over all channels hides a few deviating samples.
-        A torque offset beyond its stated size needs no such channel, because it is one number among thousands."""
+        A torque offset beyond its stated size counts without such a channel, because it is one number among thousands.
+        """
         tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
         largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
         is_seen = largest > 1 + limits.min_channel_excess_chi2_per_dof

@@ -55,9 +55,10 @@ class FilterStateTransition:
 class KalmanStepMatrices:
     """One step of a linear Kalman filter with fixed gains. A measurement update precedes a state transition.
 
-    The state x = (s, p) contains parameters p. It is measured by y = H x + e, where the noise e has unit covariance,
-    and becomes x' = (M x, f p) + process noise. P is the covariance before the measurement, and S = I + H P H'. The
-    normalized innovations S^(-1/2) (y - H mean) of all steps are independent and have unit variance."""
+    The state x = (s, p) consists of dynamic states s and parameters p. It is measured by y = H x + e, where the noise e
+    has unit covariance, and becomes x' = (M x, f p) + process noise, with the transition M and the decay f. P is the
+    covariance before the measurement, and S = I + H P H'. The normalized innovations S^(-1/2) (y - H mean) of all steps
+    are independent and have unit variance."""
 
     observation: Array  # H, shape (r, nx)
     whitening: Array  # S^(-1/2), shape (r, r)

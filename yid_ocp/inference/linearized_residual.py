@@ -131,8 +131,8 @@ class ResidualDerivativesAtNodes:
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
         """Residual derivatives (r, d) along d directions, from the derivatives of states and efforts at K nodes.
 
-        `by_node` (K, nx, d) is the derivative of the states, `effort` (K, nc, d) that of the efforts. The K nodes begin
-        with node `first`. A residual beyond them uses the last node."""
+        `by_node` (K, nx, d) holds the derivatives of the states, `effort` (K, nc, d) the derivatives of the efforts.
+        The K nodes begin with node `first`. A residual beyond them uses the last node."""
         found = np.zeros((len(self.node), by_node.shape[2]))
         for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
             used = np.flatnonzero(by_state.any(axis=1) | by_effort.any(axis=1))

@@ -132,10 +132,10 @@ def residual_chi2_null_test(
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Whiten a residual r in noise units against further independent errors, by (I + F F')^(-1/2) r.
+    """Whiten a residual r (nr,), given in noise units, against further independent errors: (I + F F')^(-1/2) r.
 
-    Column j of the `spread` F (nr, k) is the change of the residual for one standard deviation of error j. Columns that
-    are not finite are ignored."""
+    Column j of F (nr, k), the argument `spread`, is the change of the residual for one standard deviation of error j.
+    Columns that are not finite are ignored."""
     spread = spread[:, np.isfinite(spread).all(axis=0)]
     columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
@@ -226,9 +226,10 @@ def _windows(
 
 
 def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """Mark the p-values that are significant at the false-discovery rate `level` among `tries` tests, listed or not.
+    """Mark the p-values that are significant at the false-discovery rate `level` among `tries` tests.
 
-    Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x."""
+    `p_values` may omit tests with large p-values. Benjamini and Hochberg (1995),
+    doi:10.1111/j.2517-6161.1995.tb02031.x."""
     order = np.argsort(p_values)
     passed = np.flatnonzero(np.sort(p_values) <= level * np.arange(1, len(order) + 1) / max(tries, 1.0))
     real = np.zeros(len(order), bool)

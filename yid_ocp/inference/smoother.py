@@ -363,8 +363,9 @@ def force_log_likelihood_coefficients(
 ) -> tuple[Array, Array]:
     """Log likelihood g'f - f'L f / 2 of the values f (J,) of one unknown in J intervals: returns g (J,) and L (J, J).
 
-    `unknown` is the index of the unknown; f is in units of its reference. Free parameters, states and all other
-    unknowns are integrated out; `variance` gives the variances of their groups [squared reference]."""
+    `unknown` is the index of the unknown; f is in units of the unknown's reference standard deviation. Free parameters,
+    states and all other unknowns are integrated out; `variance` gives the variances of their groups [squared
+    reference]."""
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))
     intervals = []
@@ -454,10 +455,10 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 def gap_locations_by_smoother_evidence(
     smoothed: SmoothedUnknownsResult, location_z: float = 3.0
 ) -> tuple[GapLocation, ...]:
-    """Rank all locations by their share of the log evidence. At equal shares, observable ones come first.
+    """Rank all locations by their share of the log evidence. At equal shares, observable locations come first.
 
-    A location's time windows are those in which one of its unknowns is over `location_z` standard deviations from zero.
-    """
+    The time windows of a location are those in which one of its unknowns is over `location_z` standard deviations from
+    zero."""
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
         groups.setdefault(source.location, []).append(source)

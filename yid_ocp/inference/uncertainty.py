@@ -260,7 +260,7 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Convert a covariance to names and data for result.json. `matrix` (n, n) holds the correlations.
+    """Convert correlations `matrix` (n, n) and standard deviations `std` to the covariance data of result.json.
 
     Parameters whose standard deviation is not finite and positive are left out."""
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]

@@ -97,8 +97,8 @@ class WhiteningFilter:
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.
 
-        The first column of `rows` is a residual in units of sensor noise, the others are its derivatives. `push` (N,
-        nu, c) is the tracking filter's correction of the torque and the derivatives of this correction [N m]."""
+        The first column of `rows` is a residual in units of sensor noise, all other columns are its derivatives. `push`
+        (N, nu, c) is the tracking filter's correction of the torque and the derivatives of this correction [N m]."""
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
             result[part.rows], mean, _ = self._updated(part, mean, rows[part.rows], push)

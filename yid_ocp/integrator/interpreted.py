@@ -37,7 +37,7 @@ _PointEvaluator = Callable[[Array], Array]
 class InterpretedKernel:
     """Thread-safe stepping kernel in CasADi's interpreter and NumPy, for machines without a compiler.
 
-    It has the methods of `CompiledKernel`. A point is a column of all `DiscreteEquations.arguments`. The outputs are
+    Its methods are as in `CompiledKernel`. A point is a column of all `DiscreteEquations.arguments`. The outputs are
     the rows of the balance, internal and constraint equations, then p1, then the effort of the prescribed coordinates.
     """
 

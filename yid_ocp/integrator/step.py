@@ -243,7 +243,8 @@ def simulate(
 ) -> Rollout:
     """Simulate a system over `steps` steps. Derivatives are computed along `directions`, if given.
 
-    Raises `ModelError` if an array has the wrong shape.
+    If Newton's method fails, `status` of the result reports it, and the later entries are NaN. Raises `ModelError` if
+    an array has the wrong shape.
 
     Parameters
     ----------
@@ -254,13 +255,7 @@ def simulate(
     path : array_like, shape (N + 1, nc), optional
         Prescribed coordinates at every node [rad or m]; default: their initial values.
     feedback : TrackingFeedback, optional
-        Correction of the torque by the state.
-
-    Returns
-    -------
-    Rollout
-        (q, p, z) at every node, shape (N + 1, nx), multipliers (N, m) [N s], efforts (N, nc) and torques (N, nu) [N m].
-        If Newton's method fails, `status` reports it, and the later entries are NaN."""
+        Correction of the torque by the state."""
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return simulate_rollouts(step, [inputs])[0]
 

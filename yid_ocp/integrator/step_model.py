@@ -128,7 +128,7 @@ class RolloutStatus:
 
 @dataclass(frozen=True)
 class SensitivityDirections:
-    """The d directions along which a rollout is differentiated. The first directions are those of the named parameters.
+    """The d directions along which a rollout is differentiated. The first directions are the named parameters.
 
     The tangents are the derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path
     (N + 1, nc, d) along these directions."""

@@ -52,12 +52,12 @@ def lqr_tracking_feedback(
     """Compute a feedback with finite-horizon LQR gains that keeps the driven arms near their measured motion.
 
     The gains act on the arms' angles and momenta. They minimise the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 +
-    |du|^2/torque^2 over the recording, with fixed scales for angle, rate and torque (Anderson and Moore 1990, Optimal
-    Control: Linear Quadratic Methods, section 2.4). The model is that of the arms without the object, linearised about
-    the measured motion. The reference momentum follows from the measured angles (N + 1, nu) [rad] and torques (N, nu)
-    [N m] by the arms' DEL equations, and is therefore comparable with the model's momentum. The angles must be smooth
-    enough for numerical differentiation. `arms` is the result of `compile_driven_arms_only_step`, compiled if absent.
-    """
+    du|^2/torque^2 over the recording, with fixed scales for angle, rate and torque (Anderson and Moore 1990, Optimal
+    Control: Linear Quadratic Methods, section 2.4). The model contains the arms without the object and is linearised
+    about the measured motion. The reference momentum follows from the measured angles (N + 1, nu) [rad] and torques (N,
+    nu) [N m] by the arms' DEL equations, and is therefore comparable with the model's momentum. The angles must be
+    smooth enough for numerical differentiation. `arms` is the result of `compile_driven_arms_only_step`, compiled if
+    absent."""
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arm_step = compile_driven_arms_only_step(step) if arms is None else arms
@@ -224,10 +224,10 @@ class EffectMomentumShift:
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Momentum shift at nodes 0..N-1, with effects minus recorded, (N, nu), and its derivatives (N, nu, d).
+        """Momentum (N, nu) that effects add to the recorded motion at nodes 0..N-1, and its derivatives (N, nu, d).
 
         `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
-        `names` are the parameters of the first of the d directions."""
+        The first of the d directions are the parameters `names`."""
         steps, plain_theta = len(true.torque), self.theta_without_effects(theta)
         still = np.zeros((steps, len(self._kept)))
         plain, *_ = self._maps(False)(
@@ -284,7 +284,7 @@ def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
     """Derivative of the applied torque (recorded plus feedback) with respect to an error of the recorded torque.
 
     The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
-    is assumed to be the same in this step and the previous one. `gain` (..., nu, nb) is the feedback gain of the step.
+    is assumed to be the same in this step and the previous step. `gain` (..., nu, nb) is the feedback gain of the step.
     `by_torque` (nu, nu) is `EffectMomentumShift.momentum_derivative_by_previous_torque`."""
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]

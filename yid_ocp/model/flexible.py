@@ -124,7 +124,9 @@ def flexible_object(
     """Build a flexible object as chains of rigid links, with elastic joints before each link.
 
     Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`). Parameters are `SEGMENT.length` (or `.length_0`, ...), `.mass`,
-    `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` if given).
+    `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` if given). Raises
+    `ModelError` for an unknown parent, a parent after its child, a length, mass or radius that is not positive, or
+    inconsistent links.
 
     Parameters
     ----------
@@ -133,12 +135,7 @@ def flexible_object(
     root_placement : array_like, shape (4, 4), optional
         Pose of the root; default: identity.
     gravity_fraction : float
-        Factor on the object's weight, not on its inertia; below one if something else supports it.
-
-    Raises
-    ------
-    ModelError
-        Unknown parent, parent after child, non-positive length, mass or radius, or inconsistent links."""
+        Factor on the object's weight, not on its inertia; below one if something else supports it."""
     root = Placement.identity() if root_placement is None else Placement.from_matrix(root_placement)
     parts = _Parts(frames={"object_root": Frame(-1, root)})
     fraction = None if gravity_fraction == 1 else ca.SX(gravity_fraction)
@@ -211,9 +208,9 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
     """Compute the twist-free rotation (3, 3) of each edge of a polyline relative to the previous edge.
 
-    They serve as `Segment.rest_rotation` and `Segment.link_rest_rotations`. `vertices` (k, 3) are the undeformed centre
-    line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line; default: the world
-    frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong."""
+    The rotations serve as `Segment.rest_rotation` and `Segment.link_rest_rotations`. `vertices` (k, 3) are the
+    undeformed centre line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line;
+    default: the world frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong."""
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
         what, hint = f"the vertices have the shape {points.shape}", "give x, y and z of two or more vertices"

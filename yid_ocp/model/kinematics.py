@@ -56,8 +56,8 @@ class Kinematics:
 class MultibodyLagrangianDerivatives:
     """First derivatives of the rigid-body Lagrangian, and vectors from which the second derivatives follow.
 
-    S_j is the screw of joint j and D_j = V_parent(j) x S_j. Ic_j, H_j and W_j are the inertia, momentum and weight of
-    all bodies that joint j moves:
+    S_j is the screw of joint j and D_j = V_parent(j) x S_j, with the velocity V_parent(j) of the link before the joint.
+    Ic_j, H_j and W_j are the inertia, momentum and weight of all bodies that joint j moves:
 
         dL/dv_j = S_j . H_j            dL/dq_j = D_j . H_j + S_j . W_j
 

@@ -94,10 +94,11 @@ class Joint:
 
 @dataclass(frozen=True)
 class Frame:
-    """A named frame fixed to a joint's moving side. `joint_index` is -1 for the world.
+    """A named frame fixed to the link that a joint moves. `joint_index` is -1 for the world.
 
-    `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and further joints) are attached to the same
-    side and stay with the joint if the mechanism is cut at this frame. Everything else there is beyond the cut."""
+    `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and further joints) belong to the same link.
+    They stay with the joint if the mechanism is cut at this frame. All other bodies and frames of the link are beyond
+    the cut."""
 
     joint_index: int
     placement: Placement
@@ -127,8 +128,8 @@ class ArcLengthChain:
 class Mechanism(ReprMixin):
     """A kinematic tree of joints with bodies, named frames and parameters. Parents precede children.
 
-    Placements and inertias depend on `parameters`. For a chain NAME of `link_chains`, `NAME:40%` is a frame by arc
-    length."""
+    Placements and inertias depend on `parameters`. For a chain NAME of `link_chains`, the frame `NAME:40%` is the point
+    at 40 % of its arc length."""
 
     name: str
     joints: tuple[Joint, ...]
@@ -244,8 +245,8 @@ class Mechanism(ReprMixin):
     def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
         """Return a copy with a chain of joints inserted at `index`. Other joints and frames stay attached as before.
 
-        The first joint's parent must precede `index`. The parent of each other joint is the previous one of the chain.
-        """
+        The first joint's parent must precede `index`. The parent of each further joint is the previous joint of the
+        chain."""
         count = len(chain)
 
         def moved(joint: int) -> int:

@@ -168,9 +168,9 @@ class PositionServo:
         dc:     torque = clip(gain (e + integral z) - derivative dq/dt) - damping dq/dt
 
     with the error e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p), p =
-    `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p. Several limits add up in the tightness. For a DC motor the
-    limit is that of the duty cycle, and the damping is the back-EMF (torque = kt/R (duty V - kt dq/dt)).
-    `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero."""
+    `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, the sum over all limits. For a DC motor the duty cycle is
+    limited, and the damping is the back-EMF (torque = kt/R (duty V - kt dq/dt), with torque constant kt, resistance R
+    and voltage V). `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero."""
 
     gain: ca.SX  # includes the firmware's gain if known [N m/rad or N/m]
     damping: ca.SX  # [N m s/rad or N s/m]
@@ -224,7 +224,7 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJoin
 def build_joint_servos(
     tree: Mechanism, joints: Sequence[str], options: PositionServoOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
-    """Build a servo for every named joint. Returns them and their parameters, such as `JOINT.servo_gain`.
+    """Build a servo for every named joint. Returns the servos and their parameters, such as `JOINT.servo_gain`.
 
     With the initial gain, an error of `_DEFAULT_FULL_TORQUE_ERROR` gives the joint's effort limit. For a DC motor
     `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor (the gain set in the firmware)."""

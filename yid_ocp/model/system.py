@@ -94,7 +94,7 @@ class Grasp:
 class MidpointState:
     """Symbols at the midpoint of one step, on which energies and forces may depend.
 
-    q, z are the means of (internal) coordinates at both nodes; v, z_rate are their differences divided by h."""
+    The coordinates q and internal coordinates z are means of both nodes; v and z_rate are differences divided by h."""
 
     system: System
     kinematics: Kinematics  # at q
@@ -112,10 +112,10 @@ class MidpointState:
 class NodeState:
     """Symbols at one node of a trajectory, on which measurements may depend.
 
-    `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; `a` is their
-    difference over h, with an error of order h^2. At the first and last node, `v` is that of the adjacent step, and `a`
-    is that of the neighbouring node (error of order h). `load` and `lam` belong to the next step (at the last node: the
-    last)."""
+    `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; the
+    acceleration `a` is their difference over h, with an error of order h^2. At the first and last node, `v` is the
+    velocity of the adjacent step, and `a` is the acceleration at the neighbouring node (error of order h). `load` and
+    `lam` belong to the step after the node (at the last node, to the last step)."""
 
     system: System
     kinematics: Kinematics  # at q
@@ -163,9 +163,9 @@ class StepTerms:
 class Effect:
     """Base class of additions to the nominal model, such as friction. The base class itself changes nothing.
 
-    With neutral parameters a subclass leaves the nominal model unchanged. For recorded inputs (torques that drive the
-    model, angles that are prescribed or followed) `corrected_reading` computes the true value from the reading. It is
-    the inverse of `distorted_reading`."""
+    With neutral parameters a subclass leaves the nominal model unchanged. `distorted_reading` computes a reading from
+    the true value. Its inverse `corrected_reading` computes the true value of recorded inputs (torques that drive the
+    model, angles that are prescribed or followed)."""
 
     kind: str  # name under which its class is registered
     location: str  # name of the location where it acts
@@ -192,14 +192,15 @@ class Effect:
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """Added delay [s] of a channel: recorded minus true time of a sample. `channel` is as in `distorted_reading`.
 
-        `camera` marks points of a camera. For `torque.JOINT`, a driving torque, it is the delay of its action."""
+        `camera` marks points of a camera. For a driving torque, `torque.JOINT`, the delay is from recording to action.
+        """
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant [s] of a channel's first-order lag.
 
-        For `torque.JOINT`, the acting torque lags behind the recorded one. For `joints.effort.JOINT`, the recorded
-        effort lags behind the true one."""
+        For `torque.JOINT`, the applied torque lags behind the recorded torque. For `joints.effort.JOINT`, the recorded
+        effort lags behind the true effort."""
         return ca.SX(0)
 
 
@@ -281,7 +282,7 @@ class System(ReprMixin):
     def build(
         mechanism: Mechanism | None = None, *, effects: Sequence[Effect] = (), **options: Unpack[SystemBuildArguments]
     ) -> System:
-        """Build a system from a robot, effects and `SystemBuildArguments`. Without a robot it is the object alone.
+        """Build a system from a robot, effects and `SystemBuildArguments`. Without a robot, it has the object alone.
 
         Raises `ModelError` for an unknown or repeated name, no joints, or a joint both driven and prescribed."""
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)

@@ -115,7 +115,9 @@ def read_urdf(
     """Read a mechanism from a URDF or MJCF file. Chosen joints are movable, all others are locked.
 
     Each movable joint has the parameter `JOINT.mass` [kg], which also scales the inertia of its bodies. Links without a
-    movable joint before them are fixed to the world. Every link is a frame of the same name.
+    movable joint before them are fixed to the world. Every link is a frame of the same name. Raises `ModelError` for a
+    missing or malformed file, MJCF without `mujoco`, an unknown joint, or a joint type that is not revolute,
+    continuous, prismatic or fixed.
 
     Parameters
     ----------
@@ -126,13 +128,7 @@ def read_urdf(
     locked : mapping of str to float, optional
         Positions of locked joints [rad or m]; default: zero or the nearest limit.
     exclude_links : sequence of str
-        Links to remove together with their subtrees, such as a tool that is not mounted.
-
-    Raises
-    ------
-    ModelError
-        Missing or malformed file, MJCF without `mujoco`, unknown joint, or joint type that is not revolute, continuous,
-        prismatic or fixed."""
+        Links to remove together with their subtrees, such as a tool that is not mounted."""
     file, locked = resolve_urdf_path(path), dict(locked or {})
     if not is_file(file):
         hint = "give a path, or package:NAME for example-robot-data"

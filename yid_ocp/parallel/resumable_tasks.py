@@ -98,8 +98,9 @@ def run_tasks(
     """Run a function for all tasks and return results in their order. Results stored in `folder` are reused.
 
     A task that raises writes `HASH.error.json` and a warning. The other tasks continue, and the next run repeats the
-    failed one. After an interruption, finished results are kept. Workers with other sources than this process do not
-    run tasks.
+    failed task. After an interruption, finished results are kept. Workers whose sources differ from this process do not
+    run tasks. Raises `DataError` if a task's file cannot be read, `OutputError` if the folder cannot be made, and
+    `WorkerError` if a worker is unsuitable (see `WorkerConfig`).
 
     Parameters
     ----------
@@ -109,12 +110,7 @@ def run_tasks(
         Local processes stop at once if the run is interrupted. If a process crashes, only its own task is lost. Workers
         of a scheduler finish their current task.
     code : str, optional
-        Hash of the sources that results depend on; default: the whole package. See `version.folder_source_hash`.
-
-    Raises
-    ------
-    DataError, OutputError, WorkerError
-        A task's file cannot be read, the folder cannot be made, or a worker is unsuitable (see `WorkerConfig`)."""
+        Hash of the sources that results depend on; default: the whole package. See `version.folder_source_hash`."""
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
     # paths are absolute, because a worker may run in another folder
     anywhere = [replace(task, arguments=_mapped(task.arguments, Path.absolute)) for task in tasks]

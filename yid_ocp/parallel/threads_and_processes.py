@@ -167,10 +167,10 @@ def call_merged_with_other_threads(
 
 
 def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Apply a function to items concurrently. Their calls of `call_merged_with_other_threads` are merged.
+    """Apply a function to items concurrently, so that simulations of different items run together as one batch.
 
-    At most as many items run as there are threads. Which calls are merged depends only on the items. An item must not
-    hold a lock during such a call."""
+    The calls of `call_merged_with_other_threads` are merged. At most as many items run as there are threads. Which
+    calls are merged depends only on the items. An item must not hold a lock during such a call."""
     entries = list(items)
     if len(entries) < 2 or getattr(_THREAD_SHARE, "march", None) is not None:
         return [function(entry) for entry in entries]

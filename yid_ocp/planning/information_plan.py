@@ -70,6 +70,10 @@ def plan_informative_motion(
 ) -> InformativeMotionPlan:
     """Plan the arm motion, within limits, that best identifies parameters or discriminates between effects.
 
+    Raises `ConfigError`, `ModelError` or `DataError` if a parameter or effect does not exist or is unobservable, if no
+    motion is possible within the limits, if there is no start equilibrium, or if a sensor has no noise level. Raises
+    `SolverError` if the rollout of a motion fails.
+
     Parameters
     ----------
     problem : EstimationProblem
@@ -77,13 +81,7 @@ def plan_informative_motion(
     values : mapping of str to float, optional
         Parameter values at which the motion is optimised. Default: the values of the problem.
     effects : mapping of label to mapping of quantity to value, optional
-        Known sizes of the effects to discriminate. Default: typical sizes.
-
-    Raises
-    ------
-    ConfigError, ModelError, DataError, SolverError
-        A parameter or effect does not exist or is unobservable; the limits leave no motion; there is no start
-        equilibrium; a sensor has no noise level; the rollout of a motion fails."""
+        Known sizes of the effects to discriminate. Default: typical sizes."""
     check_option_bounds(options, "plan")
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
     progress.begin_stage("building the experiment")

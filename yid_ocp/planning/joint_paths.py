@@ -143,8 +143,9 @@ _N_REST_CONTROL_POINTS = 3  # equal control points at each end, for zero velocit
 class SplinePath:
     """Spline path of joints between standstills: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
-    The spline has degree 5 and clamped ends. It and its derivatives lie within the convex hulls of their control
-    points, so limits on control points hold at all times, not only at nodes."""
+    The coefficients w_k are the control points. The spline has degree 5 and clamped ends. The path and its derivatives
+    lie within the convex hulls of their control points, so limits on control points hold at all times, not only at
+    nodes."""
 
     duration: float  # [s]
     n_coefficients: int  # number K of coefficients per joint; the last one is the final displacement
@@ -368,7 +369,7 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 def solve_equilibrium_at_point_target(
     step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, place: Array, tolerance: float
 ) -> Equilibrium:
-    """Find an equilibrium within joint limits at which a point rests at its target. `start` is the initial guess.
+    """Find an equilibrium within joint limits at which a point is at its target. `start` is the initial guess.
 
     Raises `ConfigError` if no joint moves the point, or if no equilibrium has the point at the target."""
     statics, system = EquilibriumSolver(step), step.system

@@ -46,7 +46,7 @@ class ParameterCovariance:
 class TargetMotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
-    The time step of its simulator can be shorter than that of the given step."""
+    The motion can be simulated with a shorter time step than the time step of the given step."""
 
     target_point: str
     target_position: Array  # (3,) [m]
@@ -70,9 +70,10 @@ def plan_motion_to_target(
 ) -> TargetMotionPlan:
     """Plan a motion of a step's prescribed joints that brings a point to a target.
 
-    `theta` defaults to the parameter values of the system; `known` is the covariance of uncertain parameters. If no
-    motion keeps the limits, the result is still a plan, and its `message` names the violated limit and the excess.
-    Raises `ConfigError` or `ModelError` if the goal is out of reach, or a name or an equilibrium does not exist."""
+    `theta` holds the parameter values; default: those of the system. `known` is the covariance of uncertain parameters.
+    If no motion keeps the limits, the result is still a plan, whose `message` names the violated limit and the excess.
+    Raises `ConfigError` or `ModelError` if the target is out of reach, a name does not exist, or there is no
+    equilibrium."""
     check_option_bounds(options, "plan")
     system = step.system
     if system.driven or not system.prescribed:

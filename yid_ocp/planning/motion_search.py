@@ -109,7 +109,8 @@ class PlanResidualAndLimitFunctions:
     def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
         """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
-        Also returns their Jacobian (rows, K nc) with respect to the coefficients, None if `rollout` has none."""
+        Also returns their Jacobian (rows, K nc) with respect to the spline coefficients, K for each of nc prescribed
+        joints, or None if `rollout` has no sensitivities."""
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
@@ -274,10 +275,10 @@ def _prior(columns: int, bounded: Sequence[int]) -> Array:
 
 @dataclass(frozen=True)
 class DOptimalityCriterion:
-    """Optimality criterion -1/2 log det of the covariance of chosen parameters, with all other unknowns eliminated.
+    """Criterion of how well a motion determines chosen parameters: -1/2 log det of their covariance.
 
-    It is D-optimality, or D_s-optimality if only some parameters are chosen (Atkinson, Donev and Tobias 2007, Optimum
-    Experimental Designs, with SAS, sections 10.2 and 10.3)."""
+    All other unknowns are eliminated. This is D-optimality, or D_s-optimality if only some parameters are chosen
+    (Atkinson, Donev and Tobias 2007, Optimum Experimental Designs, with SAS, sections 10.2 and 10.3)."""
 
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
@@ -300,8 +301,8 @@ class DOptimalityCriterion:
 class EffectDiscriminationCriterion:
     """Criterion of how well the measurements separate effects: -1/2 log sum_ij 1 / (1 + d_ij^2).
 
-    d_ij^2 = min_b |J_i a - J_j b|^2 is the distance of effect i from the best imitation by effect j and the nuisance
-    unknowns. The smallest distances dominate the sum."""
+    d_ij^2 = min_b |J_i a - J_j b|^2 is the distance of effect i (amplitudes a, sensitivities J_i) from the best
+    imitation by effect j and the nuisance unknowns (b, J_j). The smallest distances dominate the sum."""
 
     amplitude_columns: tuple[tuple[int, ...], ...]  # columns of the amplitudes of every effect
     # amplitudes in units of the columns, (amplitudes, cases): one case if they are known, else one per amplitude

@@ -161,9 +161,10 @@ class EpisodePredictor:
     def inputs_with_effect_momentum_shift(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
-        """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
+        """Corrected inputs of an episode, with the momentum that effects add to the tracking filter's reference.
 
-        `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative by `wanted` and the offset."""
+        `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative with respect to `wanted` and the
+        offset."""
         inputs = self.corrected_inputs(episode, theta, wanted)
         if not self._follows_momenta:
             return inputs
@@ -401,7 +402,7 @@ class EpisodePredictor:
     ) -> Array:
         """Gradient of a cost of one episode's predictions, with respect to its (shared, local, initial state) unknowns.
 
-        `result` is their prediction. `pulls` (M, k) are the derivatives of the cost by each prediction."""
+        `result` holds the predictions, `pulls` (M, k) the derivatives of the cost with respect to each prediction."""
         wanted, rollout = self.unknowns.free_parameters, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
         pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}

@@ -90,7 +90,8 @@ _MIN_TORQUE_ERROR_FRACTION = 1e-3
 class InputErrorModel:
     """Noise levels and current estimates of the errors of recorded torques and angles that drive a rollout.
 
-    A recorded torque has an error w in each step and a constant error b [N m]; an angle has an error v [rad]."""
+    A recorded torque has an error w in each step and a constant error b [N m]. A recorded angle has an error v [rad].
+    """
 
     torque_std: Array  # standard deviation of w, (nu,)
     torque_bias_std: Array  # standard deviation of b, (nu,)
@@ -218,7 +219,7 @@ class Episode:
 def prepare_episode(
     functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array, free: Sequence[str]
 ) -> Episode:
-    """Place a recording's inputs and measurements on the nodes of a rollout's time grid.
+    """Prepare a recording for prediction: place its inputs and measurements on the nodes of a rollout's time grid.
 
     The nominal parameters `theta` are used to convert encoder noise to effort and to compute the tracking filter's
     gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level."""

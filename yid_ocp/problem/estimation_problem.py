@@ -54,7 +54,8 @@ class EstimationProblem(ReprMixin):
     """Immutable, thread-safe problem of estimating free parameters from recordings.
 
     It evaluates the cost, predicts held-out recordings, and derives problems with other parameters, data, options or
-    whitening filters. `inference.whitening` makes the filters.
+    whitening filters (made by `inference.whitening`). Raises `ConfigError` if a parameter is unknown, listed twice, or
+    outside its bounds, and `DataError` if a recording lacks joints, points or a noise level, or is too short.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ class EstimationProblem(ReprMixin):
     free : sequence of str
         Names of free parameters.
     values : mapping of str to float, optional
-        Initial values of free parameters and values of fixed ones. Default: the values of the model.
+        Initial values of free parameters and values of fixed parameters. Default: the values of the model.
     held_out : sequence of Recording
         Recordings not used by the fit, only predicted by `predict_held_out`.
     may_free : sequence of str, optional
@@ -78,18 +79,11 @@ class EstimationProblem(ReprMixin):
     shared_parameters, local_parameters : tuple of str
         Free parameters with one value for all recordings, and with one value per recording.
     theta : ndarray, shape (ntheta,)
-        Initial values of free parameters and values of fixed ones.
+        Initial values of free parameters and values of fixed parameters.
     unknowns, residual_rows : UnknownVectorLayout, ResidualVectorLayout
         Layouts of the unknown vector and of the residual.
     whitening_filters, held_out_whitening_filters : tuple of ProcessNoiseWhitener or None
-        Filter that whitens each recording's residual, or None if sensor noise is the only noise.
-
-    Raises
-    ------
-    ConfigError
-        A parameter is unknown, listed twice, or outside its bounds.
-    DataError
-        A recording lacks joints, points or a noise level, or is too short."""
+        Filter that whitens each recording's residual, or None if sensor noise is the only noise."""
 
     def __init__(
         self,
@@ -270,9 +264,10 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Compute cost, gradient and evaluation. With process noise, the gradient uses sensitivities, else the adjoint.
+        """Compute cost, gradient (adjoint method; with process noise, sensitivities) and evaluation.
 
-        A known `evaluation` at `x` saves the rollout. The returned evaluation has no Jacobian."""
+        A known `evaluation` at `x` saves the rollout, which is most of the work. The returned evaluation has no
+        Jacobian."""
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
         weighted |= any(episode.has_uncertain_sensor_biases for episode in self.episodes)
@@ -352,6 +347,8 @@ class EstimationProblem(ReprMixin):
     ) -> Recording:
         """Simulate a synthetic recording with the inputs of an existing recording.
 
+        Raises `ConfigError` if a parameter does not exist, and `SolverError` if the rollout fails.
+
         Parameters
         ----------
         values : mapping of str to float, optional
@@ -359,12 +356,7 @@ class EstimationProblem(ReprMixin):
         recording : int
             Index of the recording that defines initial state, motion or torques, and sample times.
         seed : int, optional
-            Random seed of noise with the sensors' standard deviations. Default: no noise.
-
-        Raises
-        ------
-        ConfigError, SolverError
-            A parameter does not exist; the rollout fails."""
+            Random seed of noise with the sensors' standard deviations. Default: no noise."""
         theta = self.with_parameter_values(values or {}).theta
         return synthesize_recording(self.predictor, self.episodes[recording], theta, seed)
 

@@ -41,8 +41,8 @@ class ProcessNoiseWhitener(Protocol):
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
 
-        `rows` (r, c) holds, in units of sensor noise, the residual and its derivatives side by side. `push` (N, nu, c)
-        is the tracking filter's torque correction and its derivative [N m]."""
+        The first column of `rows` (r, c) is the residual in units of sensor noise, all other columns are its
+        derivatives. `push` (N, nu, c) is the tracking filter's torque correction and its derivative [N m]."""
         ...
 
 
@@ -202,7 +202,7 @@ def stated_prior_stds(
     """Standard deviation of each unknown's stated Gaussian prior, (nx,). It is infinite for unknowns without prior.
 
     `inertia` returns the mass matrix diagonal, which converts an initial velocity to a momentum. An effect's internal
-    coordinate has a uniform prior within its limits; the standard deviation is that of the uniform distribution."""
+    coordinate has a uniform prior within its limits, of which the standard deviation is returned."""
     limits = _unobserved_state_limits(system)
     stds = []
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
@@ -239,8 +239,8 @@ def estimated_initial_state_names(
 ) -> tuple[str, ...]:
     """Names of the estimated components of initial states, such as `q.JOINT`, `p.JOINT` and `z.NAME`.
 
-    If initial states are estimated, they include q and p of coordinates that are not driven by torques, not prescribed
-    and not compliant. They always include unobserved internal coordinates of effects that are free or not neutral."""
+    With the option "estimated", q and p are estimated of coordinates that are not driven by torques, not prescribed and
+    not compliant. Unobserved internal coordinates z of effects that are free or not neutral are always estimated."""
     found: list[str] = []
     if options.initial_state == "estimated":
         known = {*(() if system.servos else system.driven_coordinate_indices), *system.prescribed_coordinate_indices}

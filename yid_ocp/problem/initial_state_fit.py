@@ -59,13 +59,14 @@ class _Task:
 class InitialStateFitter:
     """Fits an initial state, and optionally parameters, to the first measured points of an episode.
 
-    Gauss-Newton over q (and the parameters `fitted_parameters`, which need finite bounds) minimises at the first frame
+    At the first frame, Gauss-Newton over the configuration q (and the parameters `fitted_parameters`, which need finite
+    bounds) minimises the misfit of the points w(q), the elastic energy (stiffnesses kappa_i) and the violation of the
+    constraints phi(q):
 
         |(w(q) - wbar)/std|^2 + sum kappa_i/kappa_mean (q_i - q_rest,i)^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2.
 
-    Among all shapes through the measured points, this is the shape of least elastic energy. It determines angles that
-    no point shows, such as the roll of a clamp. The last frame of the window is fitted with a prior of small velocity
-    from the first. The momentum follows from this velocity."""
+    The energy determines angles that no point shows, such as the roll of a clamp. The last frame of the window is
+    fitted with a prior of small velocity from the first. The momentum follows from this velocity."""
 
     def __init__(self, step: Step, fitted_parameters: Sequence[str] = ()) -> None:
         self.step = step
@@ -114,8 +115,8 @@ class InitialStateFitter:
         """Fit configuration and momentum to the first frame's points and their change within the window.
 
         `configuration` (nk,) holds the driven, then the prescribed coordinates at node 0. Only points of `samples` are
-        used, in the first `window` [s]. `path` (N + 1, nc) holds the prescribed coordinates at all nodes. With
-        `roughly`, the fit stops at a coarse shape. Raises `DataError` if no point is measured within the window."""
+        used, in the first `window` [s]. `path` (N + 1, nc) holds the prescribed coordinates at all nodes. `roughly`
+        stops the fit at a coarse shape. Raises `DataError` if no point is measured within the window."""
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
         frames: dict[int, list[tuple[SensorMeasurements, int]]] = {}

@@ -186,9 +186,10 @@ class SensorMeasurements:
         return replace(self, node=node, fraction=position - node)
 
     def prediction_change_per_step(self, at_nodes: Array, unmoved: SensorMeasurements, steps: Array) -> Array:
-        """Change of a prediction per step at delayed samples, (M, k). At a node it is the mean of adjacent steps.
+        """Rate of change of a prediction at delayed samples, per time step, (M, k).
 
-        `at_nodes` (len(nodes), k) is the prediction. `unmoved` are measurements before the delay of `steps` (k,)."""
+        At a node it is the mean of adjacent steps. `at_nodes` (len(nodes), k) is the prediction. `unmoved` are the
+        measurements before the delay of `steps` (k,)."""
         nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short part may hold no sample of a slow sensor
             return np.zeros((0, at_nodes.shape[1]))
@@ -248,7 +249,7 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
 def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
     """Weight measurements at nearest nodes as in Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
 
-    J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2]."""
+    The cost is sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points wbar_k [m]."""
     nearest_node = samples.node + (samples.fraction >= 0.5)
     weight = np.where(np.isfinite(samples.value), 1.0, 0.0)
     weight[nearest_node == 0] = 0.0
@@ -271,10 +272,10 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
 
 
 def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
-    """Whiten residual and derivatives, already in units of noise, against constant sensor errors as well.
+    """Whiten a residual and its derivatives, already in units of noise, against constant sensor errors as well.
 
-    `columns` (r, c) holds residual and derivatives side by side. `slopes` (r, m) are the derivatives of whitened
-    measurements with respect to m constant errors, each in units of its standard deviation."""
+    The first column of `columns` (r, c) is the residual, all other columns are its derivatives. `slopes` (r, m) are the
+    derivatives of whitened measurements with respect to m constant errors, each in units of its standard deviation."""
     left, size, _ = np.linalg.svd(slopes, full_matrices=False)
     return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
 

@@ -74,9 +74,9 @@ class CorrectedInputs:
         wanted: Sequence[str],
         by_internal: Array | None,
     ) -> CorrectedInputs:
-        """Add to every step the momentum that effects add to the tracking filter's reference.
+        """Add the momentum that effects cause to the reference of the tracking filter, in every step.
 
-        The angles in `recorded` are smoothed, those in `measured` (N + 1, nu) are raw. `by_internal` (nz, d) is the
+        The angles in `recorded` are smoothed, the angles `measured` (N + 1, nu) are not. `by_internal` (nz, d) is the
         derivative of the initial internal coordinates."""
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
@@ -175,10 +175,10 @@ class InputCorrectionFunctions:
     def true_angles_and_efforts(
         self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """Compute true angles and efforts (K, nj) of `joint_names` from recorded ones, with derivatives.
+        """Compute true angles and efforts (K, nj) of `joint_names` from recorded values, with derivatives.
 
-        Returns angles, efforts, their derivatives (K, nj, d) by the d parameters `wanted`, and the derivative of the
-        effort by its reading."""
+        Returns angles, efforts, their derivatives (K, nj, d) with respect to the d parameters `wanted`, and the
+        derivative of the true effort with respect to the recorded effort."""
         a, e, e_reading, *slopes = self._maps(bool(wanted))(angle, effort, theta)
         at = [self._names.index(name) for name in wanted]
         a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
@@ -189,7 +189,8 @@ class InputCorrectionFunctions:
     ) -> tuple[Array, Array] | None:
         """Delays or lag time constants (nj,) [s] of driven joints' torques or of prescribed joints' efforts.
 
-        Also returns their derivatives (nj, d) by the parameters `wanted`. None if no effect has a delay or lag."""
+        Also returns their derivatives (nj, d) with respect to the parameters `wanted`. None if no effect has a delay or
+        lag."""
         return self._evaluate(self._times[kind], theta, wanted)
 
     def sensor_delays_with_derivatives(

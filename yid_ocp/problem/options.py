@@ -44,9 +44,9 @@ class MultivariateGaussianPrior:
 
 @dataclass(frozen=True)
 class ExcessResidualCriteria:
-    """Significance level and smallest excess chi2 at which a residual exceeds its noise.
+    """Criteria by which a residual exceeds its noise: a significance level and a smallest excess of chi2.
 
-    It exceeds the noise if it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`. The fraction
+    A residual exceeds its noise if it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`. The fraction
     `noise_fraction_of_std` of stated standard deviations is noise; the rest represents model error."""
 
     significance_level: float = 0.01
@@ -75,7 +75,8 @@ class ProblemOptions:
     multivariate_prior : MultivariateGaussianPrior
         Correlated prior of several parameters, in place of entries of `prior_stds`.
     stated_std_factor : float
-        Factor already multiplied into all standard deviations here, priors included, so that they are noise alone.
+        Factor by which the stated standard deviations, of noise and priors, are already multiplied, to leave noise
+        alone.
     parameters_by_recording : mapping of recording to mapping of parameter to value
         Known values of parameters that differ between recordings, such as marker positions.
     known_initial_states : mapping of recording to array_like, shape (nx,)
@@ -89,7 +90,7 @@ class ProblemOptions:
     checked_discretisations : tuple of str
         Discretisation errors that the standard deviations include: `links`, `time_step`.
     divided_links_model : DividedLinksModel, optional
-        Required for `links`.
+        Model with divided links, required to check `links`.
     cable_topology : CableTopology, optional
         Topology of a cable held by clamps, for its baselines."""
 

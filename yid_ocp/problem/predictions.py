@@ -41,7 +41,7 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
 
 
 def constant_position_baseline(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
-    """Predict that every point stays at its position in the last given frame (baseline).
+    """Predict, as a baseline without a model, that every point stays at its position in the last given frame.
 
     Returns positions (M, len(points), 3) [m]; the first `given` frames are as measured. Raises `DataError` if a point
     is not recorded or not measured in the last given frame, or if there are too few frames."""
@@ -51,9 +51,10 @@ def constant_position_baseline(recording: Recording, points: Sequence[str], give
 def mean_clamp_displacement_baseline_prediction(
     recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2
 ) -> Array:
-    """Predict that every point moves by the clamped points' mean displacement since the last given frame.
+    """Predict, as a baseline without a model, that every point moves by the mean displacement of the clamped points.
 
-    The path of the `clamped` points is known. Shape and errors are as in `constant_position_baseline`."""
+    Displacements count from the last given frame. The path of the `clamped` points is known. Shape and errors are as in
+    `constant_position_baseline`."""
     share = np.full((len(points), len(clamped)), 1.0 / max(len(clamped), 1))
     return _carried(recording, points, clamped, given, share)
 
@@ -66,11 +67,11 @@ def interpolated_displacement_position_baseline(
     clamped: Sequence[str] | None = None,
     given: int = 2,
 ) -> Array:
-    """Predict displacements by interpolation along the parent's arc length. Children move with their junction.
+    """Predict displacements, as a baseline without a model, by interpolation along the arc length of the parent branch.
 
     `parent` lists its points from end to end. Displacements are interpolated between its points `clamped` (default: its
-    two ends). Each child starts with the parent point of its junction. Shape and errors are as in
-    `constant_position_baseline`; a point without a branch also raises `DataError`."""
+    two ends). Children move with their junction: each child starts with the parent point of its junction. Shape and
+    errors are as in `constant_position_baseline`; a point without a branch also raises `DataError`."""
     known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
     at = _given_frame(recording, parent, given)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
@@ -93,7 +94,8 @@ def interpolated_displacement_position_baseline(
 def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
     """Root mean square of the Euclidean error over points and frames [m]. NaN if there is nothing to compare.
 
-    Shapes are (M, np, 3), or `DataError` is raised. The first `given` frames and missing points do not count."""
+    The arrays have the shape (M, np, 3); different shapes raise `DataError`. The first `given` frames and missing
+    points do not count."""
     if predicted.shape != measured.shape:
         what = f"the prediction has the shape {predicted.shape}, the measurement {measured.shape}"
         raise DataError(what, where="predicted", allowed="equal shapes (M, np, 3)", hint="predict the measured frames")

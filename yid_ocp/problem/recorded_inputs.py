@@ -36,11 +36,12 @@ def mean_step_inputs(
 ) -> Array:
     """Mean input (steps, nu) of driven joints in every step: torque [N m] or servo command [rad or m].
 
-    Effort samples are interpolated by a cubic spline. For interval means, the input is the derivative of a spline
-    through their cumulative sum, which preserves every mean. Efforts of kind `command` and held commands are piecewise
-    constant. A lost sample is interpolated from its neighbours. Each input acts later than recorded by `delay` (nu,)
-    [s]. With `servos` (for all driven joints) the input is the position command. `where` is the name of the recording.
-    Raises `DataError` if a joint is missing, or if efforts (with `servos`: commands) are not recorded."""
+    Effort samples are interpolated by a cubic spline. Efforts that are interval means are integrated, and the input is
+    the derivative of a spline through the integral, which preserves every mean. Efforts of kind `command` and held
+    commands are piecewise constant. A lost sample is interpolated from its neighbours. Each input acts later than
+    recorded by `delay` (nu,) [s]. With `servos` (for all driven joints) the input is the position command. `where` is
+    the name of the recording. Raises `DataError` if a joint is missing, or if efforts (with `servos`: commands) are not
+    recorded."""
     if not driven:
         return np.zeros((grid.steps, 0))
     late = np.zeros(len(driven)) if delay is None else delay
@@ -84,7 +85,8 @@ def _motor_off_steps(
 def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
     """Firmware gains stated in recordings, as `JOINT.servo_gain_factor` values by recording name.
 
-    Raises `DataError` if only some of the recordings with motors on state gains."""
+    Raises `DataError` if only some of the recordings with motors on state gains, because gains cannot be compared then.
+    """
     wanted = {name: f"{name}.{SERVO_GAIN_FACTOR_PARAMETER}" for name in system.servos}
     wanted = {name: parameter for name, parameter in wanted.items() if parameter in system.parameters}
     found: dict[str, dict[str, float]] = {}
@@ -193,10 +195,10 @@ def smoothed_joint_efforts(
 
 
 def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Remove effort noise from gear loads: the model's loads plus the slow part of measured minus model.
+    """Remove effort noise from gear loads: the result is the model's loads plus the slow part of measured minus model.
 
     `measured` and `own` (the model's) are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
-    difference is constant. `cutoff` [Hz] is the cutoff of the filter of paths and efforts."""
+    difference is constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts."""
     gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
@@ -204,8 +206,8 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     """Kinds of signals in recordings that effects can require, such as `joints.effort`.
 
-    Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, so is each point group
-    that neither a camera nor an arm measured: `points:GROUP`."""
+    Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, each point group that
+    neither a camera nor an arm measured is a kind too: `points:GROUP`."""
     found, mounted = set[str](), set[str]()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.values_by_channel}

@@ -134,20 +134,21 @@ def twice_applied_effort_filter(cutoff: float) -> LowPassFilter:
 
 @dataclass(frozen=True)
 class FirstOrderLag:
-    """First-order lags of k channels, with derivatives with respect to their time constants T.
+    """First-order lags of k channels, T dz/dt = x - z, with derivatives with respect to their time constants T.
 
-    E = exp(-h/T) and f = T/h (1 - E); both are zero at T = 0, where output z equals input x. Node values allow a
-    negative T: then z leads x, with z = x - T dx/dt."""
+    With the time step h, E = exp(-h/T) and f = T/h (1 - E). At T = 0 both are zero and the output z equals the input x.
+    Node values allow a negative T: then z leads x, with z = x - T dx/dt."""
 
     time_constant: Array  # T, (k,) [s]
     time_constant_sensitivity: Array  # (k, d)
     time_step: float  # h [s]
 
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
-        """Mean lagged output over each step, for inputs held over steps. Output and input start equal.
+        """Mean output z of the lag over each step, with derivatives, for inputs x (N, k) that are constant in every
+        step.
 
-        For x (N, k) it is x + (z - x) f with z_{k+1} = x + (z - x) E. Also returns its derivative, given `slope` (N, k,
-        d)."""
+        The mean is x + (z - x) f with z_{k+1} = x + (z - x) E, with E and f as in the class. The output starts at the
+        first input. `slope` (N, k, d) is the derivative of x."""
         decay, share, decay_slope, share_slope = self._factors()
         held = self._following(value, np.zeros(value.shape), decay)
         gap = held - value
@@ -159,11 +160,11 @@ class FirstOrderLag:
         return value + share * gap, through + mean_by_time
 
     def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
-        """Lagged output at nodes with derivatives, for an input linear between nodes. The lag starts at node 1.
+        """Output of the lag at nodes, with derivatives, for an input x (N, k) that is linear between nodes.
 
-        For x (N, k) it is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences.
-        `slope` (N, k, d) is the derivative of x; its first columns are the parameters of
-        `time_constant_sensitivity`."""
+        The lag starts at node 1. The output is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1} or, for negative T, x -
+        T dx/dt by central differences. `slope` (N, k, d) is the derivative of x; its first columns are the parameters
+        of `time_constant_sensitivity`."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         followed = self._straight(value, decay, share) - lead * (rates @ value)

@@ -83,8 +83,8 @@ class Animation:
 def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dict[str, Any]:
     """Convert scenes to JSON-ready data, with meshes by joint. Positions are integers in 0.1 mm, null if unknown.
 
-    The meshes of the robot's URDF are drawn on the arm of a scene's last model, or of its measured motion if the scene
-    has no model. If no mesh can be read, the arm is drawn as sticks."""
+    The meshes of the robot's URDF are drawn on the arm of a scene's last model or, in a scene without a model, on the
+    arm's measured motion. If no mesh can be read, the arm is drawn as sticks."""
     meshes: dict[str, list[list[int]]] | None = None
     made = []
     for scene in scenes:
@@ -166,8 +166,8 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
 class ConfigurationTrajectory:
     """Trajectory of a model, with configurations q (N, n) at times t (N,) [s].
 
-    `acting` lists the applied forces to draw: label, location (joint, segment, grasp or frame), unit and values (N, k).
-    Values are vectors in world axes (k = 3), scalars (k = 1) or empty, for an effect."""
+    `acting` lists the applied forces and effects to draw: label, location (joint, segment, grasp or frame), unit and
+    values (N, k). Values are vectors in world axes (k = 3) or scalars (k = 1). Effects have no values."""
 
     name: str
     system: System
@@ -285,7 +285,7 @@ def animation_of_trajectories(
 def recording_animation(
     title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
 ) -> Animation | None:
-    """Animate a recording alone. None if the recording holds no positions.
+    """Animate a recording alone, without predictions. None if the recording holds no positions.
 
     With `has_straight_object`, the model at the recorded angles is drawn too, with an undeformed object."""
     clock = max((group.t for group in recording.joint_and_point_groups), key=len)

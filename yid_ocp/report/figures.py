@@ -105,7 +105,7 @@ def prediction_and_residual_plots(
     lines: Mapping[str, Array],
     course: tuple[Array, Array] | None = None,
 ) -> tuple[TimePlotData, TimePlotData]:
-    """Plot measured and predicted values, and their residual with a band of two noise stds.
+    """Plot measured and predicted values, and their residual with a band of two standard deviations of the noise.
 
     All arrays have shape (M,). For sparse measurements, `course` (t (K,), value (K,)) draws the first line densely."""
     seen = np.isfinite(measured) & np.isfinite(std)
@@ -236,7 +236,7 @@ def rate_intervals_figure(
 ) -> Figure:
     """Plot rates between 0 and 1 with intervals. Each entry has `rate`, `low` and `high`.
 
-    A calibration plot shows the diagonal; all others have a logarithmic x axis."""
+    A calibration plot shows the diagonal; all other plots have a logarithmic x axis."""
     figure = _styled_figure(340, x, y)
     if is_calibration:
         line = {"color": MEASURED_COLOR, "dash": "dot"}
@@ -377,7 +377,7 @@ class ValueBeforeAfter:
 
 
 def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]) -> Figure:
-    """Plot values before and after, one row each. Error bars are two standard deviations.
+    """Plot values before and after a change, one row each. Error bars are two standard deviations.
 
     `axis` is the title of the x axis, with unit. `words` are the legends of before, after and the reference marks."""
     figure = _rows_figure(110 + 32 * len(rows), list(rows), axis)

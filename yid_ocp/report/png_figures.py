@@ -29,8 +29,8 @@ def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[st
 def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     """Write `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
 
-    They show detection over effect size with binomial 95 % intervals, first answers against truth, and observed against
-    nominal rates of intervals and p-values. Raises `OutputError`."""
+    The figures show the detection rate over effect size with binomial 95 % intervals, the first answers against the
+    truth, and observed against nominal rates of intervals and p-values. Raises `OutputError` if writing fails."""
     from matplotlib.figure import Figure
 
     lines = {
@@ -101,7 +101,7 @@ _MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; b
 
 
 def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern]]) -> None:
-    """Draw rows of sparsity patterns as PNG, with separated and named blocks. Raises `OutputError`.
+    """Draw rows of sparsity patterns as PNG, with separated and named blocks. Raises `OutputError` if writing fails.
 
     Patterns without rows or columns are omitted."""
     from matplotlib.figure import Figure

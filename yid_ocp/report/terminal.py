@@ -130,7 +130,7 @@ def misfit_summary_blocks(
 ) -> SummaryBlockOrTextIterator:
     """Conclusions on a poor fit: baselines that predict better, the misfit, and values that are still meaningful.
 
-    Values of `parameters` are meaningful if their standard deviation, misfit included, is at most 10 %."""
+    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 %."""
     worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))

@@ -84,7 +84,8 @@ class SensorOptions:
 class ChannelSpecification:
     """One kind of recorded quantity: its group, dataset, unit, components and sensor constants.
 
-    Noise levels are the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`; for points, the dataset `std`."""
+    Noise levels are stored in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std` or, for points, in the
+    dataset `std`."""
 
     group: str  # recording group; several are allowed, `GROUP` and `GROUP_NAME`, each with its own clock
     quantity: str  # dataset of the group, with one column for every name of the group
@@ -211,7 +212,7 @@ def expand_to_joint_values(
 
 
 class Sensor(ABC):
-    """Base class of sensors. A sensor predicts a group of measured channels with a common clock; it is hashable.
+    """Base class of sensors, which predict a group of measured channels with a common clock. Sensors are hashable.
 
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each)."""
 
@@ -271,7 +272,7 @@ class Sensor(ABC):
 
 
 def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
-    """Build a CasADi function of a sensor's readings with effects, and of their derivatives.
+    """Build a CasADi function of a sensor's readings y, including effects on the sensor, and of their derivatives.
 
     It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), with the
     symbols of `NodeState`. dy/dtheta has one column per parameter in `names`. v, a and lam refer to the recorded clock;

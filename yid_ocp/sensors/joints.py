@@ -144,8 +144,8 @@ def smoothed_effort_data(
     """Low-pass filter an effort sensor's measurements and thin them until their noise is nearly independent.
 
     `values` (M, k) are in the sensor's unit. `std` and `bias` (k,) are the standard deviations of white noise and of a
-    constant error. With `is_sample`, a value belongs to its time, otherwise it is the mean of the interval until the
-    next value. Raises `DataError` if the recording is too short for the filter."""
+    constant error. With `is_sample`, a value is measured at its time, otherwise it is the mean until the next value's
+    time. Raises `DataError` if the recording is too short for the filter."""
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
     # the mean of an interval belongs to its centre
     late = 0.0 if is_sample else 0.5 * period
@@ -164,7 +164,8 @@ def nodes_and_decorrelated_values(
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
 
     `values` (M, k) belong to the times `t` + `late` [s]. `like_path` selects the path filter; the default is the effort
-    filter, which is also applied to predictions. Raises `DataError`, with `noun`, if the recording is too short."""
+    filter, which is also applied to predictions. Raises `DataError`, which names `noun`, if the recording is too short.
+    """
     low_pass = around.path_filter if like_path else around.effort_filter
     times, smooth = around.node_times, low_pass(t, values)
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)

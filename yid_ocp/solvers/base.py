@@ -233,10 +233,10 @@ class SolverResult:
 
 @runtime_checkable
 class Solver(Protocol):
-    """Interface of a solver. A solver is a frozen dataclass of settings, registered under its name.
+    """Interface of a solver, which is a frozen dataclass of settings, registered under its name.
 
     Optional class attributes, with their defaults: `needs_rollout` (True), whether the rollout must succeed at the
-    start; `uses_process_noise_covariance` (False), whether it can whiten residuals by process noise;
+    start; `uses_process_noise_covariance` (False), whether the solver can whiten residuals by process noise;
     `estimates_torque_errors` (False), whether torque errors are unknowns."""
 
     @property
@@ -323,10 +323,11 @@ def solve(
     """Fit an estimation problem and return estimates with uncertainties and verdicts.
 
     `yid_ocp.solve` (`analysis.estimation`) adds the discretisation error and checks of the fit. Without
-    `initial_unknowns`, free effects start off neutral (`unknowns_with_neutral_effects_activated`). If the rollout fails
-    at the start (a soft object snaps, an arm falls), the problem is first solved over a short horizon, which then
-    grows. With process noise, methods that can whiten by it run in several passes, each with a fixed covariance
-    (`problem_whitened_at`). The result of a method with torque errors as unknowns is judged in the same way.
+    `initial_unknowns`, free effects start with a small amplitude (`unknowns_with_neutral_effects_activated`). If the
+    rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over a short horizon,
+    which then grows. With process noise, methods that can whiten by process noise run in several passes, each with a
+    fixed covariance (`problem_whitened_at`). The result of a method whose unknowns include torque errors is judged in
+    the same way. A search that does not converge raises no error; see `status` and `message` of the solution.
 
     Parameters
     ----------
@@ -342,11 +343,7 @@ def solve(
         Whether a poor fit is repeated from other initial values.
     verdicts : bool
         Whether loosely known parameters are evaluated at the ends of their intervals. If not, verdicts are provisional.
-
-    Returns
-    -------
-    Solution
-        Its status and message report non-convergence, which raises no error."""
+    """
     # small matrices: threads of the linear algebra library cost more than they save
     with threadpoolctl.threadpool_limits(1):
         if initial_unknowns is None:

@@ -46,11 +46,12 @@ _LOWEST = "the cost cannot be lowered any further"
 class GaussNewton(SolverWithCheckedSettings):
     """Gauss-Newton method with bounded, damped linear least-squares steps on the cost 1/2 |r(x)|^2.
 
-    Each iteration solves min |J d + r|^2 + mu |d/s|^2 subject to lower <= x + d <= upper. It accepts d if the cost
-    falls by a sufficient part of the predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10,
-    doi:10.1007/978-0-387-40065-5). A short step, or a damped step with a small predicted decrease, does not end the
-    search; only `is_stationary_point` does. The search also ends after many steps with a decrease that is small against
-    the noise. This happens if the cost is not smooth (friction that changes sign, fast waves over many seconds)."""
+    Each iteration solves min |J d + r|^2 + mu |d/s|^2 for the step d, subject to lower <= x + d <= upper, with the
+    Jacobian J, the damping mu and the scales s. The step is accepted if the cost falls by a sufficient part of the
+    predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5). The
+    search ends at a stationary point (`is_stationary_point`), not at a short step or a small predicted decrease of a
+    damped step. It also ends after many steps whose decrease is small against the noise, as happens if the cost is not
+    smooth (friction that changes sign, fast waves over many seconds)."""
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
     step_tolerance: Annotated[

@@ -57,11 +57,11 @@ class UnknownsAndNodeStateGuess:
 def guess_unknowns_and_node_states(
     problem: EstimationProblem, nodes: Sequence[IntArray], x: Array, misfit: _MisfitFunction
 ) -> UnknownsAndNodeStateGuess:
-    """Guess unknowns and node states near a solution, from `x` or, if it fits poorly, from multiples of `x`.
+    """Guess unknowns and node states near a solution, from `x` or, if `x` fits poorly, from multiples of `x`.
 
-    The states of a recording come from a rollout with the tracking filter; they have no defects. If the rollout fails
-    or deviates from the measurements, each node in `nodes` (K + 1,) instead gets the equilibrium at the arms' measured
-    posture. This guess has defects but follows the data."""
+    The states of a recording come from a rollout with the tracking filter, so that they satisfy the equations of
+    motion. If the rollout fails or deviates from the measurements, each node in `nodes` (K + 1,) instead gets the
+    equilibrium at the arms' measured posture. This guess has defects (gaps between steps) but follows the data."""
     lower, upper = problem.bounds
     best: tuple[float, UnknownsAndNodeStateGuess] | None = None
     for factor in _PARAMETER_FACTORS:

@@ -63,16 +63,17 @@ _CLOSED_DEFECT = 1e-7
 class MultipleShooting(SolverWithCheckedSettings):
     """Multiple shooting, which minimises 1/2 |r|^2 over parameters and node states under the equations of motion.
 
-    IPOPT solves the program of `transcribe`, whose constraints are the DEL equations of every step. Defects are scaled
-    to order one, the cost by its initial value, and IPOPT's own scaling is off. In these units IPOPT's initial bound
-    multipliers of one weigh as much as the cost, so that the first steps change no parameter by much more than a
-    factor. A much larger barrier parameter than the default pushes poorly informed parameters off their bounds.
+    IPOPT solves the program of `transcribe`, whose constraints are the discrete Euler-Lagrange equations of every step.
+    Defects (violations of these constraints) are scaled to order one, the cost by its initial value, and IPOPT's own
+    scaling is off. In these units IPOPT's initial bound multipliers of one weigh as much as the cost, so that the first
+    steps change no parameter by much more than a factor. A much larger barrier parameter than the default pushes poorly
+    informed parameters off their bounds.
 
     With `condensing`, the steps between nodes are rolled out, and Gauss-Newton iterates on node states s_j and
-    parameters x with defects d_j = F^n(s_j, x) - s_{j+1}. A linear step closes every defect. The recursion S_{j+1} =
-    A_j S_j + B_j, c_{j+1} = A_j c_j + d_j expresses all node steps by the parameters' step. An iteration therefore
-    costs one sweep, with one direction more than in single shooting. A step is accepted if it improves the cost or the
-    defects.
+    parameters x with defects d_j = F^n(s_j, x) - s_{j+1}, where F^n are the n steps between two nodes. A linear step
+    closes every defect. The recursion S_{j+1} = A_j S_j + B_j, c_{j+1} = A_j c_j + d_j expresses all node steps by the
+    parameters' step. An iteration therefore costs one sweep, with one direction more than in single shooting. A step is
+    accepted if it improves the cost or the defects.
 
     References
     ----------

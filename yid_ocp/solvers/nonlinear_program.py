@@ -46,10 +46,11 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function y(v; d, s) of local variables v, data d and shared data s, with its derivatives.
+    """Symbolic function y(v; d, s) with its derivatives, such as the equations of one step.
 
-    `jacobian` dy/dv (ny, nv) is derived from the value by default. Derivatives can be compiled. The value stays a
-    CasADi expression, so that terms built on it can be differentiated."""
+    v are local variables, d data and s data shared by all calls. `jacobian` dy/dv (ny, nv) is derived from the value by
+    default. Derivatives can be compiled. The value stays a CasADi expression, so that terms built on it can be
+    differentiated."""
 
     def __init__(
         self,
@@ -194,8 +195,9 @@ class ResidualTerm:
     def loss_hessian_residual_weights(self, r: ca.MX, exact: bool) -> ca.MX | None:
         """Weight of each residual in the Hessian of the loss. None if all weights are one.
 
-        With `exact`, it is the second derivative of the Huber loss: one up to the threshold, zero beyond. Otherwise it
-        is the weight of iteratively reweighted least squares, which has the same gradient and is never zero."""
+        With `exact`, the weight is the second derivative of the Huber loss: one up to the threshold, zero beyond.
+        Without `exact`, it is the weight of iteratively reweighted least squares, which has the same gradient and is
+        never zero."""
         if math.isinf(self.huber_threshold):
             return None
         size = ca.fabs(r)
@@ -206,10 +208,11 @@ class ResidualTerm:
 
 @dataclass(frozen=True)
 class GaussNewtonHessianRidge:
-    """Curvature added to the Gauss-Newton Hessian only, factor * mean square residual / max(|w_i|, scale_i)^2.
+    """Ridge that keeps Gauss-Newton steps of poorly informed unknowns small.
 
-    For poorly informed unknowns, the curvature that Gauss-Newton neglects can be as large as its own. `factor` is a
-    number or a function of the unknowns, whose value can change between iterates."""
+    For such unknowns, the curvature that Gauss-Newton neglects can be as large as its own. The ridge adds factor * mean
+    square residual / max(|w_i|, scale_i)^2 to the Gauss-Newton Hessian only. `factor` is a number or a function of the
+    unknowns w, whose value can change between iterates."""
 
     index: IntArray
     scale: Array
@@ -300,10 +303,10 @@ def available_memory_bytes() -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NonlinearProgram(ReprMixin):
-    """Nonlinear program in CasADi that minimises f(w, p) under bounds and constraints.
+    """Nonlinear program in CasADi that minimises f(w, p) over the variables w, under bounds and constraints.
 
-    `nlp[name]` is a block of `variables` or `parameters`, an MX of the block's shape. With one recording, `nlp["q"]` is
-    short for `nlp["q[NAME]"]`."""
+    `nlp[name]` is a block of the variables w or of the parameters p, an MX of the block's shape. With one recording,
+    `nlp["q"]` is short for `nlp["q[NAME]"]`."""
 
     variables: Mapping[str, _VectorBlock]  # what the column `w` of unknowns is made of
     parameters: Mapping[str, _VectorBlock]  # what the column `p` of parameters is made of
@@ -443,7 +446,8 @@ class NonlinearProgram(ReprMixin):
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
         """Sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
 
-        Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps that of user terms."""
+        Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps the curvature of user
+        terms."""
         with CASADI_LOCK:
             if kind not in self._hessians:
                 self._hessians[kind] = self._data_curvature(kind == "exact") + self._other_curvature(kind == "exact")
@@ -500,8 +504,7 @@ class NonlinearProgram(ReprMixin):
         lower: ArrayLike = 0.0,
         upper: ArrayLike = 0.0,
     ) -> NonlinearProgram:
-        """Program with an additional objective term and constraint rows, expressions of variables `w` and parameters
-        `p`.
+        """Program with an additional objective term and constraint rows, expressions of its variables and parameters.
 
         Rows without bounds are equalities to zero. Raises `SolverError` if an expression contains other symbols, or if
         the number of bounds is neither one nor the number of rows."""
@@ -523,7 +526,7 @@ class NonlinearProgram(ReprMixin):
         return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)))
 
     def make_solver(self, plugin: str = "ipopt", hessian: HessianKind = "gauss_newton", **options: Any) -> ca.Function:
-        """Make a `casadi.nlpsol` solver with the program's derivatives. Call it with `solver_arguments`.
+        """Make a `casadi.nlpsol` solver with the program's derivatives. Call the solver with `solver_arguments`.
 
         `plugin` is the name of a CasADi plug-in, `options` are options of `casadi.nlpsol`. Raises `SolverError` if
         CasADi lacks the plug-in or refuses the options."""

@@ -57,7 +57,9 @@ def transcribe(
 ) -> NonlinearProgram:
     """Transcribe an estimation problem into a nonlinear program with a node at every step.
 
-    Equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+    Equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955. Raises
+    `SolverError` if an effect changes recorded inputs or times, a free parameter has a known value in a recording, or
+    two recordings have the same name.
 
     Parameters
     ----------
@@ -71,13 +73,7 @@ def transcribe(
     NonlinearProgram
         Variables: `theta` and, per recording, `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]` and
         `lam[NAME]`. Parameters: `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`, `value.GROUP[NAME]`,
-        `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md.
-
-    Raises
-    ------
-    SolverError
-        An effect changes recorded inputs or times, a free parameter has a known value in a recording, or two recordings
-        have the same name."""
+        `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md."""
     problem = _about_zero(problem)
     _check_transcribable(problem)
     compiled = problem.step.is_compiled if use_compiler is None else use_compiler

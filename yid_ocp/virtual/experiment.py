@@ -47,9 +47,9 @@ _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
 def baxter_foam_y_system(arms: int) -> System:
-    """Build the system of Caldwell (ISER 2014). One or two arms of Baxter hold the foam Y by point grasps.
+    """Build the system of Caldwell (ISER 2014), in which one or two arms of Baxter hold the foam Y by point grasps.
 
-    The left arm holds the tip of T2 (43 coordinates), the right arm that of T3 (50). Every arm joint is driven, and
+    The left arm holds the tip of T2 (43 coordinates), the right arm the tip of T3 (50). Every arm joint is driven, and
     every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms."""
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="arms", allowed="1 or 2")
@@ -64,9 +64,9 @@ def baxter_foam_y_system(arms: int) -> System:
 class ArmSensorNoise:
     """Standard deviations of the arm's sensor noise. Noise is drawn per sample, the effort bias per recording.
 
-    Angles are in rad, velocities in rad/s, points (per coordinate of a grasped point) in m. Efforts are in N m, one
-    value or one per joint; their noise is in the recording, not in the applied torque. The recording states all
-    standard deviations, those of efforts only with `records_effort_std`."""
+    Units are rad (angles), rad/s (velocities), N m (efforts, one value or one per joint) and m (each coordinate of a
+    grasped point). The noise of efforts is in the recording, not in the applied torque. The recording states all
+    standard deviations, for efforts only with `records_effort_std`."""
 
     position_std: float = 2e-4
     velocity_std: float = 5e-3
@@ -80,7 +80,7 @@ class ArmSensorNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualArmOptions:
-    """Properties of the arms in virtual experiments of `blind` beyond their description.
+    """Properties of the arms in virtual experiments of `blind` that their description lacks, such as friction.
 
     The nominal model contains the friction law, with free amplitudes, and uncertain link masses."""
 
@@ -105,7 +105,8 @@ class VirtualArmOptions:
 class PointCamera:
     """A slow camera that measures positions of the object's points that no arm holds.
 
-    `pose` (4, 4) is in the world (x right, y down, z forward). By default 2 m from the object, opposite the robot."""
+    `pose` (4, 4) is the camera's pose in the world (x right, y down, z forward). By default the camera is 2 m from the
+    object, opposite the robot."""
 
     point_std: float = 5e-3  # std of the white noise on each coordinate of a point [m]
     frame_rate: float = 3.0  # mean rate; periods vary by up to a quarter [Hz]
@@ -118,7 +119,7 @@ class PointCamera:
 class VirtualExperimentSettings:
     """Settings of a virtual experiment: motion, simulation, sensors and noise.
 
-    Each sensor's noise has its own random stream from `seed`, so removing a sensor does not change the others."""
+    The noise of each sensor has its own random stream from `seed`, so removing a sensor changes no other noise."""
 
     motion: MultisineMotion | None = None  # default: `random_multisine_motion` with `seed`
     initial_joint_angles: Mapping[str, float] | None = None  # [rad or m]; default: `grasping_joint_angles`
@@ -139,7 +140,7 @@ def run_virtual_experiment(
 
     `points_arm` holds the grasped points at the joints' sample times; `points_camera` has its own clock.
     `true_parameters` holds all stiffness, damping and mass parameters (`values`, by default nominal). Raises
-    `ConfigError` if torque noise does not match the joints; other errors are those of `simulate_in_mujoco`."""
+    `ConfigError` if torque noise does not match the joints; other errors are as in `simulate_in_mujoco`."""
     chosen = experiment or VirtualExperimentSettings()
     duration = chosen.simulation.duration
     posture = chosen.initial_joint_angles

@@ -478,7 +478,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
 
 @dataclass(frozen=True)
 class InjectedEffect:
-    """An effect in the simulated data that the model lacks, with kind, location and parameter values.
+    """An effect that is present in simulated data but not in the model, with kind, location and parameter values.
 
     `values` are the effect's parameters; a kind outside the library has `size`, in the unit of its force."""
 
@@ -502,10 +502,11 @@ def run_experiment_with_effects(
     """Record a virtual experiment with effects that the system's description lacks.
 
     `system` is the nominal system, with driven joints. The recording stores `values` as `true_parameters`. The
-    experiment's `injected_terms` are replaced. If `ordinary_friction` is given (it can be empty), MuJoCo's constraint
-    solver simulates it and the joint friction in `effects`, including sticking; otherwise joint friction is a smooth
-    force. Raises `ConfigError` if an effect kind cannot be simulated, and `ModelError` if a payload is too far from its
-    frame or removes more mass than its link has. Other errors are those of `run_virtual_experiment`."""
+    experiment's `injected_terms` are replaced. Without `ordinary_friction`, joint friction in `effects` is a smooth
+    force. If `ordinary_friction` is given (it can be empty), MuJoCo's constraint solver simulates it and the joint
+    friction in `effects`, including sticking. Raises `ConfigError` if an effect kind cannot be simulated, and
+    `ModelError` if a payload is too far from its frame or removes more mass than its link has. Other errors are as in
+    `run_virtual_experiment`."""
     known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_FORCE_BUILDERS)
     known = known if ordinary_friction is None else tuple(dict.fromkeys((*known, *_ORDINARY_FRICTION)))
     for effect in (*effects, *(ordinary_friction or ())):

@@ -75,7 +75,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 class JointDynamicsTerms:
     """Stiffness, damping, dry friction, armature and constant force of one joint, in SI units.
 
-    Force = constant - stiffness q - cubic q^3 - damping v - friction."""
+    The force is constant - stiffness q - cubic q^3 - damping v - friction."""
 
     stiffness: float = 0.0
     constant_force: float = 0.0
@@ -266,7 +266,9 @@ def mujoco_xml(
     Joints keep their names. Consecutive massless joints at one location become one body with several joints, which is
     kinematically equivalent. Every point and grasp end is a site: points under their own name, grasps as
     `grasp_NAME_holder` and `grasp_NAME_held`. There are no contacts or limits. Everything is inside one fixed body
-    `world_base`, because some readers require a single root.
+    `world_base`, because some readers require a single root. Raises `ModelError` if MuJoCo cannot express the system: a
+    moving body without mass, more than six massless joints at one location, a frame on one of them, a compliant grasp,
+    a cubic spring with a rest angle, an effect beyond `_NATIVE_ASPECTS`.
 
     Parameters
     ----------
@@ -274,20 +276,13 @@ def mujoco_xml(
         Time step of the simulator [s]. Grasps are constraints with a time constant of two steps.
     emulate : bool
         Whether approximations are allowed: sticking for smoothed dry friction, a tendon for a compliant point grasp.
-        Otherwise they raise an error.
+        Otherwise a system that needs them raises an error.
     actuators : bool
-        Whether each driven joint has an actuator of its name. Its control is the recorded torque, and gain, offset,
-        delay and lag give the applied torque. Otherwise true torques are applied as `qfrc_applied`. A servo always is
-        an actuator, whose control is the command.
+        Whether each driven joint has an actuator of its name. The control is the recorded torque; gain, offset, delay
+        and lag of the actuator give the applied torque. Without actuators, true torques are applied as `qfrc_applied`.
+        A servo always is an actuator, whose control is the command.
     gear_play : mapping of joint name to float, optional
-        Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
-
-    Raises
-    ------
-    ModelError
-        MuJoCo cannot express the system: a moving body without mass, more than six massless joints at one location, a
-        frame on one of them, a compliant grasp, a cubic spring with a rest angle, an effect beyond `_NATIVE_ASPECTS`.
-    """
+        Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`."""
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml: time_step", allowed="a number above 0 [s]")
     tree, weights = _weighed(system.numeric_mechanism(values))

@@ -107,8 +107,8 @@ class SimulationOptions:
 class SimulationResult:
     """Noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
 
-    `effort` is, by `effort_kind`, the torque at t_k or its mean from t_k to t_{k+1} [N m], or the servo command at t_k.
-    Its last row was computed but not applied. Points are `system.point_frames` in the world."""
+    Depending on `effort_kind`, `effort` is the torque at t_k, its mean from t_k to t_{k+1} [N m], or the servo command
+    at t_k. The last row of `effort` was computed but not applied. Points are `system.point_frames` in the world."""
 
     t: Array  # shape (N + 1,) [s]
     q: Array  # shape (N + 1, n)
@@ -132,7 +132,8 @@ def simulate_in_mujoco(
 ) -> SimulationResult:
     """Simulate a controller that follows a motion in MuJoCo, from equilibrium at the initial joint angles.
 
-    Position servos are MuJoCo's own. They are commanded the motion about the initial angles and start at equilibrium.
+    Position servos are MuJoCo's own; their commands are the motion about the initial angles. Raises `ModelError` if the
+    system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not settle, or diverges.
 
     Parameters
     ----------
@@ -146,13 +147,7 @@ def simulate_in_mujoco(
         Forces and model changes beyond the system's description. MuJoCo has one callback for the whole process, so no
         other simulation may run at the same time in another thread.
     gear_play : mapping of joint to float, optional
-        Full backlash width of gears behind servos [rad].
-
-    Raises
-    ------
-    ModelError
-        The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not settle, or diverges.
-    """
+        Full backlash width of gears behind servos [rad]."""
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
         allowed = f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
@@ -221,7 +216,8 @@ def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | 
 def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
     """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
 
-    Joint damping can decide which of several equilibria is found; `damping` replaces it while the scene settles."""
+    `damping` replaces the joint damping while the scene settles, because it can decide which of several equilibria is
+    found."""
     data, driven, held = scene.data, scene.moved_joint_ids, _settling_model(scene, damping)
     target = data.qpos[driven].copy()
     held.dof_damping[driven] += _HOLD_DAMPING
@@ -252,9 +248,10 @@ def _lost(scene: MujocoScene) -> bool:
 
 
 class TrackingController:
-    """Computed-torque controller: inverse dynamics along the motion, the grasps' load at equilibrium, and feedback.
+    """Computed-torque controller that keeps the driven joints on a motion.
 
-    The scene is at equilibrium before the motion, held by the torques `balance` (nu,) [N m]."""
+    The torque is the inverse dynamics along the motion, plus the load of the grasps at equilibrium, plus feedback.
+    Before the motion the scene is at equilibrium, held by the torques `balance` (nu,) [N m]."""
 
     def __init__(self, scene: MujocoScene, motion: JointMotion, balance: Array) -> None:
         self._scene, self._motion = scene, motion
@@ -396,9 +393,9 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 @dataclass(frozen=True)
 class ReplayErrorAgainstRecording:
-    """RMS error of a replayed model against the recording, in one channel or group; of points, the distance.
+    """Root mean square error of a replayed model against the recording, in one channel or group of channels.
 
-    `noise_rms` is expected from sensor noise alone, zero if the recording does not state it."""
+    The error of a point is the distance. `noise_rms` is expected from sensor noise alone, zero if not recorded."""
 
     rmse: float
     noise_rms: float

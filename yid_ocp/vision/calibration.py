@@ -91,10 +91,10 @@ class _StampDelay(NamedTuple):
 def stamp_delay_beyond_clock_offset(
     arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
-    """Estimate the delay [s] of a frame's stamp beyond the common clock offset, from its world points (N, 3) [m].
+    """Estimate the delay [s] of a frame's time stamp beyond the common clock offset. None if the arm is not in view.
 
-    None if the arm is not in view. If the misfit is close to the `usual` one of other frames [m^2], only nearby delays
-    are searched."""
+    `points` (N, 3) [m] are the frame's points in the world. If the misfit is close to the `usual` misfit of other
+    frames [m^2], only nearby delays are searched."""
     t, origin = float(state.stamps_to_joint_clock(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_MAX_START_POINTS]]
     chosen = points[arm.is_near_moving_surface_off_grasps(points, t, 2 * _OFF_ARM_DISTANCE)][:_MAX_ARM_POINTS]
@@ -226,7 +226,7 @@ class CameraCalibration:
     def point_std_from_calibration(self, points: Array, velocity: Array, stamps: Array) -> Array:
         """Standard deviations (N, 3) [m] of points due to the camera's uncertain pose, depth and clock.
 
-        The error is the same for all points at one location. `velocity` (N, 3) is in m/s, `stamps` (N,) in s."""
+        The error is common to all points at one location. `velocity` (N, 3) is in m/s, `stamps` (N,) in s."""
         slopes = np.empty((len(points), 3, CAMERA_STATE_SIZE))
         slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.world_point_jacobian_by_pose_and_depth(points)
         # a point dated too early is at a later position of the motion

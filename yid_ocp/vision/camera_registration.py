@@ -287,10 +287,10 @@ def _at_least(least: Array, matrix: Array) -> Array:
 def initial_camera_states(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], told: CameraState, search: float, most: int
 ) -> list[CameraState]:
-    """Candidate camera states that place the arm's visible surface on the clouds, best first.
+    """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
-    Returns at most `most` states, at least `_MIN_START_SEPARATION` apart, with clock offsets within `search` [s] of
-    that of `told`."""
+    Returns at most `most` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets are within `search` [s]
+    of the offset of the specified state `told`."""
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
     sides, ahead = (np.arange(-n, n + 1, _CELL_STRIDE) for n in (_SIDEWAYS_CELLS, _FORWARD_CELLS))

@@ -182,10 +182,11 @@ class ShapeFitter:
         return self._corners(q)[0].reshape(-1, 2, 3)
 
     def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
-        """Fit the object's shape in one frame, from the guesses `starts` and the robot's configuration `q_known` (n,).
+        """Fit the object's shape in one frame, given the robot's configuration `q_known` (n,).
 
-        The cheap passes on skeleton nodes run from every guess (default: the undeformed shape). The passes on points
-        run from the best result. `sight` is the filtered cloud. Raises `DataError` if it is empty."""
+        The fit has two stages. Cheap passes on skeleton nodes run from every guess in `starts` (default: the undeformed
+        shape). Passes on points run from the best result. `sight` is the filtered cloud. Raises `DataError` if it has
+        no points."""
         if not len(sight.points) or not len(sight.skeleton_nodes):
             what, allowed = "the cloud has no points or no skeleton nodes", "one point and one node or more"
             raise DataError(what, where="sight", allowed=allowed, hint="check the filters, or give another cloud")

@@ -225,9 +225,9 @@ def read_frames(
     """Read a frame sequence from a folder or file of a depth camera, one frame at a time.
 
     `path` is a folder (`read_frame_folder`), a ROS 1 or ROS 2 bag, an MCAP or RealSense file with clouds or depth
-    images under `topic`, or an Azure Kinect `.mkv` (if the Open3D build reads it). `pose` (4, 4) of the camera in the
-    world and `unit` of clouds replace a folder's values and are needed for other formats. Raises `DataError` if the
-    input cannot be read, or lacks time stamps, pose or intrinsics."""
+    images under `topic`, or an Azure Kinect `.mkv` (if the Open3D build reads it). `pose` (4, 4) is the pose of the
+    camera in the world, `unit` the unit of clouds. Both replace the values of a folder and are required for other
+    formats. Raises `DataError` if the input cannot be read, or lacks time stamps, pose or intrinsics."""
     place = Path(path)
     ending = place.suffix.lower()
     if place.is_dir():

@@ -184,9 +184,9 @@ def tracked_states_and_points(
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Times, configurations, positions, their standard deviations and the shared part, for `TrackResult`.
+    """Arrays of `TrackResult`: times, configurations, positions, standard deviations and their shared part.
 
-    The result covers good frames, and the system's points with the indices `columns`. Raises `DataError` if no frame is
+    Only good frames and the system's points with the indices `columns` are included. Raises `DataError` if no frame is
     good, or if no point is known well enough in any frame."""
     good, sizes, calibration = _good_fits(frames), common.dimensions, common.camera_calibration
     if not good:
@@ -258,8 +258,8 @@ _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends; height differe
 def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
     """Make the object's root the same end in all fits. Also returns a text that says how the end was chosen.
 
-    If a shape fits equally well with its root at another end, ends are first followed from frame to frame. The root is
-    then the end that does not move (if it is fixed) or the higher end."""
+    A choice is needed if a shape fits equally well with its root at another end. Ends are first followed from frame to
+    frame. The root is then the end that does not move (if it is fixed) or the higher end."""
     if options.root_placement == "model":
         return list(frames), ""
     fitted = _good_fits(frames)

@@ -39,10 +39,10 @@ _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """Intrinsics of a camera with axes x right, y down, z forward. `DataError` for an unknown distortion model.
+    """Intrinsics of a camera with axes x right, y down, z forward.
 
-    fx, fy (focal lengths) and (cx, cy) (principal point) are in pixels; without distortion u = fx x/z + cx, v = fy y/z
-    + cy."""
+    Without distortion u = fx x/z + cx, v = fy y/z + cy, with focal lengths fx, fy and principal point (cx, cy) in
+    pixels. Raises `DataError` for an unknown distortion model."""
 
     width: int
     height: int
@@ -253,7 +253,7 @@ class OcclusionMap:
         """Whether world positions (S, 3) are occluded, shadowed by something nearer, or outside the image.
 
         A surface occludes a position if it is nearer to the camera by more than `radius` (S,) plus `margin` [m].
-        `radius` is also the size of the position across the line of sight."""
+        `radius` is also the extent of the position across the line of sight."""
         seen, depth = _picture(places, self.camera_pose)
         asked, wide = seen.T, radius / np.maximum(depth, _MIN_DEPTH)
         if self.intrinsics is not None:

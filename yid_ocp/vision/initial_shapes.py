@@ -84,7 +84,8 @@ class _Centerline:
 def cloud_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
     """Compute the centerline of the object in a cloud, a tree of nodes plus loops. Empty if there are too few points.
 
-    `diameter` [m] is that of the thickest tube. Parts with a distance of more than `gap` [m] are not connected."""
+    `diameter` [m] is the diameter of the thickest tube. Parts with a distance of more than `gap` [m] are not connected.
+    """
     points = cloud.points
     if len(points) > _MAX_POINTS:
         points = points[np.sort(rng.choice(len(points), _MAX_POINTS, replace=False))]
@@ -267,10 +268,10 @@ class ShapeFitInitialGuesses:
         np.fill_diagonal(self._end_distances, 0.0)
 
     def initial_shapes_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
-        """Find initial shapes that follow a centerline whose path lengths between ends match the object's.
+        """Find initial shapes that follow a centerline whose path lengths between ends match the lengths of the object.
 
-        Raises `DataError` if the number of ends or the lengths differ from the object's, because a part of the object
-        is hidden or something else is connected to it."""
+        Raises `DataError` if the number of ends or the lengths do not match, because a part of the object is hidden or
+        something else is connected to it."""
         leaves, n_ends = trace.end_nodes, len(self._end_distances)
         if not n_ends <= len(leaves) <= _MAX_ENDS:
             counts = f"the cloud has {len(leaves)} ends, the object {n_ends}"

@@ -184,11 +184,11 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
 def is_statistical_inlier(
     cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None
 ) -> BoolArray:
-    """Find the inliers (N,) of statistical outlier removal. False outside the mask `asked`.
+    """Find the inliers (N,) of a cloud by statistical outlier removal. False outside the mask `asked`.
 
-    A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + ratio s. s is the
-    median absolute deviation, scaled to a standard deviation. Both statistics use the whole cloud. They are weighted,
-    so that outliers, each alone in its voxel, have little influence."""
+    A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + ratio s, where s is
+    the median absolute deviation scaled to a standard deviation. Median and s are computed from the whole cloud, with
+    weights, so that outliers, each alone in its voxel, have little influence."""
     if len(cloud) <= neighbours:
         return np.zeros(len(cloud), bool)
     tree = cKDTree(cloud.points, compact_nodes=False, balanced_tree=False)

@@ -63,10 +63,11 @@ class BackgroundPoints:
     def from_point_clouds(
         clouds: Sequence[Array], voxel: float, noise: float, shapes: Sequence[TubeLinks] | None = None, near: float = 0
     ) -> BackgroundPoints:
-        """Find background in world clouds: an empty scene, or points static in most frames and off fitted shapes.
+        """Find the points of the background in clouds [m] in world coordinates.
 
-        Points are counted in cubes of edge `voxel` and have the standard deviation `noise`. Points that were ever
-        nearer than `near` to a tube's surface can belong to the object and are excluded. All are in [m]."""
+        The background is all points of an empty scene or, with fitted `shapes`, points that are static in most frames
+        and off the shapes. Points are counted in cubes of edge `voxel` and have the standard deviation `noise`. Points
+        that were ever nearer than `near` to a tube's surface can belong to the object and are excluded."""
         if not clouds or (shapes is not None and not shapes):
             return BackgroundPoints()
         cells = [np.unique(np.floor(cloud / voxel).astype(np.int64), axis=0) for cloud in clouds]
@@ -102,7 +103,8 @@ def group_foreign_clusters(
     """Group the foreign clusters of all frames, each with its time [s], into foreign objects with advice.
 
     `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
-    `links` gives the poses (4, 4) of the robot's links at a time. `background`: static points are already removed."""
+    `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already
+    removed."""
     groups: list[list[tuple[float, ForeignCluster]]] = []
     for t, thing in ((t, thing) for t, seen in things for thing in seen):
         home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
@@ -229,8 +231,9 @@ class TubeDimensionEstimates:
     def point_std_due_to_dimensions(self, points: Array) -> Array:
         """Standard deviations (np, 3) [m] of points due to wrong or uncertain tube dimensions.
 
-        `points` (np, 3, 2 s) are derivatives. A contradicted dimension that is not estimated contributes its whole
-        displacement, an estimated dimension its standard deviation."""
+        `points` (np, 3, 2 s) are the derivatives of the points with respect to the 2 s dimensions of s segments. An
+        estimated dimension contributes its standard deviation, a contradicted dimension that is not estimated its whole
+        displacement."""
         used = np.array(self.estimated_dimension_mask)
         wrong = np.where(self.contradicted_model_value_mask & ~used, self.log_ratio, 0.0)
         chosen = points[..., used]

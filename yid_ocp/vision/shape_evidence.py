@@ -49,11 +49,10 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Project points (N, 3) on the nearest of links `corners` (K, 2, 3), with radii (K,) [m].
+    """Project points (N, 3) on the nearest tube axis, with axis ends `corners` (K, 2, 3) and radii (K,) [m].
 
     The nearest link has the smallest distance minus `share` times its radius. Returns link index (N,), position along
-    the link from 0 to 1 (N,), unit vectors (N, 3) from centre line to point, and distances (N,) from the centre line
-    [m]."""
+    the link from 0 to 1 (N,), unit vectors (N, 3) from axis to point, and distances (N,) from the axis [m]."""
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
     # (p - a).d and |p - a|^2 for all points and links, by matrix products
@@ -210,7 +209,7 @@ def fit_quality_and_point_classes(
 
 
 def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
-    """Masks of skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube.
+    """Masks of skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube of radius r = `radius`.
 
     Around a tube, points have a large spread in one direction and r/sqrt(3) across. On a table, wall or body they have
     a large spread in two directions."""
@@ -325,10 +324,10 @@ class _SurfaceResiduals(NamedTuple):
 def nearest_surface_residuals(
     corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
 ) -> _SurfaceResiduals:
-    """Residuals e = |p - c| - f r of points p (N, 3); c is the nearest axis point, f = `share` of the radius r.
+    """Distances of points p (N, 3) from the surfaces of tubes: e = |p - c| - f r, with the nearest axis point c.
 
-    Links `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest to a tube's far side is given to the
-    near side."""
+    f = `share` scales the radius r. Axis ends `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest
+    to a tube's far side is assigned to the near side."""
     link, along, normal, distance = tube_link_projections(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
     error = sign * distance - share * radius[link]
@@ -341,9 +340,9 @@ def nearest_surface_residuals(
 def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
     """Errors of points from the tubes along the line of sight. Parameters are as in `nearest_surface_residuals`.
 
-    At a distance u from the axis across the line of sight, the surface is sqrt(r^2 - u^2) nearer to the camera than the
-    axis. Errors along the surface normal would give the same tube position, but a radius too small by several times
-    noise^2/r. Points near the rim, where depth is not informative, are omitted."""
+    At a distance u from the axis across the line of sight, the surface of a tube of radius r is sqrt(r^2 - u^2) nearer
+    to the camera than the axis. Errors along the surface normal would give the same tube position, but a radius too
+    small by several times noise^2/r. Points near the rim, where depth is not informative, are omitted."""
     link, along, normal, distance = tube_link_projections(corners, radius, points)
     axis = link_axes(corners)[link]
     sight = camera - points
@@ -365,7 +364,8 @@ def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera
 class FrameTubeDimensionCost:
     """Quadratic cost g'x + x'Sx/2 of tube dimensions x in one frame, minimised over the joint angles.
 
-    x holds the logarithms of all lengths, then of all radii, segment by segment, relative to the fit's dimensions."""
+    x (2 s,) holds the logarithms of the lengths of all s segments, then of all radii, relative to the fit's dimensions.
+    g is the gradient and S the Hessian."""
 
     gradient: Array  # (2 s,)
     hessian: Array  # (2 s, 2 s)

@@ -224,7 +224,7 @@ class ArticulatedSurfaces:
     def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, IntArray]:
         """Find where rays, from `origin` (3,) in the world along `directions` (N, 3), first meet a surface.
 
-        Returns distances (N,) in multiples of the direction vectors, unit normals (N, 3) that face the origin, and part
+        Returns distances (N,) as multiples of the direction vectors, unit normals (N, 3) that face the origin, and part
         indices (N,). A ray without intersection has distance inf, normal zero and part -1."""
         distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
         owner = np.full(len(directions), -1)
@@ -533,11 +533,11 @@ class VirtualCameraSetup:
 def render_virtual_frames(
     scene: ObservedScene, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
 ) -> VirtualFramesWithTruth:
-    """Render the frames that a virtual camera takes of a motion. A frame is rendered on loading, reproducibly.
+    """Render the frames that a virtual camera takes of a motion. A frame is rendered, reproducibly, on loading.
 
     The configurations `q` (N, n) at times `t` (N,) [s] can come from any simulator; a cubic spline interpolates them.
-    With a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or `ModelError` if
-    Open3D or an object is missing, a mesh is unreadable, or the pose is invalid."""
+    In a scene with a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or
+    `ModelError` if Open3D or an object is missing, a mesh is unreadable, or the pose is invalid."""
     lens, pose = camera.sensor_model.intrinsics, validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
     taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)

@@ -66,12 +66,9 @@ def track_object(
     model has no robot. Without a URDF file, there is no self-filter and no clock offset. `empty` holds frames of the
     background without robot and object, by the same camera.
 
-    Raises
-    ------
-    DataError
-        Joint angles are missing, time stamps come from another clock, or no frame is good (with the reasons).
-    ConfigError, ModelError
-        A point does not exist in the system; meshes cannot be read."""
+    Raises `DataError` if joint angles are missing, time stamps come from another clock, or no frame is good (with the
+    reasons). Raises `ConfigError` if a point does not exist in the system, and `ModelError` if meshes cannot be read.
+    """
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_sequence_calibration()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
@@ -99,9 +96,9 @@ class _Look(NamedTuple):
 
 
 class FrameTracker:
-    """Processes the frames of a sequence one by one, in any process. Arguments are those of `track_object`.
+    """Processes the frames of a sequence one by one, in any process. Arguments are as in `track_object`.
 
-    `frame_order` lists all frames by stamp, `calibration_frames` the frames used to calibrate the camera."""
+    `frame_order` lists all frames by time stamp, `calibration_frames` the frames used to calibrate the camera."""
 
     def __init__(
         self,

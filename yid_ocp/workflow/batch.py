@@ -62,7 +62,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
 def batch_runs_from_configs(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
 ) -> list[_BatchRun]:
-    """List the runs of a batch, one per configuration, or one for each recording that matches a pattern.
+    """List the runs of a batch: one for each configuration or, with a pattern, for each recording that matches it.
 
     With a pattern such as `fleet/*.h5` (`**`: any folders), each run estimates on one recording and has no held-out
     recording, unless `overrides` (`a.b=c` each) say otherwise. Raises `ConfigError` if a configuration does not exist

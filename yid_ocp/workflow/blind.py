@@ -89,8 +89,8 @@ def run_blind(
 ) -> CommandOutcome[None]:
     """Run a blind validation of the diagnosis in several processes. Finished parts in the folder are reused.
 
-    Models, joint angles and sensors are those of the runs' first recordings, with as many variations
-    (`EXPERIMENT_VARIATIONS`) as there are cases for. The cases depend on `seed` and `purpose` ('report' or
+    Models, joint angles and sensors are taken from the runs' first recordings, with as many variations
+    (`EXPERIMENT_VARIATIONS`) as the number of cases allows. The cases depend on `seed` and `purpose` ('report' or
     'calibration'). With `part` (K, N), only every N-th case is made and diagnosed, in a folder `slice-K-of-N`.
 
     The folder contains `configs/`, `prepared/` (detectable sizes per experiment), `cases/` (recordings),

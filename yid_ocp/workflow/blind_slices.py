@@ -44,10 +44,10 @@ def _ensemble_sha256(part: Mapping[str, Any]) -> str:
 def join_slices(
     files: Sequence[str | Path], out: str | Path, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[None]:
-    """Score slices of one ensemble together, from their files `slice.json` or folders that hold one.
+    """Score slices of one ensemble together, from their files `slice.json` or the folders of these files.
 
-    `out` receives the files of a whole ensemble without recordings, so it can be judged again. Raises `DataError` if a
-    slice belongs to another ensemble or is given twice, or if labels were changed."""
+    `out` receives the files of a whole ensemble without recordings, so that the ensemble can be judged again. Raises
+    `DataError` if a slice belongs to another ensemble or is given twice, or if labels were changed."""
     found: list[dict[str, Any]] = []
     for file in files:
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
@@ -133,7 +133,7 @@ def rescore_blind(
     """Judge finished cases of a blind validation again, with the present rules and the thresholds in `overrides`.
 
     Nothing is refitted. `out` receives `result.json` (`yid-blind/1`): `rescored` lists the cases whose verdict or
-    effects change, `not_judged` counts the cases that need a refit which the original diagnosis did not make."""
+    effects change, `not_judged` counts the cases that need a refit that the original diagnosis did not make."""
     made, target = Path(folder), make_folder(out)
     commitment = read_input_json(made / "commitment.json")
     labels = {}

@@ -125,7 +125,7 @@ def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
 def arms_are_estimated_states(run: RunSettings) -> bool:
     """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
 
-    This is not possible with sensors on links, which cannot be weighted under process noise."""
+    Arms with sensors on links remain prescribed, because such sensors cannot be weighted under process noise."""
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
     recordings = read_recordings_of_role(run)

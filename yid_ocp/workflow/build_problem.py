@@ -132,13 +132,10 @@ def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:
 def build_problem(
     run: RunSettings, step: Step | None = None, reference_recordings: Sequence[Recording] = ()
 ) -> EstimationProblem:
-    """Build the estimation problem of a run. It includes marker positions of `reference_recordings`.
+    """Build the estimation problem of a run, with the marker positions of `reference_recordings`.
 
-    Raises
-    ------
-    ConfigError, DataError, ModelError
-        Settings, recordings or names are inconsistent, a grasp cannot be closed, or a recording is unusable. With
-        `recordings.strict`, any issue of a recording."""
+    Raises `ConfigError`, `DataError` or `ModelError` if settings, recordings or names are inconsistent, a grasp cannot
+    be closed, or a recording is unusable. With `recordings.strict`, any issue of a recording raises an error."""
     system = build_system(run) if step is None else step.system
     free = free_parameter_names(run, system.parameters)
     if not free:

@@ -69,8 +69,8 @@ def print_result(
 ) -> None:
     """Print a command's result in one of three modes: as text, as path or as JSON.
 
-    By default, the lines of `texts` and the line `place` are printed. `quiet` prints only `path`. `json` prints only
-    JSON on standard output, and `place` on standard error."""
+    By default, the lines of `texts` and the line `place` are printed. With `quiet`, only `path` is printed. With
+    `json`, only JSON is printed on standard output, and `place` on standard error."""
     if arguments.json:
         print_json(result)
         if not arguments.quiet:

@@ -140,6 +140,9 @@ def propose_config_choices(
 ) -> ProposedConfigChoices:
     """Propose choices for a configuration from a robot and its recordings, all of which need joints.
 
+    Raises `ConfigError` if no recorded joint is in the URDF or a frame does not exist; other errors are as in
+    `read_urdf`.
+
     Parameters
     ----------
     branches : sequence of Segment
@@ -149,10 +152,7 @@ def propose_config_choices(
     grasps : mapping of frame to point, optional
         Other grasps. Default: ends of the object, if it stands on the ground or two arms were recorded.
     standing : bool
-        Whether the object stands on the ground and arms hold its ends.
-
-    Raises `ConfigError` if no recorded joint is in the URDF or a frame does not exist; other errors as in
-    `read_urdf`."""
+        Whether the object stands on the ground and arms hold its ends."""
     allowed = "joint states of the robot, which say how it was moved"
     for other in recordings:
         if other.joints is None:
@@ -325,9 +325,9 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 
 
 def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
-    """Time [s] of standstill in the later part of a recording, at which the held-out part starts. None without.
+    """Find a time [s] of standstill in the later part of a recording, at which the held-out part starts. None without.
 
-    The later part can be predicted from equilibrium, and so tests the model on held-out data."""
+    From standstill, the held-out part can be predicted from equilibrium, and so tests the model on held-out data."""
     first, duration = min(group.t[0] for group in recording.joint_and_point_groups), recording.duration
     for part in np.arange(0.75, 0.5, -0.01):
         time = first + float(part) * duration

@@ -43,7 +43,7 @@ def run_plan(
 ) -> CommandOutcome[_Plan]:
     """Plan the motion of a run's goal, and write recording, CSV tables, `trajectory.json`, result.json and report.
 
-    Successful if the goal is reached within all limits; otherwise the run folder holds the reason."""
+    The command is successful if the goal is reached within all limits; otherwise the run folder holds the reason."""
     with atomic_run_folder(run, out, "plan") as folder:
         folder.record_run_start(run, "plan")
         progress.begin_stage("building the model and its compiled step")

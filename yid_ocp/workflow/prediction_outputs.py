@@ -26,9 +26,10 @@ from yid_ocp.solvers.base import EpisodeAndPrediction
 
 
 def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
-    """Estimated torque offset of every recording, held-out ones too, and joint: `value`, `std`, `prior_std` [N m].
+    """Estimated torque offset of every joint in every recording, held-out too: `value`, `std`, `prior_std` [N m].
 
-    The problem's whitening filters are fixed near `x` (nx,). Empty without filters or offsets in the model."""
+    The problem's whitening filters are fixed near `x` (nx,). The result is empty without filters, or without offsets in
+    the model."""
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
     known = list(zip(problem.episodes, whitening.torque_biases_and_stds_by_recording(problem, x), strict=True))
@@ -125,12 +126,12 @@ EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, Episo
 def write_solve_trajectories(
     path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> None:
-    """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`. Raises `OutputError`.
+    """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1` (HDF5).
 
     `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m) [N
     s], `torque` (N, nu) [N m] or, for servos, `command` (N, nu) [rad or m] (NaN while a motor is off), `effort` (N, nc)
     [N m], the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with
-    `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`."""
+    `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`. Raises `OutputError` if writing fails."""
     pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:
         done = solution.episode_predictions

@@ -116,9 +116,9 @@ def _grouped(notes: list[str]) -> list[str]:
 def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
     """Create a run folder that appears under its name only if the block succeeds (context manager).
 
-    The name is `out`, or `NAME-COMMAND-YYYYmmdd-HHMMSS` in `output.runs_folder`. It is reserved first, so that two runs
-    never write to one folder. Remains of killed runs next to it are deleted. Raises `OutputError` if the folder exists
-    and is not empty, is being written by another run, or cannot be created or written to."""
+    The name is `out`, or `NAME-COMMAND-YYYYmmdd-HHMMSS` in `output.runs_folder`. The name is reserved first, so that
+    two runs never write to one folder. Remains of killed runs next to the folder are deleted. Raises `OutputError` if
+    the folder exists and is not empty, is being written by another run, or cannot be created or written to."""
     stem = "-".join(filter(None, (run.name, command)))
     targets = _targets(run, out, stem)
     made = [parent for parent in targets[0].parents if not parent.exists()]

@@ -31,8 +31,8 @@ _loaded: dict[str, str] = {}  # loaded files and entry points, with hash or dist
 def load_plugins(run: RunSettings) -> None:
     """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once per process.
 
-    Raises `ConfigError`, and registers nothing of the plug-in, if it is missing, raises, registers nothing, uses a
-    registered name, or changed after this process ran it."""
+    Raises `ConfigError` if a plug-in is missing, raises an error, registers nothing, uses a registered name, or changed
+    after this process ran it. Nothing of this plug-in is then registered."""
     for entry in _installed():
         name, of = f"entry point {entry.name}", _distribution(entry)
         if name not in _loaded:

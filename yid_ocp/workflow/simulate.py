@@ -34,14 +34,13 @@ def run_simulate(
     seed: int = 0,
     noise: bool = False,
 ) -> CommandOutcome[Recording | None]:
-    """Write `recording.h5` of the model with the first recording's inputs, or of a virtual experiment.
+    """Simulate the model of a run, or a virtual experiment, and write `recording.h5`.
 
     With a recording under `recordings.estimate`, its torques or prescribed motion drive the model at the initial
-    parameter values, and every sensor is predicted at its sample times. Otherwise MuJoCo simulates a random motion of
-    the driven arms. If the rollout fails there is no recording.
-
-    `noise` adds noise with the recorded standard deviations to the predictions (a virtual experiment always has noise).
-    `seed` determines the motion and the noise."""
+    parameter values, and every sensor is predicted at its sample times. Without a recording, MuJoCo simulates a random
+    motion of the driven arms, as a virtual experiment. If the rollout fails, no recording is written. `noise` adds
+    noise with the recorded standard deviations to the predictions (a virtual experiment always has noise). `seed`
+    determines the motion and the noise."""
     with atomic_run_folder(run, out, "simulate") as folder:
         flags = [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
         folder.record_run_start(run, "simulate", flags)

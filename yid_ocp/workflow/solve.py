@@ -36,10 +36,10 @@ _BARS, _SPARKLINE_WIDTH = "▁▂▃▄▅▆▇█", 24
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS, is_live: bool = False
 ) -> CommandOutcome[Solution]:
-    """Estimate, validate and write the run folder. Successful if the solver converged.
+    """Estimate, validate and write the run folder. The command is successful if the solver converged.
 
-    If it failed, the run folder holds the reason and the best point. `is_live` reports a table of cost and parameters
-    at every iterate, which a terminal updates."""
+    If the solver failed, the run folder holds the reason and the best point. With `is_live`, a table of cost and
+    parameters is reported at every iterate, which a terminal updates."""
     with atomic_run_folder(run, out) as folder:
         folder.record_run_start(run, "solve")
         progress.begin_stage("building the model and its compiled step", ahead=20.0)

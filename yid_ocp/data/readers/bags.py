@@ -172,16 +172,16 @@ def read_bag(
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    Joints come from `sensor_msgs/JointState`; several topics are merged on one clock. Without it, they come from
-    Franka's `FrankaState` and `FrankaRobotState` (with the estimated wrench as `wrist_estimated`), `DynamicJointState`
-    and `JointTrajectoryControllerState` of `control_msgs`, or `RobotStateRTMsg` of `ur_msgs`. `joint_topics` selects
-    such topics even if there are joint states, and `fields` reads messages of any type. Stamped points, poses and
-    transforms of `geometry_msgs` and frames of `/tf` become points, one group per reference frame. Each topic of
-    `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
+    Joints come from `sensor_msgs/JointState`; several topics are merged on one clock. In files without `JointState`,
+    joints come from Franka's `FrankaState` and `FrankaRobotState` (with the estimated wrench as `wrist_estimated`),
+    `DynamicJointState` and `JointTrajectoryControllerState` of `control_msgs`, or `RobotStateRTMsg` of `ur_msgs`.
+    `joint_topics` selects these topics even if there are `JointState` messages, and `fields` reads messages of any
+    type. Stamped points, poses and transforms of `geometry_msgs` and frames of `/tf` become points, one group per
+    reference frame. Each topic of `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
 
     Times are header stamps (recording times if a message has no stamp), relative to the first message. A joint channel
     that is empty or all NaN is omitted. `notes` lists unused topics. Raises `DataError` if `rosbags` is not installed,
-    if the bag cannot be read, has no usable topic or is ambiguous, and the errors of `validated_recording`."""
+    if the bag cannot be read, has no usable topic or is ambiguous, or if `validated_recording` refuses the result."""
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
     if distance is not None and not 0 < distance < float("inf"):

@@ -78,9 +78,9 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     - points: `<point>_x`, `<point>_y`, `<point>_z`
 
     Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are recognised by their headers, which also state
-    the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. If all cells of the joints,
-    of the points or of a sensor are empty in a row, this group has no sample at that time. Raises `DataError` if the
-    file, a column, cell, option or unit cannot be understood, and the errors of `validated_recording`."""
+    the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. The joints, the points or a
+    sensor have no sample at a time if all their cells in this row are empty. Raises `DataError` if the file, a column,
+    cell, option or unit cannot be understood, or if `validated_recording` refuses the result."""
     path = Path(path)
     digest = file_sha256(path)
     said = options.description, path.name, path.stem, digest

@@ -45,10 +45,10 @@ class MountSettings:
 
 @dataclass(frozen=True)
 class ClampPoseDefinition:
-    """Defines a clamp's pose by two measured points. The first is the origin, and the z axis points to the second.
+    """Definition of a clamp's pose by two measured points: the origin, and a second point on the z axis.
 
-    With `level` the roll angle is zero (x axis perpendicular to world y). With `transported` it starts as `level`, and
-    the clamp never rotates about its own z axis."""
+    Two points do not determine the roll angle about z. With `level` it is zero (x axis perpendicular to world y). With
+    `transported` it starts as `level`, and the clamp never rotates about its own z axis."""
 
     clamp_name: str
     origin_point_name: str
@@ -137,7 +137,7 @@ class InitCommandObject:
 
 @dataclass(frozen=True)
 class InitCommandObjectFactory:
-    """Template for one word of `init --object`.
+    """Template of an object for one value of `init --object`.
 
     `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
     Raises `ConfigError` if an input is missing."""
@@ -186,7 +186,8 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 class ObjectKind:
     """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
-    A subclass overrides `kind`, and `build_segments` or `build`. A whole system is also a `ClampedObject`."""
+    A subclass overrides `kind`, and `build_segments` or `build`. A kind that is a whole system is also a
+    `ClampedObject`."""
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
     default_link_refinement: ClassVar[bool] = False

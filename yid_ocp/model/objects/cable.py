@@ -69,10 +69,11 @@ class CableBranchOptions:
 class CableOptions:
     """Settings of a cable's model.
 
-    With `shape_memory_fraction`, each joint's rest angle is (1 - memory) x undeformed + memory x (start angle -
-    load/stiffness). The load is the joint's torque in equilibrium at the start of the recording. The fraction becomes
-    the parameter `SEGMENT.memory`. For a recording that starts in motion it is multiplied by 1/(1 + (start
-    speed/`start.speed_scale`)^2). Branches without an entry have the `default_branch`. `gravity` is in m/s^2."""
+    `shape_memory_fraction` models a cable that partly keeps the shape in which it was held before the recording. The
+    rest angle of each joint is then (1 - memory) x undeformed + memory x (start angle - load/stiffness), where the load
+    is the joint's torque in equilibrium at the start. The fraction becomes the parameter `SEGMENT.memory`. For a
+    recording that starts in motion it is multiplied by 1/(1 + (start speed/`start.speed_scale`)^2). Branches without an
+    entry have the `default_branch`. `gravity` is in m/s^2."""
 
     branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by branch, parent and children")] = (
         field(default_factory=dict)

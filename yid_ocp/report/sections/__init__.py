@@ -55,8 +55,8 @@ REPORT_SECTIONS: Registry[_ReportSection] = Registry("report section")
 def register_report_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
     """Decorator that registers a function as the report section `name`. Sections with lower `order` come first.
 
-    The function returns the context of the template `NAME.html`, or pairs (title, figure) for a section without a
-    template. It returns None, or no pair, if the section has no content."""
+    The function returns the context of the template `NAME.html` or, for a section without a template, pairs (title,
+    figure). It returns None or no pair if the section has no content."""
 
     def enter(prepare: _PrepareContext) -> _PrepareContext:
         REPORT_SECTIONS.register(name)(_ReportSection(order, title, prepare))
