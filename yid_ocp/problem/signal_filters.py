@@ -144,8 +144,7 @@ class FirstOrderLag:
     time_step: float  # h [s]
 
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
-        """Mean output z of the lag over each step, with derivatives, for inputs x (N, k) that are constant in every
-        step.
+        """Mean output z of the lag over each step, with derivatives, for inputs x (N, k) that are constant in a step.
 
         The mean is x + (z - x) f with z_{k+1} = x + (z - x) E, with E and f as in the class. The output starts at the
         first input. `slope` (N, k, d) is the derivative of x."""

@@ -209,12 +209,12 @@ class SingleShooting(SolverWithCheckedSettings):
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
 class SteepestDescent(SolverWithCheckedSettings):
-    """Projected steepest descent with Armijo backtracking, x <- P(x - s g), on a cost with gradient g.
+    """Projected steepest descent with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
 
-    P projects onto the bounds. The gradient comes from the adjoint method and is not scaled, as in the paper (Caldwell
-    et al. 2014). The first trial step s of an iteration is twice the last accepted step (`last`, as in the paper), or
-    the Barzilai-Borwein step (`spectral`). The spectral step needs far fewer iterations, but may raise the cost for a
-    few of them (`nonmonotone_memory`: about 10).
+    The gradient g comes from the adjoint method and is not scaled, as in the paper (Caldwell et al. 2014). The first
+    trial step s of an iteration is twice the last accepted step (`last`, as in the paper), or the Barzilai-Borwein step
+    (`spectral`). The spectral step needs far fewer iterations, but may raise the cost for a few of them
+    (`nonmonotone_memory`: about 10).
 
     References
     ----------
