@@ -6,6 +6,7 @@ import pytest
 import scipy.linalg
 
 from yid_ocp.effects import make_effect
+from yid_ocp.effects.bodies import with_link_mass_parameters
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import (
@@ -102,6 +103,7 @@ def test_driven_joints_must_come_first(parts):
 ANGLES = slice(0, 2)
 MOMENTA = slice(2, 4)
 AT = "shoulder"
+OWN = {f"{joint}.{quantity}" for joint in ("shoulder", "elbow") for quantity in ("mass", "damping")}
 EFFECTS = {
     "nothing": (),
     "armature": (("rotor_inertia", {"armature": 0.3}),),
@@ -156,13 +158,26 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
         assert np.max(np.abs(value)) > 1e-3
 
 
+def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(plain):
+    step = compile_step(with_link_mass_parameters(plain, "mass_scale"), TIME_STEP, use_compiler=False)
+    names = {"shoulder.mass_scale": 1.1, "elbow.mass_scale": 0.8, "elbow.damping": 0.4}
+    theta = step.system.parameters.vector(names)
+    state, torque, internal = moved(step, theta)
+    shift = EffectMomentumShift(step)
+    loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.theta_without_effects(theta))
+    recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, internal)
+    value, slopes = shift.node_momentum_shifts_and_derivatives(recorded, recorded, theta, tuple(names))
+    np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
+    assert np.all(np.max(np.abs(slopes), axis=(0, 1)) > 1e-4)
+
+
 def test_the_shift_of_a_torque_that_was_misread(plain):
     """Half the impulse of the error; the derivative says the same of a gain."""
     step = step_with(plain, ())
     theta = step.system.parameters.vector()
     state, torque, none = moved(step, theta)
     shift = EffectMomentumShift(step)
-    assert shift.parameter_names == ()
+    assert set(shift.parameter_names) == OWN
     by_torque = np.stack([torque, 0 * torque], axis=2)
     recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, none)
     true = JointMotionWithSensitivities(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
@@ -205,7 +220,7 @@ def test_derivatives_are_those_of_differences(plain, names):
 def test_an_effect_away_from_neutral_or_sought_shifts_the_momentum(plain):
     step = step_with(plain, EFFECTS["armature"])
     shift = EffectMomentumShift(step)
-    [name] = shift.parameter_names
+    [name] = set(shift.parameter_names) - OWN
     theta = step.system.parameters.vector()
     neutral = shift.theta_without_effects(theta)
     assert neutral[step.system.parameters.index(name)] == 0.0

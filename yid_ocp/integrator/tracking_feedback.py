@@ -161,9 +161,9 @@ class EffectMomentumShift:
     """Computes the momentum that effects add to the recorded motion, so that the feedback does not oppose it.
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
-    effect such as an armature, or a torque other than the recorded torque, changes the momentum of the motion. Without
-    this shift the feedback would oppose it: at a wrist, whose momentum gain times h/2 is near one, by half of the
-    effect. `parameter_names` are the effect parameters on which the momentum depends if the torques are known."""
+    effect such as an armature, a fitted mass or damping of the arm, or a torque other than the recorded torque, changes
+    the momentum of the motion. Without this shift the feedback would oppose it: at a wrist, whose momentum gain times
+    h/2 is near one, by half. `parameter_names` are those on which the momentum depends if the torques are known."""
 
     def __init__(self, step: Step) -> None:
         e, system = step.equations, step.system
@@ -185,8 +185,8 @@ class EffectMomentumShift:
         [momentum, law] = ca.substitute(wanted, [e.q0, e.q1, e.z0, e.z1, e.lam], known)
         last, then = e.z0[self._kept], e.z1[self._kept]
         self._time_step = np.array([step.time_step])
-        # an effect without neutral values keeps its parameters
-        neutral: dict[str, float] = {}
+        # the arm's own masses and damping count as effects do; an effect without neutral values keeps its parameters
+        neutral = {p.name: p.value for p in system.parameters if p.name.rpartition(".")[0] in system.driven}
         for effect in system.effects:
             neutral |= getattr(effect, "neutral_values", {})
         at = {i: neutral[name] for i, name in enumerate(system.parameters.names) if name in neutral}
@@ -270,7 +270,7 @@ class EffectMomentumShift:
         return z, total if np.any(total) else None
 
     def theta_without_effects(self, theta: Array) -> Array:
-        """Copy of theta with neutral effect parameters, with which the feedback's reference is computed."""
+        """Copy of theta with neutral effects and the arm as described, by which the reference is computed."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
         return plain
