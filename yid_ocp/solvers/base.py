@@ -524,7 +524,7 @@ def _fit_from(
         weighted = problem_whitened_at(weighted, x, warm) if passes > 1 else problem
         noted = _noting(callback, f"pass {number + 1} of at most {passes}" if passes > 1 else "")
         begun, coarse = x, getattr(solver, "coarse", solver) if passes > 1 else solver
-        for own in dict.fromkeys((coarse, solver)):
+        for own in (solver,) if coarse == solver else (coarse, solver):
             result = _minimize_cost(own, weighted, x, noted)
             x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
             history += result.history
