@@ -39,8 +39,8 @@ from yid_ocp.model.objects.cable import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
-    constant_position_baseline,
-    interpolated_displacement_position_baseline,
+    constant_position_baseline_prediction,
+    interpolated_displacement_baseline_prediction,
     mean_clamp_displacement_baseline_prediction,
     position_rmse,
     recorded_point_positions,
@@ -97,7 +97,7 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=8.0,
-        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free_vertex_names)},
+        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.unclamped_vertex_names)},
         clamp_pose_definitions_from_points=cable.clamp_pose_definitions_from_points,
         prior_stds=dict.fromkeys(names, 0.2),
         initial_state_fit_window=TIME_STEP,
@@ -129,11 +129,11 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
 
 def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     """Prediction errors without a model [m]."""
-    free, measured = cable.free_vertex_names, recorded_point_positions(recording, cable.free_vertex_names)
+    free, measured = cable.unclamped_vertex_names, recorded_point_positions(recording, cable.unclamped_vertex_names)
     predictions = {
-        "stay": constant_position_baseline(recording, free),
+        "stay": constant_position_baseline_prediction(recording, free),
         "move_with_clamps": mean_clamp_displacement_baseline_prediction(recording, free, cable.clamped_vertex_names),
-        "linear_carry": interpolated_displacement_position_baseline(
+        "linear_carry": interpolated_displacement_baseline_prediction(
             recording,
             free,
             cable.parent_branch_vertex_names,
@@ -161,8 +161,8 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
         step, estimate, identifiable_cable_parameter_names(cable, OPTIONS), options, None, held_out
     )
     clock = time.perf_counter()
-    nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.free_vertex_names)
-    point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)
+    nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.unclamped_vertex_names)
+    point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)
     seconds["starts"] = time.perf_counter() - clock
     episode = problem.episodes[0]
     (theta, offset) = problem.theta_and_initial_state_deviation(problem.initial_unknowns, 0)
@@ -172,11 +172,11 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     clock = time.perf_counter()
     solution = solve(problem, GaussNewton(max_iterations=iterations))
     seconds["fit"] = time.perf_counter() - clock
-    fitted = point_rmse_by_recording(problem, solution.x, cable.free_vertex_names)
+    fitted = point_rmse_by_recording(problem, solution.x, cable.unclamped_vertex_names)
     clock = time.perf_counter()
     simple = solve(undeformed, GaussNewton(max_iterations=iterations))
     seconds["fit_undeformed_rest"] = time.perf_counter() - clock
-    by_simple = point_rmse_by_recording(undeformed, simple.x, cable.free_vertex_names)
+    by_simple = point_rmse_by_recording(undeformed, simple.x, cable.unclamped_vertex_names)
     files = {}
     for recording in (*estimate, *held_out):
         errors = baselines(recording, cable)
@@ -193,7 +193,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
         "format": "yid-cable/1",
         "unit": "m",
         "given": "held vertices throughout, free vertices in the first two frames",
-        "free_vertices": list(cable.free_vertex_names),
+        "free_vertices": list(cable.unclamped_vertex_names),
         "files": files,
         "held_out_median": medians([entry for entry in files.values() if entry["held_out"]]),
         "parameters": parameters(cable, solution.x, solution.covariance, problem.unknown_names),

@@ -31,7 +31,7 @@ from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_conf
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import scale_parameters_to_more_links
-from yid_ocp.diagnosis.blind_scores import evidence_to_json, judge_recorded_case
+from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict, judge_recorded_case
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.files import make_folder, read_input_json, write_strict_json
@@ -238,7 +238,7 @@ def run(name: str, seeds: Sequence[int], record: str = "") -> dict[str, str]:
     case = CASES[name]
     finding, seconds, best = found(name, seeds)
     if record:
-        data = {"said": said(finding.to_dict()), "evidence": evidence_to_json(finding)}
+        data = {"said": said(finding.to_dict()), "evidence": diagnosis_evidence_to_dict(finding)}
         write_strict_json(Path(record) / f"{name}.json", data)
     truth = " + ".join(effect.label for effect in case.withheld) or "-"
     rivals = "; ".join(

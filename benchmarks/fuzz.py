@@ -509,7 +509,7 @@ def tried(case: Case, originals_folder: Path, work: Path) -> str:
     try:
         KINDS[case.kind](work, rng)
     except YidError as error:
-        if "" in error.four_parts().values() or "Traceback" in str(error) or len(str(error)) > 600:
+        if "" in error.message_parts().values() or "Traceback" in str(error) or len(str(error)) > 600:
             return f"an error without words, or with too many: {error!r}"
     except UnsoundError as error:
         return str(error)

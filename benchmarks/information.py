@@ -202,7 +202,7 @@ def wrist() -> None:
 def _share(effect: InjectedEffect, share: float) -> InjectedEffect:
     """The same effect, its amplitudes that part of the way from neutral."""
     kind = make_effect(effect.kind, effect.location, baxter_foam_y_system(1))
-    names = {name.removeprefix(f"{kind.label}."): name for name in kind.amplitude_names}
+    names = {name.removeprefix(f"{kind.label}."): name for name in kind.amplitude_parameter_names}
     neutral = {short: kind.neutral_values[name] for short, name in names.items()}
     values = {
         name: neutral[name] + share * (value - neutral[name]) if name in neutral else value

@@ -36,7 +36,7 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.planning.joint_paths import (
     FramePositionEvaluator,
-    SplinePath,
+    RestToRestSplineBasis,
     solve_equilibrium_at_point_target,
     solve_start_equilibrium,
 )
@@ -97,7 +97,7 @@ class PlannedMovement:
     """A planned joint motion as reference for the virtual robot's controller."""
 
     joints: tuple[str, ...]
-    path: SplinePath
+    path: RestToRestSplineBasis
     spline_coefficients: Array
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
@@ -107,7 +107,7 @@ class PlannedMovement:
         return offset, rate, bend
 
 
-def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> PlannedMovement:
+def straight(step: Step, posture: Array, shift: Array, path: RestToRestSplineBasis) -> PlannedMovement:
     """The gripper along a straight line, its orientation as little changed as the arm allows."""
     system = step.system
     gripper, n = FramePositionEvaluator(system, [GRIPPER]), system.n_coordinates

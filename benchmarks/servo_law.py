@@ -21,8 +21,8 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import FrictionLawSettings
 from yid_ocp.diagnosis import law as gap_law
-from yid_ocp.effects.law import Law, LawTable, make_law, quantity_values_along
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.effects.law import TorqueLaw, TorqueLawTable, make_torque_law, torque_law_quantity_values_along_rollout
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
@@ -46,12 +46,12 @@ def visited(problem: EstimationProblem, solution: Solution, quantity: str) -> di
         own = result.rollout
         nodes = {"state": own.state, "torque": own.torque, "multipliers": own.multipliers}
         nodes["time_step"] = np.array(episode.grid.time_step)
-        values = quantity_values_along(problem.system, JOINT, quantity, theta, nodes).ravel()
+        values = torque_law_quantity_values_along_rollout(problem.system, JOINT, quantity, theta, nodes).ravel()
         found[episode.name] = values[np.isfinite(values)]
     return found
 
 
-def with_prior(problem: EstimationProblem, law: Law, precision: Array) -> EstimationProblem:
+def with_prior(problem: EstimationProblem, law: TorqueLaw, precision: Array) -> EstimationProblem:
     known = problem.options.multivariate_prior
     count, names = len(known.parameter_names), (*known.parameter_names, *law.parameters.names)
     covariance = np.zeros((len(names),) * 2)
@@ -69,14 +69,14 @@ def left_out_errors(
         low, high = min(low, -high), max(high, -low)
     room, zeros = (high - low) / (N_KNOTS - 3), np.zeros(N_KNOTS)
     knots = np.linspace(low - room / 2, high + room / 2, N_KNOTS)
-    law = make_law(JOINT, base.system, [LawTable(quantity, knots, zeros, zeros)], TORQUE_STD)
+    law = make_torque_law(JOINT, base.system, [TorqueLawTable(quantity, knots, zeros, zeros)], TORQUE_STD)
     names, known = law.parameters.names, base.named_values(solution.x)
     step = compile_step_like(base.step, base.system.with_effects([law]))
     nominal = dict(zip(base.system.parameters.names, map(float, base.theta), strict=True))
     recordings = [episode.recording for episode in base.episodes]
     problem = EstimationProblem(step, recordings, (*base.free, *names), base.options, nominal)
     evaluation = problem.evaluate(problem.vector(known))
-    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
+    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     at = [problem.unknown_names.index(name) for name in names]
     basis, _ = np.linalg.qr(np.delete(jacobian, at, axis=1))
     rest, slopes = (x - basis @ (basis.T @ x) for x in (residual, jacobian[:, at]))

@@ -141,7 +141,7 @@ OPENED_ELSEWHERE = {
     "data.readers.lerobot._files": "the format of a name",
     "export.signals.export_recording_csv_files": "writes",
     "integrator.codegen.kernel_c_source": "sources in C that come with the package",
-    "integrator.codegen.kernel_source_text": "sources that come with the package",
+    "integrator.codegen.kernel_cache_key_text": "sources that come with the package",
     "inference.kalman._library": "a source in C that comes with the package",
     "integrator.compiler._machine": "/proc",
     "report.html._is_plotly_script": "a script that is compared with its original",

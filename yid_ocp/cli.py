@@ -430,7 +430,7 @@ def _reliable_streams() -> Iterator[None]:
 
 def _wrong(error: YidError, as_json: bool) -> int:
     print(f"error: {error}", file=sys.stderr)
-    _told(as_json, type(error).__name__, code=_EXIT_WRONG_INPUT, **error.four_parts())
+    _told(as_json, type(error).__name__, code=_EXIT_WRONG_INPUT, **error.message_parts())
     return _EXIT_WRONG_INPUT
 
 

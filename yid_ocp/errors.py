@@ -20,7 +20,7 @@ class YidError(Exception):
         self.what, self.where, self.allowed, self.hint = what, where, allowed, hint
         super().__init__(what)
 
-    def four_parts(self) -> dict[str, str]:
+    def message_parts(self) -> dict[str, str]:
         """The keys what, where, allowed and hint as the user sees them. Missing parts have general texts."""
         said = {
             "what": self.what,
@@ -36,7 +36,7 @@ class YidError(Exception):
         return shown
 
     def __str__(self) -> str:
-        shown = self.four_parts()
+        shown = self.message_parts()
         return f"{shown['what']}\n  where: {shown['where']}\n  allowed: {shown['allowed']}\n  try: {shown['hint']}"
 
 

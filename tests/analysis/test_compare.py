@@ -19,7 +19,7 @@ from yid_ocp.analysis.compare import (
     PAPER_ESTIMATES,
     _load_torque_ensemble,
     compare_methods,
-    explain_paper_estimates,
+    explain_paper_differences,
     is_within_ensemble_range,
 )
 from yid_ocp.analysis.estimation import (
@@ -173,7 +173,7 @@ def compared(monkeypatch):
 
         monkeypatch.setattr(module, "solve", solve)
         monkeypatch.setattr(estimation, "solve", whole)
-        monkeypatch.setattr(estimation, "checked_solution", lambda _, made: replace(made, message="checked"))
+        monkeypatch.setattr(estimation, "with_intervals_and_checks", lambda _, made: replace(made, message="checked"))
         monkeypatch.setattr(
             module, "solution_with_profile_intervals", lambda _, made: replace(made, message="profiled")
         )
@@ -362,7 +362,7 @@ def test_why_a_published_value_is_what_it_is(monkeypatch, expected, case):
     monkeypatch.setitem(PAPER_ESTIMATES, "made up", {"T1.bend": published})
     ensemble = {"made up": {"none": {"T1.bend": [stopped]}, "offsets": {"T1.bend": [6.0, 14.0]}}}
     monkeypatch.setattr(module, "_load_torque_ensemble", lambda: ensemble)
-    [said] = explain_paper_estimates("made up", {"T1.bend": entry}, {} if truth is None else {"T1.bend": truth})
+    [said] = explain_paper_differences("made up", {"T1.bend": entry}, {} if truth is None else {"T1.bend": truth})
     assert said.startswith(f"T1.bend = {published:.4g} of Caldwell et al.: {expected}")
 
 
@@ -376,7 +376,7 @@ def judged(**verdicts):
 
 
 def told(experiment, **verdicts):
-    return explain_paper_estimates(experiment, judged(**verdicts), PAPER_TRUTH)
+    return explain_paper_differences(experiment, judged(**verdicts), PAPER_TRUTH)
 
 
 def test_each_published_value_has_one_sentence():
@@ -405,7 +405,7 @@ def test_the_truth_was_chosen_from_one_answer_and_this_is_said():
     other = told("single_arm_no_vision")
     assert other[0] == "T1.bend = 23.78 of Caldwell et al.: near the truth of these recordings, 22"
     elsewhere = {name: 1.05 * value for name, value in PAPER_TRUTH.items()}
-    assert not any("chosen" in text for text in explain_paper_estimates(_TRUTH_EXPERIMENT, judged(), elsewhere))
+    assert not any("chosen" in text for text in explain_paper_differences(_TRUTH_EXPERIMENT, judged(), elsewhere))
 
 
 def test_weak_parameters_are_said_with_their_interval_and_what_is_not_explained_not_at_all():
@@ -415,7 +415,7 @@ def test_weak_parameters_are_said_with_their_interval_and_what_is_not_explained_
     assert "unexplained; such recordings leave 8.65 to 109.7 open and not this, it is not slow" in said[1]
     assert told(_TRUTH_EXPERIMENT, T1_bend=estimate(1.0, 1.0, "not_trusted")) == ()
     assert len(told(_TRUTH_EXPERIMENT, T2_bend=estimate(10.7, 0.0, "fixed", free=False))) == 5
-    assert len(explain_paper_estimates(_TRUTH_EXPERIMENT, {"T1.bend": FOUND, "else": FOUND}, PAPER_TRUTH)) == 1
+    assert len(explain_paper_differences(_TRUTH_EXPERIMENT, {"T1.bend": FOUND, "else": FOUND}, PAPER_TRUTH)) == 1
 
 
 class Means:

@@ -11,7 +11,7 @@ from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, step_map
 from yid_ocp.analysis.step_diagnostics import (
     checked_step_linearisation,
     linearise_step_equations,
-    parameter_detectabilities,
+    parameter_influences,
     step_complexity_summary,
 )
 from yid_ocp.analysis.step_symbols import NamedStepEquations
@@ -45,7 +45,7 @@ def judged(problem):
     path = episode.initial_known_coordinates[len(system.driven) :]
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
     symbols = NamedStepEquations.from_equations(step.equations)
-    found = parameter_detectabilities(step, symbols, episode, rest.state, problem.theta, rows)
+    found = parameter_influences(step, symbols, episode, rest.state, problem.theta, rows)
     return {entry.parameter: entry for entry in found}, rest, rows
 
 
@@ -176,7 +176,7 @@ def test_without_sensors_only_rows_are_said(hanging):
     theta = step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, theta, np.zeros(0))
-    found = {e.parameter: e for e in parameter_detectabilities(step, symbols, None, rest.state, theta, rows)}
+    found = {e.parameter: e for e in parameter_influences(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].observable_rows is None
     assert (found["T1.twist"].max_change_from_rest, found["T1.twist"].seconds) == (None, 0.0)
     assert len(found["T1.bend"].rows) == 12

@@ -27,8 +27,8 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.whitening import problem_with_whitening_at, problem_without_input_errors
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
@@ -55,8 +55,8 @@ MARKER_DISTANCE = 0.03
 def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
-        (made.camera_point_group_and_sampling(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_point_group_and_sampling(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.camera_point_group_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
+        (made.arm_point_group_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -67,9 +67,9 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     std = np.full((3, 2, 3), 2e-3)
     std[0] = [9e-3, np.nan, 9e-3]
     made, episode = setting(group(std=std))
-    assert made.camera_point_group_and_sampling(episode)[2] == 2e-3
+    assert made.camera_point_group_times_and_std(episode)[2] == 2e-3
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
-    assert made.camera_point_group_and_sampling(episode)[2] == 3e-3
+    assert made.camera_point_group_times_and_std(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
     with pytest.raises(DataError, match="the noise level of group 'points_camera' is neither recorded nor given"):
         unknown.existing_point_observation_schedules(episode)
@@ -374,11 +374,11 @@ def drawn_motion(monkeypatch):
 
     monkeypatch.setattr(propagation, "step_derivatives_along_rollout", maps)
     monkeypatch.setattr(
-        propagation, "applied_torque_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
+        propagation, "applied_torque_derivative_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    functions = SimpleNamespace(step=None, effect_momentum_shift_functions=shift)
+    functions = SimpleNamespace(step=None, recorded_momentum_correction=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
@@ -480,14 +480,14 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
             own = replace(own, t=times, position=np.zeros(shape), std=std)
         groups.append(own)
     # what is there tells of errors of torques too: those that the real recording tells of
-    errors = problem_whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors
+    errors = problem_with_whitening_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors
     effort = recording.joints.effort.copy()
     effort[: len(errors.torque_noise)] -= errors.estimated_torque_error
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
     values = noisy.named_values(noisy.initial_unknowns)
     problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, values)
-    weighted = problem_whitened_at(problem, problem.initial_unknowns)
-    jacobian = linearization_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
+    weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
+    jacobian = residual_and_jacobian_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
     std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) / problem.initial_unknowns
     for name, value in zip(problem.unknown_names, std, strict=True):
         assert predicted.std_relative[name] == pytest.approx(value, rel=0.02)
@@ -524,7 +524,7 @@ def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_fo
     )
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), options)
     x, [episode] = problem.initial_unknowns, problem.episodes
-    slopes, _ = propagation.point_sensitivities_and_joint_sensor_information(
+    slopes, _ = propagation.point_sensitivities_and_joint_sensor_fisher_information(
         problem, problem.evaluate(x), x, 0, {tip.name: 1e-6}
     )
     [found] = (own[:, :, len(x) :].reshape(-1, own.shape[2] - len(x)) for own in slopes.values())

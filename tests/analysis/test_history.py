@@ -15,13 +15,13 @@ from yid_ocp.analysis.estimate_history import (
     RunEstimates,
     assess_drift_and_outlier_runs,
     nearby_positive_definite_covariance,
-    pool_estimates,
+    pool_estimates_and_chi2,
 )
 from yid_ocp.analysis.friction_ladder import (
     FrictionLawFit,
     cross_validate_friction_law,
-    friction_torque_clouds,
     mean_and_std_error_over_motion_kinds,
+    measured_and_predicted_friction_torques,
     recording_names_by_name_stem,
     simplest_fit_within_std_error,
 )
@@ -51,7 +51,7 @@ def outliers(found):
 def test_two_runs_together_are_their_weighted_mean_also_without_full_rank():
     other = np.array([[1.0, -0.3], [-0.3, 2.0]]) * 1e-4
     first, second = run("x", [1.0, 2.0]), run("y", [1.003, 2.002], other)
-    mean, chi2, degrees = pool_estimates([first, second])
+    mean, chi2, degrees = pool_estimates_and_chi2([first, second])
     sum_of = np.linalg.inv(np.linalg.inv(COVARIANCE) + np.linalg.inv(other))
     expected = sum_of @ (np.linalg.inv(COVARIANCE) @ first.values + np.linalg.inv(other) @ second.values)
     apart = first.values - second.values
@@ -59,7 +59,7 @@ def test_two_runs_together_are_their_weighted_mean_also_without_full_rank():
     assert mean.covariance == pytest.approx(sum_of, rel=1e-8)
     assert chi2 == pytest.approx(apart @ np.linalg.solve(COVARIANCE + other, apart), rel=1e-8)
     assert (degrees, mean.run_name) == (2, "2 runs")
-    alone, chi2, degrees = pool_estimates([first])
+    alone, chi2, degrees = pool_estimates_and_chi2([first])
     assert (alone.run_name, chi2, degrees) == ("x", pytest.approx(0.0, abs=1e-20), 0)
     assert alone.covariance == pytest.approx(COVARIANCE, rel=1e-8)
     flat = np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer([1e-3, 1e4], [1e-3, 1e4])
@@ -72,15 +72,18 @@ def test_two_runs_together_are_their_weighted_mean_also_without_full_rank():
 
 
 def test_runs_that_differ_widen_the_mean_and_a_parameter_counts_where_it_is():
-    mean, chi2, degrees = pool_estimates([run("x", [1.0, 2.0]), run("y", [1.5, 2.0])])
+    mean, chi2, degrees = pool_estimates_and_chi2([run("x", [1.0, 2.0]), run("y", [1.5, 2.0])])
     assert chi2 > 50
     assert mean.std == pytest.approx(np.sqrt(np.diag(COVARIANCE) / 2 * chi2 / degrees), rel=1e-8)
-    mean, _, degrees = pool_estimates([run("x", [1.0, 2.0]), run("y", [1.0], [[1e-4]], ("a",))])
+    mean, _, degrees = pool_estimates_and_chi2([run("x", [1.0, 2.0]), run("y", [1.0], [[1e-4]], ("a",))])
     assert mean.parameter_names == ("a", "b")
     assert degrees == 1
     assert mean.std[0] < 0.01
     misfit = replace(run("y", [1.0, 2.0]), is_fit_adequate=False)
-    assert (mean.is_fit_adequate, pool_estimates([run("x", [1.0, 2.0]), misfit])[0].is_fit_adequate) == (True, False)
+    assert (mean.is_fit_adequate, pool_estimates_and_chi2([run("x", [1.0, 2.0]), misfit])[0].is_fit_adequate) == (
+        True,
+        False,
+    )
 
 
 def test_without_drift_chi2_is_distributed_as_it_should_and_alarms_stay_at_their_level():
@@ -197,7 +200,7 @@ def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_
     assert set(fit.left_out_errors) == {"slow_1", "slow_2", "fast_1", "turn_1"}
     assert all(error < 1.3e-3 for error in fit.left_out_errors.values())
     assert fit.parameters["joint_coulomb@shoulder.tau_c"].value == pytest.approx(1.2, abs=0.05)
-    [cloud] = friction_torque_clouds(driven, solution, ["joint_coulomb@shoulder.tau_c"])
+    [cloud] = measured_and_predicted_friction_torques(driven, solution, ["joint_coulomb@shoulder.tau_c"])
     assert (cloud.joint, cloud.speed.shape, cloud.load.shape) == ("shoulder", (4 * 79,), (4 * 79,))
     assert len(np.unique(cloud.speed)) == 4 * 79, "every point of the motion once"
     moving = np.abs(cloud.speed) > 0.5

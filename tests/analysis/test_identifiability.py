@@ -90,7 +90,7 @@ def test_a_fit_is_judged_by_the_noise_that_drives_the_motion_too(monkeypatch):
     """Far too large a residual until it is weighed by the noise that drives the motion."""
     problem = Formula(lambda x: [300 * (x["a"] / 2 - 1) + 20.0 * (-1) ** k for k in range(60)], {"a": 2.0})
     weighed = Formula(lambda x: [300 * (x["a"] / 2 - 1) + (-1) ** k for k in range(60)], {"a": 2.0})
-    monkeypatch.setattr(module, "problem_whitened_at", lambda *given, rounds: weighed)
+    monkeypatch.setattr(module, "problem_with_whitening_at", lambda *given, rounds: weighed)
     assert verdicts(identifiability(problem, [2.0])) == ["identifiable"]
 
 

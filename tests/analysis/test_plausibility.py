@@ -14,16 +14,16 @@ from small_problems import joints, measured, pendulum_step, points, recording, s
 from yid_ocp.analysis.clock_checks import _by_clock, _clock_error, drift_and_overstated_noise_issues
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
-    check_efforts_by_inverse_dynamics,
-    check_inertial_effort_excitation,
-    check_joint_excitation,
-    check_joint_limits,
+    inertial_effort_excitation_issues,
+    inverse_dynamics_effort_issues,
+    joint_excitation_issues,
+    joint_limit_issues,
 )
 from yid_ocp.analysis.point_checks import (
-    check_cable_point_geometry,
-    check_object_points_against_rollout,
-    check_point_distances,
-    check_robot_held_points,
+    cable_point_geometry_issues,
+    object_point_rollout_issues,
+    point_distance_issues,
+    robot_held_point_issues,
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
@@ -148,7 +148,7 @@ EFFORTS = {
 def test_efforts_beside_inverse_dynamics(arms, runs, case, begun):
     count, change, expected = EFFORTS[case]
     run = with_joints(runs[count], effort=change, t=lambda j: j.t + begun)
-    found = check_efforts_by_inverse_dynamics(arms[count], run)
+    found = inverse_dynamics_effort_issues(arms[count], run)
     assert_issues(found, expected)
     assert {(doubt.recording, doubt.weight) for doubt in found} <= {(runs[count].name, "not_trusted")}
 
@@ -215,7 +215,7 @@ SWUNG = {
 @pytest.mark.parametrize("case", SWUNG)
 def test_efforts_of_two_drives_that_swing(drives, case):
     change, behind, expected = SWUNG[case]
-    found = check_efforts_by_inverse_dynamics(drives, swung(drives, change, behind=behind))
+    found = inverse_dynamics_effort_issues(drives, swung(drives, change, behind=behind))
     assert_issues(found, expected)
     lag = f"model.effects: [{{kind: effort_delay, location: gripper, values: {{delay: {behind:g}}}}}]"
     assert [doubt.setting for doubt in found if "lag" in doubt.cause] == {0.1: [lag], -0.3: [""]}.get(behind, [])
@@ -228,7 +228,7 @@ def test_a_joint_of_which_nothing_is_asked_may_swing(drives, kind, least, expect
     needed = swung(drives, size=least / 2.4, length=6.0).joints.effort[:, 0]
     assert np.sqrt(np.mean(needed**2)) == pytest.approx(least, rel=0.3)
     recording = swung(drives, lambda e: e * [0.0, 1.0], least / 2.4, length=6.0, effort_kind=kind)
-    assert {doubt.cause for doubt in check_efforts_by_inverse_dynamics(drives, recording)} == expected
+    assert {doubt.cause for doubt in inverse_dynamics_effort_issues(drives, recording)} == expected
 
 
 def test_motion_of_another_robot_or_with_a_counterbalance(arms, runs):
@@ -236,39 +236,39 @@ def test_motion_of_another_robot_or_with_a_counterbalance(arms, runs):
     free = free_arm("package:baxter", joints=arms[1].joint_names)
     # nothing else can load an arm that holds nothing
     for arm, many, times_off, ratio in ((arms[1], 4, "4.3", 1.425), (free, 7, "6.6", 2.212)):
-        (doubt,) = check_efforts_by_inverse_dynamics(arm, quick)
+        (doubt,) = inverse_dynamics_effort_issues(arm, quick)
         assert (doubt.cause, doubt.evidence_ratio) == ("effort_unlike", pytest.approx(ratio, rel=2e-3))
         assert f"efforts of {many} of 7 joints do not match this robot" in doubt.what
         assert f"{times_off} times the usual model error" in doubt.what
     balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
-    assert check_efforts_by_inverse_dynamics(arms[1], balanced) == []
+    assert inverse_dynamics_effort_issues(arms[1], balanced) == []
 
 
 def test_too_little_of_a_recording_says_nothing(arms, runs, drives):
     arm, few = arms[1], runs[1].time_slice(-1.0, float(runs[1].joints.t[8]))
     blind = replace(with_joints(few, position=lambda j: 9.0 * j.position), joints=None)
     deaf = with_joints(runs[1], effort=lambda _: None)
-    for check in (check_efforts_by_inverse_dynamics, lambda *given: check_inertial_effort_excitation(*given, USUAL)):
+    for check in (inverse_dynamics_effort_issues, lambda *given: inertial_effort_excitation_issues(*given, USUAL)):
         assert [list(check(arm, run)) for run in (few, blind, deaf)] == [[], [], []]
-    assert list(check_joint_limits(arm, with_joints(few, t=lambda j: j.t / 30))) == []
-    assert list(check_joint_limits(arm, blind)) == list(check_robot_held_points(arm, blind, usual)) == []
-    assert list(check_joint_excitation([blind, runs[1]], {"else": ("else.damping",)}, USUAL)) == []
-    assert list(check_inertial_effort_excitation(drives, swung(drives, size=1e-3, **SLOW), USUAL)) == []
+    assert list(joint_limit_issues(arm, with_joints(few, t=lambda j: j.t / 30))) == []
+    assert list(joint_limit_issues(arm, blind)) == list(robot_held_point_issues(arm, blind, usual)) == []
+    assert list(joint_excitation_issues([blind, runs[1]], {"else": ("else.damping",)}, USUAL)) == []
+    assert list(inertial_effort_excitation_issues(drives, swung(drives, size=1e-3, **SLOW), USUAL)) == []
 
 
 def test_limits_of_joints(arms, runs):
     arm, run = arms[1], runs[1]
-    assert list(check_joint_limits(arm, run)) == []
+    assert list(joint_limit_issues(arm, run)) == []
     for shift, past, ratio in ((3.0, 1.74, 17.44), (-3.0, 1.94, 19.42)):
         wide = with_joints(run, position=lambda j, by=shift: j.position + by * (np.arange(7) == 3))
-        (doubt,) = check_joint_limits(arm, wide)
+        (doubt,) = joint_limit_issues(arm, wide)
         assert (doubt.cause, doubt.channel, doubt.group) == ("angle_limits", "position.left_e1", "joints")
         assert (doubt.evidence_ratio, doubt.recording) == (pytest.approx(ratio, rel=1e-3), run.name)
         assert f"left_e1 goes {past} rad beyond its limits of -0.05 to 2.62" in doubt.what
-    (doubt,) = check_joint_limits(arm, with_joints(run, position=lambda j: np.degrees(j.position)))
+    (doubt,) = joint_limit_issues(arm, with_joints(run, position=lambda j: np.degrees(j.position)))
     assert (doubt.cause, doubt.weight, doubt.evidence_ratio) == ("degrees", "refused", pytest.approx(754.1, rel=1e-3))
     assert "angles reach 78 rad" in doubt.what
-    (doubt,) = check_joint_limits(arm, with_joints(run, t=lambda j: j.t / 30))
+    (doubt,) = joint_limit_issues(arm, with_joints(run, t=lambda j: j.t / 30))
     assert (doubt.cause, doubt.channel, doubt.evidence_ratio) == ("speed_limits", "t", pytest.approx(6.959, rel=1e-3))
     assert "left_e1 turns 10.4 times as fast as it can (1.5 rad/s)" in doubt.what
 
@@ -295,7 +295,7 @@ for unit in (1e-3, 1e-2, 0.0254, 0.1, 0.3048):
 @pytest.mark.parametrize("case", HELD)
 def test_points_that_the_arm_holds(arms, runs, case):
     count, change, cause, words = HELD[case]
-    found = list(check_robot_held_points(arms[count], with_points(runs[count], "points_arm", change), usual))
+    found = list(robot_held_point_issues(arms[count], with_points(runs[count], "points_arm", change), usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert words in doubt.what
@@ -309,7 +309,7 @@ def test_points_that_the_arm_holds(arms, runs, case):
 @pytest.mark.parametrize("offset", [0.05, -0.03])
 def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, offset):
     moved = with_joints(runs[1], position=lambda j: j.position + offset * (np.arange(7) == joint))
-    (doubt,) = check_robot_held_points(arms[1], moved, usual)
+    (doubt,) = robot_held_point_issues(arms[1], moved, usual)
     name = arms[1].joint_names[joint]
     assert (doubt.cause, doubt.group, doubt.channel) == ("encoder_offset", "joints", f"position.{name}")
     size, found = re.search(r"([-+\d.]+) rad more.*location: (\S+, .*)}}", f"{doubt.what} {doubt.setting}").groups()
@@ -324,7 +324,7 @@ def test_points_may_be_as_far_off_as_they_are_said_to_be(arms, runs, std, is_kno
         return replace(group, position=group.position + np.array([0.06, 0.0, 0.0]), std=level)
 
     groups = tuple(moved(g) if g.name == "points_arm" else g for g in runs[1].points)
-    found = list(check_robot_held_points(arms[1], replace(runs[1], points=groups), usual))
+    found = list(robot_held_point_issues(arms[1], replace(runs[1], points=groups), usual))
     assert [doubt.cause for doubt in found] == (["point_frame"] if is_known else [])
 
 
@@ -341,13 +341,13 @@ def test_a_clocks_offset_is_known_no_better_than_the_errors_that_look_like_it():
 
 
 def test_clocks_that_are_far_apart(arms, runs):
-    (doubt,) = check_robot_held_points(arms[2], stamped(runs[2], 0.2, -0.05), usual)
+    (doubt,) = robot_held_point_issues(arms[2], stamped(runs[2], 0.2, -0.05), usual)
     assert "taken +0.202 s from the joints, by a clock that runs -52.4 parts per thousand fast" in doubt.what
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
-    (doubt,) = check_robot_held_points(arms[2], replace(runs[2], points=tuple(groups)), usual)
+    (doubt,) = robot_held_point_issues(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert (doubt.cause, doubt.evidence_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
     assert ("taken +0.4 s" in doubt.what, doubt.advice) == (True, "subtract 0.4 s from their times")
-    (doubt,) = check_robot_held_points(arms[1], stamped(runs[1], drift=0.05), usual)
+    (doubt,) = robot_held_point_issues(arms[1], stamped(runs[1], drift=0.05), usual)
     assert (doubt.cause, doubt.evidence_ratio) == ("clock_drift", pytest.approx(1.392, rel=2e-3))
     assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
     late, drift, middle = map(float, re.search(r"by t (\S+) (\S+) \(t - (\S+)\)", doubt.advice).groups())
@@ -377,7 +377,7 @@ CLOCKS = {
 def test_a_clock_that_is_a_little_off(arms, runs, case):
     count, late, drift, cause = CLOCKS[case]
     gaps = with_points(stamped(runs[count], late, drift), "points_arm", lambda p: np.where(KEPT[: len(p)], p, np.nan))
-    found = list(check_robot_held_points(arms[count], gaps, usual))
+    found = list(robot_held_point_issues(arms[count], gaps, usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
@@ -396,7 +396,7 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
 def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
     (group,) = stamped(runs[1], 0.03).points[:1]
     seen = replace(group, name="points_camera", sensor="camera")
-    (doubt,) = check_robot_held_points(arms[1], replace(runs[1], points=(seen,)), usual)
+    (doubt,) = robot_held_point_issues(arms[1], replace(runs[1], points=(seen,)), usual)
     assert re.search(r"kind: camera_latency, location: camera, values: {delay: 0.03\d*}", doubt.setting)
 
 
@@ -406,11 +406,11 @@ def test_what_is_a_little_off_or_at_rest_is_no_wrong_clock(arms, runs):
     place = arms[1].frame_positions_and_jacobians(("left_gripper",), joints.position[:1])[0]
     rng = np.random.default_rng(0)
     at_rest = with_points(still, "points_arm", lambda p: place + 1e-3 * rng.standard_normal(p.shape))
-    assert list(check_robot_held_points(arms[1], stamped(at_rest, 0.5), usual)) == []
+    assert list(robot_held_point_issues(arms[1], stamped(at_rest, 0.5), usual)) == []
     short = runs[1].time_slice(-1.0, float(joints.t[200]))
     for run, off in ((runs[1], 1), (short, 0), (short, 4)):
         moved = with_joints(run, position=lambda j, off=off: j.position + 0.005 * (np.arange(7) == off))
-        assert list(check_robot_held_points(arms[1], moved, usual)) == []
+        assert list(robot_held_point_issues(arms[1], moved, usual)) == []
 
 
 @pytest.mark.parametrize(
@@ -419,7 +419,7 @@ def test_what_is_a_little_off_or_at_rest_is_no_wrong_clock(arms, runs):
 )
 def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
     recording = with_points(runs[1], "points_camera", lambda p: factor * p)
-    found = check_point_distances(arms[1], arms[1].system, arms[1].theta, recording, usual)
+    found = point_distance_issues(arms[1], arms[1].system, arms[1].theta, recording, usual)
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert doubt.evidence_ratio == pytest.approx(ratio, rel=1e-3)
@@ -455,14 +455,14 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
     samples = measured(sensor, at, 0.0 * at, change(place).reshape(20, 9))
     episode = SimpleNamespace(name="run", measurements=(samples,))
     result = SimpleNamespace(predicted_outputs=(place.reshape(20, 9),))
-    found = list(check_object_points_against_rollout(episode, result, 2.0))
+    found = list(object_point_rollout_issues(episode, result, 2.0))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         apart = np.sqrt(np.mean(np.sum((change(place) - place) ** 2, axis=2)))
         assert (doubt.recording, doubt.group, doubt.weight) == ("run", "points_camera", "not_trusted")
         assert doubt.evidence_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
         assert words in doubt.what
-    assert list(check_object_points_against_rollout(episode, result, 0.0)) == []
+    assert list(object_point_rollout_issues(episode, result, 0.0)) == []
 
 
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}
@@ -498,7 +498,7 @@ def hanging(seed: int = 0) -> Recording:
     ],
 )
 def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words, ratio):
-    found = list(check_cable_point_geometry(CABLE, with_points(hanging(), "points", change), GRAVITY))
+    found = list(cable_point_geometry_issues(CABLE, with_points(hanging(), "points", change), GRAVITY))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert words in doubt.what
@@ -508,10 +508,10 @@ def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words, ratio):
 def test_a_cable_of_which_a_point_is_missing_is_judged_by_the_others():
     (group,) = with_points(hanging(), "points", lambda p: 10 * p).points
     fewer = Recording(None, (replace(group, names=group.names[:-1], position=group.position[:, :-1]),), name="c")
-    (doubt,) = check_cable_point_geometry(CABLE, fewer, GRAVITY)
+    (doubt,) = cable_point_geometry_issues(CABLE, fewer, GRAVITY)
     assert (doubt.cause, "9.98 times as long" in doubt.what) == ("point_scale", True)
     two = Recording(None, (replace(group, names=group.names[:3], position=group.position[:, :3]),), name="c")
-    assert list(check_cable_point_geometry(CABLE, two, GRAVITY)) == []
+    assert list(cable_point_geometry_issues(CABLE, two, GRAVITY)) == []
 
 
 def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
@@ -535,7 +535,7 @@ def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
     seen = np.linalg.norm(np.hypot(moving, 6 * 0.04 * v) / 0.05)
     for seed in range(3):
         recording = swung(drives, size=0.03, seed=seed, **{**SLOW, "rate": rate})
-        found = list(check_inertial_effort_excitation(drives, recording, USUAL))
+        found = list(inertial_effort_excitation_issues(drives, recording, USUAL))
         assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
         for doubt in found:
             assert doubt.evidence_ratio == pytest.approx(5.0 / seen, rel=0.02)
@@ -544,11 +544,11 @@ def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
 
 def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(drives):
     slow = swung(drives, size=0.03, **SLOW)
-    (unstated,) = check_inertial_effort_excitation(drives, with_joints(slow, effort_std=lambda _: None), USUAL)
+    (unstated,) = inertial_effort_excitation_issues(drives, with_joints(slow, effort_std=lambda _: None), USUAL)
     assert "noise between samples is 0.049 N m" in unstated.what
-    assert list(check_inertial_effort_excitation(drives, slow, replace(USUAL, std=1e-4))) == []
-    assert len(list(check_inertial_effort_excitation(drives, slow, replace(USUAL, std=10.0)))) == 1
-    assert list(check_inertial_effort_excitation(drives, slow, replace(USUAL, use=False))) == []
+    assert list(inertial_effort_excitation_issues(drives, slow, replace(USUAL, std=1e-4))) == []
+    assert len(list(inertial_effort_excitation_issues(drives, slow, replace(USUAL, std=10.0)))) == 1
+    assert list(inertial_effort_excitation_issues(drives, slow, replace(USUAL, use=False))) == []
 
 
 def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):
@@ -556,16 +556,16 @@ def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):
     recording = swung(drives, size=0.75)
     still = replace(recording.joints, position=recording.joints.position * [1.0, 0.01])
     held = replace(recording, joints=still, name="held")
-    (doubt,) = check_joint_excitation([held], asked, USUAL)
+    (doubt,) = joint_excitation_issues([held], asked, USUAL)
     assert (doubt.cause, doubt.channel, doubt.recording) == ("weak_excitation", "position.elbow", "held")
     assert doubt.setting == "parameters.elbow.stiffness.free: false; parameters.elbow.damping.free: false"
     assert doubt.evidence_ratio == pytest.approx(QUALITY_LIMITS.min_joint_motion / 0.006, rel=1e-3)
     assert "elbow turns by 0.006 rad at most, in held" in doubt.what
-    assert list(check_joint_excitation([held, recording], asked, USUAL)) == []
-    assert list(check_joint_excitation([recording, held], asked, USUAL)) == []
-    assert list(check_joint_excitation([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
+    assert list(joint_excitation_issues([held, recording], asked, USUAL)) == []
+    assert list(joint_excitation_issues([recording, held], asked, USUAL)) == []
+    assert list(joint_excitation_issues([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
     coarse = replace(USUAL, std=0.2)
-    (doubt,) = check_joint_excitation([held, recording], asked, coarse)
+    (doubt,) = joint_excitation_issues([held, recording], asked, coarse)
     assert (doubt.recording, doubt.evidence_ratio) == ("run", pytest.approx(6 * 0.2 / 0.6, rel=1e-3))
 
 

@@ -74,10 +74,10 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
     run = load_config(None, ["parameters.T1.bend.initial=5"])
     assert run.parameters["T1.bend"].free
     assert len(run.parameters) == 6
-    assert run.describe_location("parameters", "T1.bend", "initial").startswith("--set parameters.T1.bend.initial")
-    assert "line" in run.describe_location("parameters", "T2.bend", "free")
+    assert run.setting_location("parameters", "T1.bend", "initial").startswith("--set parameters.T1.bend.initial")
+    assert "line" in run.setting_location("parameters", "T2.bend", "free")
     made = load_config(None, ["parameters.T9.bend.free=true"])
-    assert made.describe_location("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
+    assert made.setting_location("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
 
 
 METHOD = "compare.methods.multiple_shooting"

@@ -92,12 +92,12 @@ def point(residual, *signatures: _EffectSignature) -> AllCandidatesLinearization
 
 
 def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> CandidateScore:
-    values = dict.fromkeys(of.amplitude_names, 0.1) if step is None else dict(step)
+    values = dict.fromkeys(of.amplitude_parameter_names, 0.1) if step is None else dict(step)
     return CandidateScore(of, values, decrease, statistic, p)
 
 
 def visible(of: EffectBase, seen=True, detectable=0.1) -> DetectableAmplitudes:
-    return DetectableAmplitudes(of, dict.fromkeys(of.amplitude_names, detectable), seen)
+    return DetectableAmplitudes(of, dict.fromkeys(of.amplitude_parameter_names, detectable), seen)
 
 
 def alike(labels: Sequence[str], matrix) -> ConfusabilityMatrix:
@@ -108,7 +108,7 @@ def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
     """Candidates that are seen and like no other, unless said."""
     labels = [entry.effect.label for entry in scores]
     seen = [visible(entry.effect) for entry in scores] if seen is None else seen
-    joint = SimpleNamespace(ranked_pairs=lambda among: iter(pairs))
+    joint = SimpleNamespace(ranked_candidate_pairs=lambda among: iter(pairs))
     return ScreeningResult(tuple(seen), tuple(scores), table or alike(labels, np.eye(len(labels))), joint)
 
 
@@ -135,7 +135,9 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
     values = neutral | dict(values or {})
     std = dict.fromkeys(values, 0.01) | dict(std or {})
     held = std | dict(held or {})
-    sizes = {e.label: [(values[n] - neutral[n]) / (held[n] or 1e-9) for n in e.amplitude_names] for e in effects}
+    sizes = {
+        e.label: [(values[n] - neutral[n]) / (held[n] or 1e-9) for n in e.amplitude_parameter_names] for e in effects
+    }
     p_values = {label: float(scipy.special.chdtrc(len(z), np.square(z).sum())) for label, z in sizes.items()}
     noisy = getattr(problem, "has_process_noise", False)
     rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, noisy, problem, evaluation([1.0]))

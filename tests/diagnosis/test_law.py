@@ -8,7 +8,13 @@ from small_problems import H, assert_slopes_are_those_of_differences, joints, pe
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.effects.law import LawTable, law_tables_csv, make_law, quantity_values_along, read_law_tables
+from yid_ocp.effects.law import (
+    TorqueLawTable,
+    make_torque_law,
+    read_torque_law_tables,
+    torque_law_quantity_values_along_rollout,
+    torque_law_tables_csv,
+)
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
@@ -85,13 +91,14 @@ def test_no_law_is_told_of_recordings_without_a_gap(system, urdf_folder):
 def tables(count=7, quantities=("angle",)):
     rng = np.random.default_rng(3)
     return [
-        LawTable(name, np.linspace(-0.5, 0.7, count), rng.normal(size=count), np.ones(count)) for name in quantities
+        TorqueLawTable(name, np.linspace(-0.5, 0.7, count), rng.normal(size=count), np.ones(count))
+        for name in quantities
     ]
 
 
 def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond(system):
     [table] = tables()
-    law = make_law("elbow", system, [table])
+    law = make_torque_law("elbow", system, [table])
     plain, with_law = compile_step(system, H), compile_step(system.with_effects([law]), H)
     t = H * np.arange(201)
     path = np.column_stack([0.2 * np.sin(t), 1.5 * np.sin(3 * t)])
@@ -109,7 +116,7 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
 def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
     servos = PositionServoOptions(motor=MotorOptions("dc"))
     plain = pendulum_step(urdf_folder, driven=JOINTS, servos=servos)
-    law = make_law("elbow", plain.system, tables(quantities=("command",)))
+    law = make_torque_law("elbow", plain.system, tables(quantities=("command",)))
     with_law = compile_step(plain.system.with_effects([law]), H, use_compiler=False)
     commands = np.tile([0.4, -0.3], (40, 1))
     commands[:20] = MOTOR_OFF_COMMAND
@@ -119,7 +126,7 @@ def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
     assert np.abs(runs[1].state[40] - runs[0].state[40]).max() > 1e-4
     nodes = {"state": runs[1].state, "torque": commands, "multipliers": np.zeros((40, 0)), "time_step": np.array(H)}
     theta = with_law.system.parameters.vector()
-    seen = quantity_values_along(with_law.system, "elbow", "command", theta, nodes)
+    seen = torque_law_quantity_values_along_rollout(with_law.system, "elbow", "command", theta, nodes)
     assert np.isnan(seen[:20]).all()
     motor = torque_function(plain, {})
     middle, rate = (runs[1].state[21:, :2] + runs[1].state[20:-1, :2]) / 2, np.diff(runs[1].state[20:, :2], axis=0) / H
@@ -130,7 +137,7 @@ def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
 
 @pytest.mark.parametrize("quantities", [("angle",), ("speed",), ("angle", "speed"), ("time",)])
 def test_derivatives_by_the_values_at_the_knots(system, urdf_folder, quantities):
-    law = make_law("elbow", system, tables(5, quantities))
+    law = make_torque_law("elbow", system, tables(5, quantities))
     step = compile_step(system.with_effects([law]), H, use_compiler=False)
     run = moved(urdf_folder, UNNAMED["angle"], 5, seconds=0.4)
     problem = EstimationProblem(step, [run], law.parameters.names, ProblemOptions(path_cutoff=float("inf")))
@@ -139,8 +146,8 @@ def test_derivatives_by_the_values_at_the_knots(system, urdf_folder, quantities)
 
 def test_a_table_is_read_as_it_was_written(tmp_path):
     file, written = tmp_path / "law.csv", tables(6, ("angle", "speed"))
-    file.write_text(law_tables_csv(written))
-    for own, other in zip(written, read_law_tables(file, "angle+speed"), strict=True):
+    file.write_text(torque_law_tables_csv(written))
+    for own, other in zip(written, read_torque_law_tables(file, "angle+speed"), strict=True):
         assert own.quantity == other.quantity
         np.testing.assert_allclose(own.knots, other.knots, rtol=1e-9)
         np.testing.assert_allclose(own.torque, other.torque, rtol=1e-9)
@@ -163,19 +170,19 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, said):
     file = tmp_path / "law.csv"
     file.write_text(text)
     with pytest.raises(DataError, match=said):
-        read_law_tables(file, "angle")
+        read_torque_law_tables(file, "angle")
 
 
 def test_a_law_has_a_place_and_a_quantity_there(system):
     with pytest.raises(ConfigError, match="no place 'nowhere'"):
-        make_law("nowhere", system, tables())
+        make_torque_law("nowhere", system, tables())
     with pytest.raises(ConfigError, match="cannot depend on 'command'"):
-        make_law("elbow", system, tables(quantities=("command",)))
+        make_torque_law("elbow", system, tables(quantities=("command",)))
 
 
 def test_a_configuration_has_a_law_by_its_table(tmp_path):
     file = tmp_path / "law.csv"
-    file.write_text(law_tables_csv(tables()))
+    file.write_text(torque_law_tables_csv(tables()))
     said = f"model.effects=[{{kind: law, location: T1, depends_on: angle, table: {file}}}]"
     made = build_system(load_config(None, [said]))
     assert [effect.label for effect in made.effects] == ["law@T1"]

@@ -203,10 +203,10 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
 
 
 def test_what_is_detectable_survives_as_plain_data(drawn):
-    told = json.loads(json.dumps(drawn().candidate_sensitivities_to_json()))
+    told = json.loads(json.dumps(drawn().candidate_sensitivities_to_plain_data()))
     other = drawn(seed=5)
-    other.set_candidate_sensitivities_from_json(told)
-    assert other.candidate_sensitivities_to_json() == told
+    other.set_candidate_sensitivities_from_plain_data(told)
+    assert other.candidate_sensitivities_to_plain_data() == told
     assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
     assert other._inside(np.random.default_rng(1), 3.0) == drawn()._inside(np.random.default_rng(1), 3.0)
 
@@ -310,7 +310,7 @@ def detectable(of, columns, **shapes):
 )
 def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(drawn, of, column, wanted, largest):
     ensemble = drawn()
-    columns = [[column]] if len(of.amplitude_names) == 1 else [[0.6 * column, 0.8 * column]]
+    columns = [[column]] if len(of.amplitude_parameter_names) == 1 else [[0.6 * column, 0.8 * column]]
     for seed in range(5):
         found, multiple = ensemble._sized(detectable(of, columns), np.random.default_rng(seed), wanted)
         values = np.array(list(found.values.values()))

@@ -12,12 +12,12 @@ from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, labels_json_and_sha256, open_sealed_labels
 from yid_ocp.diagnosis.blind_scores import (
     detection_and_false_alarm_rates,
-    evidence_to_json,
+    diagnosis_evidence_to_dict,
     judge_recorded_case,
     score_blind_case,
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.refit import SearchRecord
+from yid_ocp.diagnosis.refit import EffectSearchRecord
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import LocatedGap
 from yid_ocp.errors import DataError
@@ -292,14 +292,14 @@ def diagnosed(decrease=80.0, there=0.5):
     refits[f"{FRICTION.label} on the held-out recordings"] = model([FRICTION], 1.0, 50.0, there)
     beside = screening([score(WEAK, p=0.5), score(STRANGE, p=0.6)])
     known = {"screening": screening(ranked), "nominal_model": fit((), loss(3.0, 3.2), 100.0, {"k": 2.0})}
-    record = SearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
+    record = EffectSearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
     named = {"single_effect_models": (refits[FRICTION.label],), "selected_effects": (added(FRICTION),)}
     return finding(**named, record=record, located_gap=LocatedGap((place("elbow"),), decrease), **known)
 
 
 def again(finding, **limits):
     """Verdict and effects of what was kept of a diagnosis, by other thresholds."""
-    data = json.loads(json.dumps(evidence_to_json(finding), allow_nan=False))
+    data = json.loads(json.dumps(diagnosis_evidence_to_dict(finding), allow_nan=False))
     found = judge_recorded_case(data, limits)
     return found["verdict"], [f"{e['kind']}@{e['location']}" for e in found["effects"]]
 
@@ -328,7 +328,7 @@ def test_what_was_kept_of_a_case_is_judged_by_other_thresholds(made, limits, ver
 
 def test_a_case_keeps_its_own_thresholds_as_far_as_there_still_are_such():
     asked = Thresholds(min_explained_fraction=0.6)
-    made = evidence_to_json(replace(diagnosed(decrease=120.0), thresholds=asked))
+    made = diagnosis_evidence_to_dict(replace(diagnosed(decrease=120.0), thresholds=asked))
     assert judge_recorded_case(made, {})["verdict"] == "effect"
     made["thresholds"] = {"min_explained_fraction": 0.8, "one_that_is_gone": 3.0}
     assert judge_recorded_case(made, {})["verdict"] == "unknown"
@@ -358,7 +358,7 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
         second, screening=replace(second.screening, candidate_scores=second.screening.candidate_scores[:2])
     )
     for i, made in enumerate((first, second)):
-        value = {"seconds": 9.0, "result": made.to_dict(), "evidence": evidence_to_json(made)}
+        value = {"seconds": 9.0, "result": made.to_dict(), "evidence": diagnosis_evidence_to_dict(made)}
         (tmp_path / f"answers/{i}.json").write_text(json.dumps({"name": f"case_{i}", "value": value}))
     said = rescore_blind(tmp_path, tmp_path / "same").result
     assert (said["not_judged"], said["rescored"]["changed"], said["detection"]["3"]["right"]) == (0, [], 1.0)

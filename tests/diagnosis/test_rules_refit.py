@@ -44,7 +44,7 @@ class Problem:
     def problem(self):
         return self
 
-    def without_other_places(self, effects):
+    def restricted_to_effect_location(self, effects):
         return self
 
     def with_nominal_and_effects_free(self, effects):

@@ -72,9 +72,9 @@ def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
         nominal_model=fit(lost=loss(2.0, channels=errors)),
         noise_floor=tuple(AssumedChannelNoiseLevel(*own[:3], 100, own[3]) for own in levels),
     )
-    channel, size = made.model_error_by_unit["m"]
+    channel, size = made.worst_held_out_channel_by_unit["m"]
     assert (channel, size) == ("points.end", pytest.approx(math.sqrt(0.02**2 - 3 * 0.001**2)))
-    assert set(made.model_error_by_unit) == {"m"}  # noise alone gives the torque's
+    assert set(made.worst_held_out_channel_by_unit) == {"m"}  # noise alone gives the torque's
 
 
 def test_the_result_holds_what_was_found():

@@ -21,7 +21,7 @@ from yid_ocp.diagnosis.screening import (
     _shape_grid,
 )
 from yid_ocp.inference import null_test
-from yid_ocp.inference.null_test import path_noise_spread, residual_channel_indices
+from yid_ocp.inference.null_test import path_noise_spread, residual_channels
 from yid_ocp.problem import EstimationProblem
 
 CHI2 = scipy.stats.chi2
@@ -67,7 +67,7 @@ def test_scores_scatter_with_the_encoders_noise_that_moves_an_arm(urdf_folder, h
     recording = taken(step, 3, camera=False, steps=80)
     problem = EstimationProblem(step, [recording], ("elbow.damping",))
     found = path_noise_spread(problem, x := problem.initial_unknowns)
-    channels = residual_channel_indices(problem)
+    channels = residual_channels(problem)
     rows = np.concatenate([c.residual_indices for c in channels if c.group == "points_arm"])
     assert not np.delete(found, rows, axis=0).any()
     if "driven" in how:
@@ -285,24 +285,24 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = list(_make_joint_score_model(at).ranked_pairs([a.label, b.label, c.label]))
+    pairs = list(_make_joint_score_model(at).ranked_candidate_pairs([a.label, b.label, c.label]))
     assert ["".join(of.kind for of in pair) for pair, *_ in pairs] == ["ab", "ac", "bc"]
     assert pairs[0][1:] == (pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0}), pytest.approx(-1.0))
-    [(fewer, *_)] = _make_joint_score_model(at).ranked_pairs(["c@x", "b@x"])
+    [(fewer, *_)] = _make_joint_score_model(at).ranked_candidate_pairs(["c@x", "b@x"])
     assert fewer == (b, c)
 
 
 def test_pairs_promise_what_the_linear_model_of_both_does():
     rng = np.random.default_rng(3)
     effects = (PAIR, TWO_SIDED, SHAPED)
-    columns = [rng.standard_normal((9, len(of.amplitude_names))) for of in effects]
+    columns = [rng.standard_normal((9, len(of.amplitude_parameter_names))) for of in effects]
     residual = rng.standard_normal(9)
     made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
-    for pair, values, decrease in _make_joint_score_model(point(residual, *made)).ranked_pairs(
+    for pair, values, decrease in _make_joint_score_model(point(residual, *made)).ranked_candidate_pairs(
         [of.label for of in effects]
     ):
         x = np.hstack([columns[effects.index(of)] for of in pair])
-        names = [name for of in pair for name in of.amplitude_names]
+        names = [name for of in pair for name in of.amplitude_parameter_names]
         lower, upper = (np.concatenate([screening._room(of)[k] for of in pair]) for k in (0, 1))
         step = np.clip(-np.linalg.lstsq(x, residual)[0], lower, upper)
         assert [values[name] for name in names] == pytest.approx(step)

@@ -22,7 +22,7 @@ from yid_ocp.diagnosis.select import (
     _refit_shortlist,
     held_out_gap_closure,
     held_out_improvement,
-    penalized_chi2_difference,
+    penalized_chi2_excess_over,
     select_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -278,7 +278,7 @@ class Rounds:
         self.progress, self.skipped, self.is_late = self.heard, [], False
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
 
-    def note_skip_past_deadline(self, *what):
+    def record_skip_if_past_deadline(self, *what):
         self.skipped += what if self.is_late else ()
         return self.is_late
 
@@ -294,7 +294,7 @@ class Rounds:
             left = tuple(replace(s, p_value=self.left) for s in left)
         return screening(left)
 
-    def ranked_pairs(self, screened, without=""):
+    def ranked_candidate_pairs(self, screened, without=""):
         kinds = {of.kind: of for of in EFFECTS if of.label != without}
         pairs = [(one, other) for one, other in self.pairs if {one, other} <= set(kinds)]
         return [((kinds[one], kinds[other]), {}, 7.0) for one, other in pairs]
@@ -509,7 +509,7 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     spring, offset = (replace(own, residual_count=100) for own in (spring, offset))
     assert held_out_improvement(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
-    assert penalized_chi2_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
+    assert penalized_chi2_excess_over(offset, spring) == pytest.approx(4.0 - math.log(100.0))
     assert near(spring, offset) == ["offset@elbow", "spring@elbow"]
     assert near(spring, replace(offset, cost=101.5)) == ["spring@elbow", "offset@elbow"]
     # up to odds of 150 to 1
@@ -616,7 +616,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     found = screening([score(of) for of in kinds.values()], table=alike([of.label for of in kinds.values()], table))
 
     def to_refit(count):
-        joint = SimpleNamespace(ranked_pairs=lambda among: asked.append(among) or iter(promised))
+        joint = SimpleNamespace(ranked_candidate_pairs=lambda among: asked.append(among) or iter(promised))
         search = RefitContext(None, Thresholds(n_refit_pairs=count), Heard())
         return _pairs_to_refit(search, replace(found, joint_score_model=joint), kinds["a"])
 

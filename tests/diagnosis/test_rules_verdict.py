@@ -29,7 +29,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     Judgement,
     LocatedGap,
-    NominalEvidence,
+    NominalModelGapEvidence,
     _check_effect_amplitude_transfer,
     _compare,
     _effects_with_transfer_checks,
@@ -52,7 +52,7 @@ def scored(*p_values):
 
 
 def seen(tests, scores=(), offsets=False):
-    return NominalEvidence(fit(), *tests, screening(scores), offsets)
+    return NominalModelGapEvidence(fit(), *tests, screening(scores), offsets)
 
 
 @cases(

@@ -57,7 +57,7 @@ NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 
 def with_effect(of, value, std=0.02, **changed):
     """A finding in which this effect was added."""
-    names = of.amplitude_names
+    names = of.amplitude_parameter_names
     fitted = fit([of], loss(1.0, 1.1), values=dict.fromkeys(names, value), std=dict.fromkeys(names, std))
     return finding(**({"selected_effects": (added(of, fitted=fitted),), "single_effect_models": (fitted,)} | changed))
 

@@ -16,14 +16,14 @@ from yid_ocp.diagnosis.diagnose import _held_out_null_test, fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, recording_models_with_unknown_forces
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_unknown_forces
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
-    problem_whitened_at,
-    problem_whitened_by_sensor_noise,
     problem_with_relinearized_held_out_whitening,
+    problem_with_sensor_noise_only,
+    problem_with_whitening_at,
     problem_without_input_errors,
 )
 from yid_ocp.integrator.step import Step, compile_step, simulate
@@ -92,7 +92,9 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     assert all(x is y is not None for x, y in held)
     assert made.problem.whitening_filters == made.problem.held_out_whitening_filters == (None,)
     x = own.vector({"elbow.stiffness": 2.5})
-    assert own.evaluate(x, False).cost == pytest.approx(problem_whitened_at(own, x).evaluate(x, False).cost, rel=0.02)
+    assert own.evaluate(x, False).cost == pytest.approx(
+        problem_with_whitening_at(own, x).evaluate(x, False).cost, rel=0.02
+    )
 
 
 @cases("held_out", {"held_out": True, "in_blocks": False})
@@ -110,13 +112,13 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
         assert after.filter_steps is before.filter_steps
         biases = before.input_error_model.torque_bias - 0.3, after.input_error_model.torque_bias
         np.testing.assert_allclose(*biases, atol=1e-12)
-    there, then = (problem_whitened_by_sensor_noise(own).evaluate(at) for own, at in ((moved, x), (wide, frozen)))
+    there, then = (problem_with_sensor_noise_only(own).evaluate(at) for own, at in ((moved, x), (wide, frozen)))
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
     pairs = ((moved, x), (wide, frozen))
     own, nominal = (p.whitened_held_out_prediction_residual(0, *p.predict_held_out(at)[0]).residual for p, at in pairs)
     assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
     # and to first order the rows are those of a filter that is worked out there
-    again = problem_whitened_at(moved, x)
+    again = problem_with_whitening_at(moved, x)
     np.testing.assert_allclose(again.evaluate(x).residual, moved.evaluate(x).residual, atol=0.1)
 
 
@@ -129,11 +131,11 @@ def test_candidates_of_other_places_are_left_out_of_a_refit(step):
     )
     friction = next(e for e in made.candidate_effects if e.label == "joint_viscous@shoulder")
     elsewhere = next(e for e in made.candidate_effects if e.location != "shoulder")
-    one_place = all_places.without_other_places([friction])
+    one_place = all_places.restricted_to_effect_location([friction])
     assert one_place.problem.step.sizes["nx"] < all_places.problem.step.sizes["nx"]
-    assert all_places.without_other_places(()) is all_places
-    assert all_places.without_other_places([friction, elsewhere]) is all_places
-    assert made.without_other_places([friction]).problem.whitening_filters == (None,)
+    assert all_places.restricted_to_effect_location(()) is all_places
+    assert all_places.restricted_to_effect_location([friction, elsewhere]) is all_places
+    assert made.restricted_to_effect_location([friction]).problem.whitening_filters == (None,)
     found = []
     for hypotheses in (all_places, one_place):
         own = hypotheses.with_effects_and_relinearized_filters([friction], at)
@@ -233,7 +235,7 @@ def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> Esti
         initial_state="equilibrium", arm_tracking_feedback=feedback, arm_tracking_feedback_gains=(9.0,)
     )
     problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
-    return problem_whitened_at(problem, problem.initial_unknowns, rounds=3)
+    return problem_with_whitening_at(problem, problem.initial_unknowns, rounds=3)
 
 
 @pytest.mark.parametrize("effect", ["rotor_inertia@shoulder", "effort_gain@shoulder", "effort_lag@shoulder"])
@@ -243,7 +245,9 @@ def test_noise_of_torques_is_not_mistaken_for_what_they_multiply(step, monkeypat
     absent, z = with_absent(step, effect), []
     for seed in range(20, 26):
         problem = weighted_at_truth(absent, recorded(step, seed), "proportional")
-        residual, jacobian = linearization_without_weak_priors(problem, problem.evaluate(problem.initial_unknowns))
+        residual, jacobian = residual_and_jacobian_without_weak_priors(
+            problem, problem.evaluate(problem.initial_unknowns)
+        )
         covariance = np.linalg.inv(jacobian.T @ jacobian)
         z.append(-covariance @ jacobian.T @ residual / np.sqrt(np.diag(covariance)))
     assert np.all(np.abs(np.mean(z, axis=0)) < 3 / np.sqrt(len(z)))
@@ -256,7 +260,7 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     gained = with_absent(step, "effort_gain@shoulder")
     problem = EstimationProblem(gained, [recorded(step, 7)], ("effort_gain@shoulder.inverse",))
     at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
-    episode = problem_whitened_at(problem, at, rounds=3).episodes[0]
+    episode = problem_with_whitening_at(problem, at, rounds=3).episodes[0]
     errors = episode.input_errors
     [theta, later] = [problem.theta_and_initial_state_deviation(x, 0)[0] for x in (at, near)]
     assert np.max(np.abs(errors.torque_noise)) > WHITE
@@ -278,7 +282,7 @@ def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feed
     least = along @ along + sum(float(np.sum(part**2)) for part in apart)
     assert least == pytest.approx(innovations @ innovations, rel=5e-3)
     # and nobody mistakes it for a prediction
-    by_sensors = problem_whitened_by_sensor_noise(problem).evaluate(problem.initial_unknowns)
+    by_sensors = problem_with_sensor_noise_only(problem).evaluate(problem.initial_unknowns)
     recorded_torque = by_sensors.residual[problem.residual_rows.data]
     assert recorded_torque @ recorded_torque > 2 * along @ along
 
@@ -292,7 +296,7 @@ def test_a_refit_is_as_sure_as_a_solution(step, friction):
     fit = fit_nominal_model(problem, AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)]), found)
     std = found.parameters["elbow.stiffness"].std
     assert fit.std["elbow.stiffness"] == pytest.approx(std, rel=0.1)
-    _, jacobian = linearization_without_weak_priors(fit.problem, fit.evaluation)
+    _, jacobian = residual_and_jacobian_without_weak_priors(fit.problem, fit.evaluation)
     noise = np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[0, 0])
     assert (std > 1.5 * noise) == (friction > 0)
 
@@ -330,9 +334,9 @@ def test_an_effect_is_found_beside_the_noise_of_torques(step, within):
 
 def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     problem = problem_of(step, [recorded(step, 1)])
-    weighted = problem_whitened_by_sensor_noise(problem)
+    weighted = problem_with_sensor_noise_only(problem)
     x = problem.initial_unknowns
-    model = recording_models_with_unknown_forces(weighted, x, weighted.evaluate(x))[0]
+    model = residual_models_with_unknown_forces(weighted, x, weighted.evaluate(x))[0]
     decay = math.exp(-_MIN_INTERVAL / _CORRELATION_TIME)
     column = model.unknown_names.index("shoulder")
     # the integral over a long time has the variance of white noise that is held over each sample
@@ -341,16 +345,16 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
     assert np.count_nonzero(model.torque_noise_variance) == 1
     calm = problem_without_input_errors(problem)
-    assert not recording_models_with_unknown_forces(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()
+    assert not residual_models_with_unknown_forces(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()
 
 
 def test_the_smoother_starts_at_rest_and_counts_priors_once(step):
     """Rest under constant unknowns stays rest; a prior of a parameter is an observation beside all recordings."""
     files = [recorded(step, seed) for seed in (1, 2)]
-    plain = problem_whitened_by_sensor_noise(problem_of(step, files))
+    plain = problem_with_sensor_noise_only(problem_of(step, files))
     x = 1.1 * plain.initial_unknowns
     given = plain.with_options(replace(plain.options, prior_stds={"elbow.stiffness": 0.5}))
-    bare, models = (recording_models_with_unknown_forces(own, x, own.evaluate(x)) for own in (plain, given))
+    bare, models = (residual_models_with_unknown_forces(own, x, own.evaluate(x)) for own in (plain, given))
     assert [model.recording for model in models] == ["run_1", "run_2"]
     for i, (model, other) in enumerate(zip(models, bare, strict=True)):
         for j, (here, there) in enumerate(zip(model.intervals, other.intervals, strict=True)):

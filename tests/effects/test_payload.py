@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
-from yid_ocp.effects.base import arm_link_end_frame_names, effort_limit_over_baxter, one_frame_name_per_arm_link
+from yid_ocp.effects.base import arm_link_end_frame_names, effort_limit_ratio_to_baxter, one_frame_name_per_arm_link
 from yid_ocp.effects.bodies import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
@@ -194,7 +194,7 @@ def test_ranges_of_strong_joints_follow_their_limits() -> None:
     pairs = zip(system.mechanism.joints, (300.0, 20.0, 1e9), strict=True)
     joints = tuple(replace(joint, effort_limit=limit) for joint, limit in pairs)
     strong = replace(system, mechanism=replace(system.mechanism, joints=joints))
-    assert [effort_limit_over_baxter(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
+    assert [effort_limit_ratio_to_baxter(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
     for kind in ("joint_coulomb", "joint_presliding"):
         tau_c = make_effect(kind, "j0", strong).definitions[0]
         assert tau_c.upper == pytest.approx(0.2 * 300.0)

@@ -8,10 +8,10 @@ from held_rod import held_rod
 from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recording, seen, taken
 
 from yid_ocp.inference import kalman
-from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces
+from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
-    problem_whitened_at,
+    problem_with_whitening_at,
     torque_bias_change_in_stds,
     torque_biases_and_stds_by_recording,
 )
@@ -100,7 +100,7 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
     if together:
         problem = problem.with_episodes([correlated(episode) for episode in problem.episodes], ())
     x = problem.initial_unknowns * 1.1
-    plain, weighted = problem.evaluate(x), problem_whitened_at(problem, x).evaluate(x)
+    plain, weighted = problem.evaluate(x), problem_with_whitening_at(problem, x).evaluate(x)
     rows = problem.residual_rows.data
     covariance = dense_covariance(problem, x, how.get("angle", ANGLE))
     solved = np.linalg.solve(covariance, np.column_stack([plain.residual[rows], plain.jacobian[rows]]))
@@ -142,7 +142,7 @@ def test_compiled_filters_do_what_plain_ones_do(urdf_folder, monkeypatch, how):
     found = []
     for library in (kalman._library(), None):
         monkeypatch.setattr(kalman, "_library", lambda library=library: library)
-        weighted = problem_whitened_at(problem, x, rounds=2)
+        weighted = problem_with_whitening_at(problem, x, rounds=2)
         own = weighted.evaluate(x)
         found.append((own.residual[rows], own.jacobian[rows], *torque_biases_and_stds_by_recording(weighted, x)[0]))
     for compiled, plain in zip(*found, strict=True):
@@ -156,7 +156,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     for g in (9.0, gain):
         feedback = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
-        weighted = problem_whitened_at(problem, problem.initial_unknowns)
+        weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
         rows = problem.residual_rows.data
         found = weighted.evaluate(problem.initial_unknowns)
         r, jacobian = found.residual[rows], found.jacobian[rows]
@@ -191,7 +191,7 @@ def small_gap(problem, size=1.0):
 def test_without_errors_of_inputs_nothing_changes(urdf_folder):
     problem = problem_of(urdf_folder, encoders=False, size=0.0)
     assert not problem.has_process_noise
-    assert problem_whitened_at(problem, problem.initial_unknowns) is problem
+    assert problem_with_whitening_at(problem, problem.initial_unknowns) is problem
     paper = problem_of(urdf_folder, encoders=False, weighting="paper")
     assert not paper.has_process_noise
     assert {s.sensor.group_name for s in paper.episodes[0].measurements} == {"points_arm", "points_camera"}
@@ -201,11 +201,11 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
     episode = problem.episodes[0]
     problem = problem.with_episodes([replace(episode, torque=episode.torque + 0.35)], [])
-    weighted = problem_whitened_at(problem, problem.initial_unknowns)
+    weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
     ((value, std),) = torque_biases_and_stds_by_recording(weighted, problem.initial_unknowns)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
-    again = problem_whitened_at(weighted, problem.initial_unknowns)
+    again = problem_with_whitening_at(weighted, problem.initial_unknowns)
     np.testing.assert_allclose(again.episodes[0].input_errors.torque_bias, value)
     moved = torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
     assert moved == pytest.approx(value[0] / BIAS)
@@ -220,7 +220,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
     x, error = problem.initial_unknowns, 1e-3
-    weighted = problem_whitened_at(problem, x)
+    weighted = problem_with_whitening_at(problem, x)
     [episode], [whitening] = weighted.episodes, weighted.whitening_filters
     group = episode.recording.joints
     wrong = replace(episode.recording, joints=replace(group, effort=group.effort + error))
@@ -237,7 +237,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
 
 def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
-    weighted = problem_whitened_at(problem, problem.initial_unknowns)
+    weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
     x = problem.initial_unknowns * 1.05
     found = weighted.evaluate(x)
     for i in range(len(x)):
@@ -261,7 +261,7 @@ def test_what_may_act_on_a_held_rod(urdf_folder):
     problem = EstimationProblem(step, [recording(arm, felt)], ("T1.bend",), ProblemOptions(initial_state="equilibrium"))
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x)
-    [model] = recording_models_with_unknown_forces(problem, x, evaluation)
+    [model] = residual_models_with_unknown_forces(problem, x, evaluation)
     told = zip(model.unknown_names, model.unknown_groups, model.reference_std, strict=True)
     found = {name: (group.location, group.kind, std) for name, group, std in told}
     bent = evaluation.episode_predictions[0].rollout.state[:, 2 : system.n_coordinates]

@@ -257,7 +257,7 @@ def test_a_kernel_in_the_cache_is_found_without_generating_code(parts, urdf_fold
     again = compile_step(parts.closed_loop(urdf_folder)[0], 2e-3)
     assert again.is_compiled
     texts = {
-        codegen.kernel_source_text(step.model.functions, step.model.index_tables)
+        codegen.kernel_cache_key_text(step.model.functions, step.model.index_tables)
         for step in (first, again, parts.builders["relaxing_cable"](urdf_folder).step)
     }
     assert len(texts) == 2

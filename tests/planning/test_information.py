@@ -12,7 +12,7 @@ from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.planning.information_plan import plan_informative_motion
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
 from yid_ocp.planning.motion_search import DOptimalityCriterion, EffectDiscriminationCriterion, InformativeMotionSearch
-from yid_ocp.planning.planned_experiment import ParameterizedExperiment
+from yid_ocp.planning.planned_experiment import SplineMotionExperiment
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
 PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
@@ -40,12 +40,12 @@ def driven_problem(limited_urdf):
 
 @pytest.fixture(scope="module")
 def moved_experiment(moved_problem):
-    return ParameterizedExperiment.from_options(moved_problem, {}, OPTIONS)
+    return SplineMotionExperiment.from_options(moved_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def driven_experiment(driven_problem):
-    return ParameterizedExperiment.from_options(driven_problem, {}, OPTIONS)
+    return SplineMotionExperiment.from_options(driven_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from yid_ocp.planning.joint_paths import SplinePath
+from yid_ocp.planning.joint_paths import RestToRestSplineBasis
 
 
 @pytest.fixture(params=[2, 3, 7, 12])
 def path(request):
-    return SplinePath(1.3, request.param)
+    return RestToRestSplineBasis(1.3, request.param)
 
 
 def test_a_path_starts_and_ends_at_rest_where_it_should(path):
@@ -37,7 +37,7 @@ def test_control_points_bound_the_path_and_its_derivatives_at_all_times(path):
 
 
 def test_a_straight_motion_is_the_smooth_one():
-    path, t = SplinePath(2.0, 8), np.linspace(0.0, 2.0, 50)
+    path, t = RestToRestSplineBasis(2.0, 8), np.linspace(0.0, 2.0, 50)
     s = t / 2.0
     smooth = s**3 * (10 - 15 * s + 6 * s**2)
     np.testing.assert_allclose(

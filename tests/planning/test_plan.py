@@ -9,7 +9,13 @@ from small_problems import pendulum_step
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate
-from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanLimits, PlanOptions, SplinePath
+from yid_ocp.planning.joint_paths import (
+    FramePositionEvaluator,
+    PathSimulator,
+    PlanLimits,
+    PlanOptions,
+    RestToRestSplineBasis,
+)
 from yid_ocp.planning.motion_plan import ParameterCovariance, plan_motion_to_target
 from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionSearch
 
@@ -24,7 +30,9 @@ def point_at(step, angle, name="tip"):
 
 def rested(step, theta, angle=START, path=None):
     """A simulator that begins at rest."""
-    return PathSimulator(step, theta, EquilibriumSolver(step).solve([angle], theta), path or SplinePath(0.4, 4), 0.1)
+    return PathSimulator(
+        step, theta, EquilibriumSolver(step).solve([angle], theta), path or RestToRestSplineBasis(0.4, 4), 0.1
+    )
 
 
 def places(mover, state, name="tip"):

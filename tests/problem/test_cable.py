@@ -52,7 +52,7 @@ def twin_options(real, cable):
     """The benchmark's options for recordings of the twin, whose edges are as long in all of them."""
 
     def make(recordings, options, path_cutoff=np.inf):
-        sharp = {"points": SensorOptions(std=1e-3, points=cable.free_vertex_names)}
+        sharp = {"points": SensorOptions(std=1e-3, points=cable.unclamped_vertex_names)}
         changes = {"sensors": sharp, "start_point_noise_std": 1e-6, "parameters_by_recording": {}}
         return replace(real.cable_options(cable, recordings, options), path_cutoff=path_cutoff, **changes)
 
@@ -122,7 +122,7 @@ def test_a_cable_names_segments_clamps_junctions_and_vertices(cable, twin):
     assert system.prescribed[:6] == tuple(f"clamp_start_{k}" for k in ("x", "y", "z", "rx", "ry", "rz"))
     assert set(cable.vertex_names) | {"junction_c", "clamp_start", "clamp_end"} <= set(system.mechanism.frames)
     assert system.n_constraints == 5
-    assert cable.free_vertex_names == ("p2", "p3", "p4", "c1", "c2")
+    assert cable.unclamped_vertex_names == ("p2", "p3", "p4", "c1", "c2")
     assert cable.clamped_vertex_names == ("p0", "p1", "p5", "p6")
 
 
@@ -148,13 +148,13 @@ def test_the_values_of_a_twin_are_found_from_its_vertices(real, twin_options, ca
     )
     free = ("parent.bend", "parent.damping", "c.bend")
     problem = EstimationProblem(step, [recording], free, settings)
-    before = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)["twin"]
+    before = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)["twin"]
     solution = solve(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
     problem = problem.with_free_parameters(free, dict(zip(free, solution.x, strict=True)))
     solution = solve(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
-    after = real.point_rmse_by_recording(problem, solution.x, cable.free_vertex_names)["twin"]
+    after = real.point_rmse_by_recording(problem, solution.x, cable.unclamped_vertex_names)["twin"]
     assert after < 5e-4
     assert before > 10 * after
 
@@ -174,7 +174,7 @@ def test_the_roll_of_a_clamp_is_found_from_two_frames(twin_options, twin):
 def test_held_out_starts_use_no_frame_after_the_second(twin_options, cable, twin):
     step, options, recording = twin
     seen = recording.points[0].position.copy()
-    free = [recording.points[0].names.index(v) for v in cable.free_vertex_names]
+    free = [recording.points[0].names.index(v) for v in cable.unclamped_vertex_names]
     seen[2:, free] += 1.0
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
     settings = twin_options([recording, other], options, path_cutoff=8.0)
@@ -255,5 +255,7 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, 
     )
     settings = replace(real.cable_options(cable, [recording], options), duration=1.0)
     problem = EstimationProblem(step, [recording], ("parent.bend", "a.bend"), settings)
-    error = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)[recording.name]
+    error = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)[
+        recording.name
+    ]
     assert error < 0.5 * real.baselines(recording, cable)["linear_carry"]

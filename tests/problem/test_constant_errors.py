@@ -8,7 +8,7 @@ import pytest
 from small_problems import H, pendulum_step, taken
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.inference.whitening import problem_whitened_at
+from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import System
@@ -17,7 +17,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
     _estimated_constant_errors,
     subtract_estimated_biases,
-    whitened_for_sensor_biases,
+    whiten_against_sensor_biases,
     whitened_measurement_sensitivities_to_biases,
 )
 from yid_ocp.problem.options import SensorOptions
@@ -57,7 +57,7 @@ def test_the_map_is_that_of_generalised_least_squares():
     rng = np.random.default_rng(3)
     slopes, columns = rng.standard_normal((40, 3)) * [0.1, 2.0, 30.0], rng.standard_normal((40, 5))
     covariance = np.eye(40) + slopes @ slopes.T
-    made = whitened_for_sensor_biases(slopes, columns)
+    made = whiten_against_sensor_biases(slopes, columns)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
     expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
     found = _estimated_constant_errors(slopes, columns[:, 0])
@@ -90,7 +90,7 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))
     assert stated.episodes[0].has_uncertain_sensor_biases
     assert not spelt.episodes[0].has_uncertain_sensor_biases
-    weighted, beside = (problem_whitened_at(problem, problem.initial_unknowns) for problem in (stated, spelt))
+    weighted, beside = (problem_with_whitening_at(problem, problem.initial_unknowns) for problem in (stated, spelt))
     assert weighted.whitening_filters[0] is not None
     expected, _ = least(beside, spelt.initial_unknowns)
     assert weighted.evaluate(stated.initial_unknowns).cost == pytest.approx(expected, rel=1e-6)

@@ -10,7 +10,7 @@ import scipy.optimize
 from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken, tip
 
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import mass_matrix_diagonal_at_zero, truncate_episode
@@ -47,7 +47,7 @@ LAYOUT = UnknownVectorLayout(("a", "b"), ("l",), ("q.x", "p.x"), ("one", "two"))
 def test_unknowns_are_shared_ones_then_those_of_every_recording():
     own = [f"{name}[{recording}]" for recording in ("one", "two") for name in ("l", "start.q.x", "start.p.x")]
     assert LAYOUT.unknown_names == ("a", "b", *own)
-    assert LAYOUT.free_parameters == ("a", "b", "l")
+    assert LAYOUT.free_parameter_names == ("a", "b", "l")
     assert LAYOUT.unknown_indices_affecting_recording(0).tolist() == [0, 1, 2, 3, 4]
     assert LAYOUT.unknown_indices_affecting_recording(1).tolist() == [0, 1, 5, 6, 7]
 
@@ -170,7 +170,7 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
     assert (rows.data, rows.stated_priors, rows.weak_priors) == (slice(0, 228), slice(228, 229), slice(229, 230))
     np.testing.assert_allclose(evaluation.residual[228:], [2.0, math.log(7.0 / 6.0) / math.log(5.0)])
     assert evaluation.cost == pytest.approx(0.5 * evaluation.residual @ evaluation.residual)
-    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
+    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     np.testing.assert_array_equal(residual, evaluation.residual[:229])
     np.testing.assert_array_equal(jacobian, evaluation.jacobian[:229])
     none = ResidualVectorLayout.from_episodes((), 2, 3)
@@ -186,7 +186,7 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
     assert problem.rms_noise_of_data_residuals == pytest.approx(noise)
-    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
+    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     data = problem.residual_rows.data
     np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
     np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)

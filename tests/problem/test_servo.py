@@ -205,9 +205,9 @@ def test_neutral_it_changes_nothing_and_shows_at_once(urdf_folder, step, kind) -
     [effect] = with_it.system.effects
     both = [made.evaluate(made.initial_unknowns).residual for made in (plain, with_it)]
     np.testing.assert_allclose(both[0], both[1], atol=1e-8)
-    freed = problem_of(with_it.step, commanded(), [*effect.amplitude_names])
+    freed = problem_of(with_it.step, commanded(), [*effect.amplitude_parameter_names])
     slope = freed.evaluate(freed.initial_unknowns).jacobian[: len(both[0]), 0]
-    low, high = effect.prior_ranges[effect.amplitude_names[0]]
+    low, high = effect.prior_ranges[effect.amplitude_parameter_names[0]]
     assert np.abs(slope).max() * (high - low) > 1.0
 
 
@@ -225,7 +225,7 @@ def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folde
     made, far = commanded(), {"shoulder.servo_torque_limit": 2e4}
     limited = servo_step(urdf_folder, [("servo_saturation", "shoulder", {"limit": 5.0})])
     [effect] = limited.system.effects
-    name = effect.amplitude_names[0]
+    name = effect.amplitude_parameter_names[0]
     power = TORQUE_SATURATION_EXPONENT
     told = effect.parameters_as_reported({name: 5.0**-power}, {name: 0.01 * power * 5.0**-power})["limit"]
     assert (told.value, told.std, told.unit) == (pytest.approx(5.0), pytest.approx(0.05), "N m")

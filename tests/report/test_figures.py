@@ -23,8 +23,8 @@ from yid_ocp.report import animation, figures
 from yid_ocp.report.animation import (
     ConfigurationTrajectory,
     animation_of_trajectories,
+    animations_to_dict,
     recording_animation,
-    scenes_to_dict,
 )
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
@@ -97,7 +97,7 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     arm, recorded = measured.sticks[0].end_indices[1], np.where(np.isin(np.arange(n), at), q[:1] + 0.01, q[:1])
     moved = animated(single_arm, recorded).positions
     np.testing.assert_allclose(measured.positions[0, arm], moved[0, arm], atol=1e-9)
-    [page] = scenes_to_dict([made])["scenes"]
+    [page] = animations_to_dict([made])["scenes"]
     assert page["motions"][1]["places"][0][3 * k] is None
     first = np.array(page["motions"][0]["places"][0]).reshape(-1, 3) / page["scale"]
     np.testing.assert_allclose(first, predicted.positions[0], atol=0.51 / page["scale"])
@@ -119,7 +119,7 @@ def worn(single_arm):
     t = np.linspace(0.0, 2.0, 401)
     q = 0.4 * np.sin(t)[:, None] * np.ones(single_arm.n_coordinates)
     told = ConfigurationTrajectory("predicted", single_arm, single_arm.parameters.vector(), t, q)
-    return scenes_to_dict([animation_of_trajectories(name, [told]) for name in "abcd"], "package:baxter")
+    return animations_to_dict([animation_of_trajectories(name, [told]) for name in "abcd"], "package:baxter")
 
 
 def test_a_robot_wears_its_meshes_thinned(single_arm, worn):
@@ -158,7 +158,7 @@ def test_a_robot_without_meshes_is_sticks(single_arm, urdf_folder):
         "p", single_arm, single_arm.parameters.vector(), np.arange(2), np.zeros((2, single_arm.n_coordinates))
     )
     for robot in (None, str(urdf_folder / "double_pendulum.urdf"), "nowhere.urdf"):
-        page = scenes_to_dict([animation_of_trajectories("a", [told])], robot)
+        page = animations_to_dict([animation_of_trajectories("a", [told])], robot)
         assert page["meshes"] == {}
         assert page["scenes"][0]["motions"][0]["sticks"]
 
@@ -176,7 +176,7 @@ def test_meshes_are_read_again_where_a_file_changed(single_arm, tmp_path, monkey
     def width(edge: float | None = None) -> float:
         if edge is not None:
             trimesh.creation.box([edge, 0.1, 0.1]).export(tmp_path / "box.stl")
-        [(flat, _)] = scenes_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"].values()
+        [(flat, _)] = animations_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"].values()
         return np.ptp(np.reshape(flat, (-1, 3)), axis=0).max() / 1e4
 
     assert [width(0.2), width(), width(0.3), width()] == pytest.approx([0.2, 0.2, 0.3, 0.3])
@@ -186,7 +186,7 @@ def test_meshes_are_read_again_where_a_file_changed(single_arm, tmp_path, monkey
         file.write_text(file.read_text()[:9])
     assert (width(0.3), len(reads)) == (pytest.approx(0.3), 3)
     robot.write_text("<robot><visual")
-    assert scenes_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"] == {}
+    assert animations_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"] == {}
 
 
 def test_what_acts_is_where_it_acts(single_arm):

@@ -15,7 +15,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data import JointGroup, Recording, SensorChannelGroup, read_recording, write_recording
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
-from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces
+from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
@@ -212,7 +212,7 @@ def test_unknown_forces_of_the_smoother_move_these_readings_as_an_effect_does(
     seen = replace(recorded, channel_groups=tuple(g for g in recorded.channel_groups if g.name == name))
     curved = holding(urdf, effects={"rest_curvature@T1": {}}, prescribed=ARM)
     made = problem(curved, seen, "rest_curvature@T1.qx")
-    [model] = recording_models_with_unknown_forces(
+    [model] = residual_models_with_unknown_forces(
         made, made.initial_unknowns, made.evaluate(made.initial_unknowns), interval=0.2
     )
     bent = [link[0] for link in curved.segment_layout("T1").link_joints]

@@ -188,7 +188,7 @@ def test_a_solver_that_needs_no_rollout_is_not_given_shorter_horizons(needs):
 
 @pytest.fixture(autouse=True)
 def weighted_as_made_up_problems_say(monkeypatch):
-    for name in ("problem_whitened_at", "problem_whitened_by_sensor_noise"):
+    for name in ("problem_with_whitening_at", "problem_with_sensor_noise_only"):
         monkeypatch.setattr(base, name, lambda problem, *at, name=name, **how: getattr(problem, name)(*at, **how))
 
 
@@ -199,7 +199,7 @@ class Disturbed(MadeUp):
         super().__init__(*arguments, **more)
         self.has_process_noise, self.frozen = True, [] if asked is None else asked
 
-    def problem_whitened_at(self, x, warm=None):
+    def problem_with_whitening_at(self, x, warm=None):
         self.frozen.append((np.asarray(x).tolist(), warm))
         made = Disturbed(self._rows, self.initial_unknowns, asked=self.frozen)
         made.frozen_at = np.asarray(x).tolist()
@@ -318,7 +318,7 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
             "evaluate": lambda x, derivatives, warm: found,
         }
         plain = SimpleNamespace(episodes=("a", "b"), predictor=SimpleNamespace(predict_episode=run), **how)
-        return SimpleNamespace(has_process_noise=True, problem_whitened_by_sensor_noise=lambda: plain)
+        return SimpleNamespace(has_process_noise=True, problem_with_sensor_noise_only=lambda: plain)
 
     fitted = solve(MadeUp(misfit(lambda x: 1.0)), Steps())
     assert replace(fitted, evaluation=smoothed, problem=known(True)).episode_predictions == ("plain a", "plain b")
@@ -356,7 +356,7 @@ def ringing_problem(start):
 
 def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypatch):
     problem = ringing_problem(1.3)
-    monkeypatch.setattr(base, "problem_whitened_at", lambda problem, x, warm=None, rounds=1: problem)
+    monkeypatch.setattr(base, "problem_with_whitening_at", lambda problem, x, warm=None, rounds=1: problem)
     # no other reason to start again
     monkeypatch.setattr(base, "_good_fit", lambda *_: True)
     monkeypatch.setattr(base, "_doubtful", lambda *_: np.zeros(1, bool))

@@ -11,8 +11,8 @@ from small_problems import PENDULUM, STEPS, pendulum_step, taken
 import yid_ocp
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import (
-    problem_whitened_at,
-    problem_whitened_by_sensor_noise,
+    problem_with_sensor_noise_only,
+    problem_with_whitening_at,
     problem_without_input_errors,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -133,7 +133,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
             by = problem.initial_state_of_episode(
                 episode, problem.theta_and_initial_state_deviation(x, i)[0]
             ).state_sensitivity[rows]
-            at = problem.unknowns.unknown_indices_affecting_recording(i)[len(problem.unknowns.free_parameters) :]
+            at = problem.unknowns.unknown_indices_affecting_recording(i)[len(problem.unknowns.free_parameter_names) :]
             expected[:count] -= by[:, :count].T @ expected[at]
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
 
@@ -250,8 +250,8 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
         episode, measurements=tuple(samples), torque=episode.torque + wrong + 1.5 * errors.torque_bias_std
     )
     problem = first.with_episodes([episode], ())
-    expected = problem_whitened_at(problem, x).evaluate(x).cost
-    assert problem_whitened_by_sensor_noise(problem).evaluate(x).cost > 3 * expected
+    expected = problem_with_whitening_at(problem, x).evaluate(x).cost
+    assert problem_with_sensor_noise_only(problem).evaluate(x).cost > 3 * expected
     program = transcribe(problem)
     arguments = program.solver_arguments
     theta = program.named_block("theta").index.ravel()

@@ -17,7 +17,7 @@ from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.vision.fit import ShapeFitter
-from yid_ocp.vision.point_cloud import ReachableObjectRegion, is_statistical_inlier, voxel_averages
+from yid_ocp.vision.point_cloud import ReachableObjectRegion, statistical_inlier_mask, voxel_averages
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
 
 FOLDER = Path(__file__).parent / "data"
@@ -40,8 +40,8 @@ def main() -> None:
     for i, q in enumerate(true):
         points = made.sequence.load_world_cloud(i)
         cloud = voxel_averages(points[region.membership_test_at(q, pose[:3, 3])(points)], VOXEL)
-        cloud = cloud.select(is_statistical_inlier(cloud, 12, 4.0))
-        cloud = cloud.select(~robot.is_within_surface_distance(cloud.points, q, 0.03))
+        cloud = cloud.select(statistical_inlier_mask(cloud, 12, 4.0))
+        cloud = cloud.select(~robot.within_surface_distance_mask(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
     vision.write_frame_folder(vision.FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")
     names = system.driven

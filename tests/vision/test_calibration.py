@@ -140,7 +140,7 @@ def test_slopes_of_the_rows_are_derivatives(robot):
     [cloud] = clouds(robot, [1.7], rng)
     state, arm = CameraState(POSE, clock_reference_stamp=1.2), arm_of(robot)
     points = state.measured_to_world_points(cloud)
-    glimpse = CalibrationFrame(1.7, cloud[arm.is_near_moving_surface_off_grasps(points, 1.7, 0.02)][::7])
+    glimpse = CalibrationFrame(1.7, cloud[arm.near_moving_surface_off_grasps_mask(points, 1.7, 0.02)][::7])
     rows = arm.linearized_surface_distances(state, glimpse, 0.1, along=True)
     moved = {TRANSLATION_SLICE.start: 1e-4, TRANSLATION_SLICE.start + 2: 1e-4, 0: 1e-4, DEPTH_SCALE_INDEX: 1e-4}
     for k, step in {**moved, CLOCK_OFFSET_INDEX: 1e-3, CLOCK_DRIFT_INDEX: 1e-3}.items():

@@ -6,7 +6,7 @@ from smooth_rods import COARSE, EYE, TARGET, SmoothY, box, filmed, floor_and_wal
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.vision import CloudFilterOptions, ExtraMesh, FrameSequence, look_at_pose
-from yid_ocp.vision.point_cloud import has_wanted_colour
+from yid_ocp.vision.point_cloud import wanted_colour_mask
 from yid_ocp.vision.sequence_calibration import BackgroundPoints, group_foreign_clusters
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
 from yid_ocp.vision.surface_meshes import extra_meshes_by_joint
@@ -57,9 +57,9 @@ def test_an_empty_scene_is_a_background():
     wall = np.column_stack([rng.uniform(0, 1, (20000, 2)), 0.003 * rng.standard_normal(20000)])
     background = BackgroundPoints.from_point_clouds([wall[::2], wall[1::2]], 0.008, 0.006)
     asked = np.array([[0.5, 0.5, 0.01], [0.5, 0.5, 0.06], [2.0, 0.5, 0.0]])
-    assert background.is_near_background(asked).tolist() == [True, False, False]
-    assert background.is_near_background(asked, 0.05).tolist() == [True, True, False]
-    assert not BackgroundPoints().is_near_background(asked).any()
+    assert background.near_background_mask(asked).tolist() == [True, False, False]
+    assert background.near_background_mask(asked, 0.05).tolist() == [True, True, False]
+    assert not BackgroundPoints().near_background_mask(asked).any()
 
 
 def test_what_stands_still_is_a_background_but_for_the_object():
@@ -70,9 +70,9 @@ def test_what_stands_still_is_a_background_but_for_the_object():
     clouds = [np.concatenate([heap, rod, other]) for other in elsewhere]
     shape = TubeLinks(np.array([[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]]), np.array([0.02]), (0,), np.array([0.3]))
     background = BackgroundPoints.from_point_clouds(clouds, 0.016, 0.006, [shape] * 4, 0.045)
-    assert background.is_near_background(heap).mean() > 0.95
-    assert not background.is_near_background(rod).any()
-    assert not background.is_near_background(elsewhere[0]).any()
+    assert background.near_background_mask(heap).mean() > 0.95
+    assert not background.near_background_mask(rod).any()
+    assert not background.near_background_mask(elsewhere[0]).any()
 
 
 def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
@@ -122,7 +122,7 @@ def test_extra_meshes_hang_on_links(system):
 def test_colours_in_light_and_shade_and_clouds_without_any(alone):
     red = [200, 40, 30]
     seen = np.array([[200, 40, 30], [100, 18, 13], [40, 200, 30], [120, 120, 120], [0, 0, 0]])
-    assert has_wanted_colour(seen, [red], 0.2).tolist() == [True, True, False, False, False]
-    assert has_wanted_colour(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
+    assert wanted_colour_mask(seen, [red], 0.2).tolist() == [True, True, False, False, False]
+    assert wanted_colour_mask(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
     with pytest.raises(DataError, match="no colours"):
         measured(alone, *filmed(SmoothY(), 1), filters=CloudFilterOptions(object_colours=((200.0, 40.0, 30.0),)))

@@ -7,7 +7,7 @@ from yid_ocp.vision.point_cloud import (
     ReachableObjectRegion,
     WeightedCloud,
     extract_skeleton,
-    is_statistical_inlier,
+    statistical_inlier_mask,
     voxel_averages,
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
@@ -34,10 +34,10 @@ def test_outliers_go_and_the_surface_stays(share):
     wrong = rng.uniform(-0.6, 0.6, (round(count * share / (1 - share)), 3))
     cloud = voxel_averages(np.concatenate([plane, wrong]), 0.008)
     far = np.abs(cloud.points[:, 2]) > 0.05
-    stays = is_statistical_inlier(cloud, 12, 4.0)
+    stays = statistical_inlier_mask(cloud, 12, 4.0)
     assert stays[~far].mean() > 0.85
     assert share == 0 or stays[far].mean() < 0.05
-    assert not is_statistical_inlier(cloud.select(np.arange(5)), 12, 4.0).any()
+    assert not statistical_inlier_mask(cloud.select(np.arange(5)), 12, 4.0).any()
 
 
 def test_the_robot_goes_with_its_padding(system, run):
@@ -48,10 +48,10 @@ def test_the_robot_goes_with_its_padding(system, run):
     for q in (run.q[0], run.q[-1]):
         pose = robot.part_poses_at_configuration(q)[robot.part_joints.index(wrist)]
         surface = meshes[wrist].transformed(pose).vertices[::20]
-        assert robot.is_within_surface_distance(surface, q, 0.01).all()
-        assert not robot.is_within_surface_distance(surface + np.array([0.0, 0.0, 3.0]), q, 0.01).any()
+        assert robot.within_surface_distance_mask(surface, q, 0.01).all()
+        assert not robot.within_surface_distance_mask(surface + np.array([0.0, 0.0, 3.0]), q, 0.01).any()
     tip = run.point_positions[0][system.point_frames.index("w_T1")][None]
-    assert not robot.is_within_surface_distance(tip, run.q[0], 0.03).any()
+    assert not robot.within_surface_distance_mask(tip, run.q[0], 0.03).any()
 
 
 def test_where_the_object_can_be(system, run):
@@ -113,7 +113,7 @@ def test_nodes_and_edges_are_a_tree_on_the_centre_lines_from_the_lowest_point():
     nodes, label = found.nodes, found.node_of_point
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
-    assert found.is_point_assigned_to_node.mean() > 0.9
+    assert found.points_assigned_to_node_mask.mean() > 0.9
     for i in range(len(nodes)):
         mine = cloud.points[label == i]
         assert len(mine) <= 50
@@ -135,8 +135,8 @@ def test_two_parts_and_a_stray_heap():
     points = np.concatenate([cloud.points[near], far])
     found = extract_skeleton(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0))
     assert set(found.component_of_node.tolist()) == {0, 1}
-    assert not found.is_point_assigned_to_node[-60:].any()
-    weights = np.bincount(found.component_of_node[found.node_of_point[found.is_point_assigned_to_node]])
+    assert not found.points_assigned_to_node_mask[-60:].any()
+    weights = np.bincount(found.component_of_node[found.node_of_point[found.points_assigned_to_node_mask]])
     assert weights[0] > weights[1]
 
 
@@ -147,7 +147,7 @@ def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it():
     assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
     found = extract_skeleton(WeightedCloud(np.zeros((500, 3)), np.ones(500)), np.random.default_rng(0))
     assert len(found.nodes) == 10
-    assert found.is_point_assigned_to_node.all()
+    assert found.points_assigned_to_node_mask.all()
     angle = np.arange(40)
     ring = WeightedCloud(0.069 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), np.ones(40))
     lonely = SkeletonOptions(neighbour_radius=0.01, min_segment_points=1)

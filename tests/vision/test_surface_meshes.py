@@ -126,10 +126,10 @@ def test_distances_follow_the_joints(ball):
         found = ball.nearest_moving_surface(points, q, 0.15)[0]
         assert np.allclose(found[expected < 0.145], expected[expected < 0.145], atol=6e-4)
         assert np.isinf(found[expected > 0.155]).all()
-        assert np.array_equal(ball.is_within_surface_distance(points, q, 0.15, moving_only=True), np.isfinite(found))
+        assert np.array_equal(ball.within_surface_distance_mask(points, q, 0.15, moving_only=True), np.isfinite(found))
     beside = np.array([[0.0, 5.0, 0.6]])
-    assert ball.is_within_surface_distance(beside, [0, 0], 0.2).all()
-    assert not ball.is_within_surface_distance(beside, [0, 0], 0.2, moving_only=True).any()
+    assert ball.within_surface_distance_mask(beside, [0, 0], 0.2).all()
+    assert not ball.within_surface_distance_mask(beside, [0, 0], 0.2, moving_only=True).any()
 
 
 def test_closest_points_give_the_way_out(ball):

@@ -178,7 +178,7 @@ def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(built):
 
 def test_link_lengths_as_parameters(built):
     assert "a.length" in built(SEGMENTED).parameters.names
-    names = built(SEGMENTED.replace("links: 2}", "links: 2, has_link_length_parameters: true}")).parameters.names
+    names = built(SEGMENTED.replace("links: 2}", "links: 2, has_length_parameter_per_link: true}")).parameters.names
     assert {"a.length_0", "a.length_1", "b.length"} <= set(names)
     assert "a.length" not in names
 

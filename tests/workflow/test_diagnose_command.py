@@ -19,7 +19,7 @@ from yid_ocp.diagnosis import StoredFit
 from yid_ocp.diagnosis.refit import REFIT_SOLVER
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.whitening import problem_whitened_at, torque_biases_and_stds_by_recording
+from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_by_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -225,7 +225,7 @@ def test_errors_of_torques_shrink_like_all_other_noise(problem_of, encoders):
     problem = problem_of("driven", STATED | {"joints.position": position})
     shrunk = _with_noise_only_stds(problem, SETTINGS)
     x = problem.initial_unknowns * 1.1
-    both = [problem_whitened_at(made, x, rounds=2) for made in (problem, shrunk)]
+    both = [problem_with_whitening_at(made, x, rounds=2) for made in (problem, shrunk)]
     before, after = (made.evaluate(x) for made in both)
     assert all(made.whitening_filters[0] is not None for made in both)
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)

@@ -17,7 +17,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
-from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
+from yid_ocp.inference.whitening import problem_with_whitening_at, problem_without_input_errors
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
@@ -123,7 +123,7 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
     problem = problem_of(step)
     assert prediction_outputs.estimated_torque_offsets(problem, problem.initial_unknowns) == {}
-    weighted = problem_whitened_at(problem, problem.initial_unknowns, rounds=2)
+    weighted = problem_with_whitening_at(problem, problem.initial_unknowns, rounds=2)
     found = prediction_outputs.estimated_torque_offsets(weighted, problem.initial_unknowns)
     assert list(found) == ["first", "second"]
     for entry in found.values():
@@ -131,9 +131,9 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["prior_std"] == OFFSET
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
-    alone = problem_whitened_at(problem_of(step, held_out=False), problem.initial_unknowns)
+    alone = problem_with_whitening_at(problem_of(step, held_out=False), problem.initial_unknowns)
     assert list(prediction_outputs.estimated_torque_offsets(alone, problem.initial_unknowns)) == ["first"]
-    unbiased = problem_whitened_at(problem_of(step, bias=0.0), problem.initial_unknowns)
+    unbiased = problem_with_whitening_at(problem_of(step, bias=0.0), problem.initial_unknowns)
     assert prediction_outputs.estimated_torque_offsets(unbiased, problem.initial_unknowns) == {}
 
 
@@ -274,7 +274,7 @@ def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
 def test_a_group_without_a_sample_has_no_expected_error():
     sensor = SimpleNamespace(channel_names=("points.p",), outputs_per_channel=3)
     empty = np.zeros((0, 3))
-    nothing = SimpleNamespace(sensor=sensor, value=empty, std=empty, error_directions=np.zeros((0, 3, 1)))
+    nothing = SimpleNamespace(sensor=sensor, value=empty, std=empty, output_changes_per_error_std=np.zeros((0, 3, 1)))
     outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
 
@@ -285,14 +285,14 @@ def test_a_spring_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder)
     theta = system.parameters.vector({"elbow.stiffness": 4.0})
     problem = SimpleNamespace(system=system, theta_and_initial_state_deviation=lambda x, i: (theta, None))
     found = {"elbow.stiffness": ParameterEstimate(4.0, 0.1, "N m/rad", 3.0, 0.0, np.inf, True, "identifiable")}
-    told = prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
+    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
     [line] = told["mjcf"]
     joint = line.replace("<joint ", '<joint axis="0 0 1" ')
     body = f'<body><geom size="1"/>{joint}</body>'
     model = mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>')
     assert (model.joint("elbow").stiffness[0], model.qpos_spring[0]) == (4.0, pytest.approx(0.2))
     lost = {"shoulder.mass": replace(found["elbow.stiffness"], verdict="identifiable")}
-    told = prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=lost), "runs/a")
+    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=lost), "runs/a")
     assert told["mjcf"] == []
 
 
@@ -308,7 +308,7 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
         "T1.bend": estimate(22.0, "identifiable"),
         "T1.twist": estimate(7.0, "not_identifiable"),
     }
-    told = prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
+    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
     assert told["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
     assert told["joints"] == [
         {"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0},
@@ -318,4 +318,4 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
     assert told["export"] == "yid-ocp export runs/a --out model.xml"
     lost = {"T1.twist": found["T1.twist"]}
-    assert prediction_outputs.numbers_to_use(problem, SimpleNamespace(x=None, parameters=lost), "runs/a") == {}
+    assert prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=lost), "runs/a") == {}

@@ -28,14 +28,14 @@ from yid_ocp.data.channel_checks import (
     median_sample_period,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup
-from yid_ocp.inference.null_test import residual_channel_indices
+from yid_ocp.inference.null_test import residual_channels
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
 
 # From times on the joints' clock (N,) to positions (N, np, 3) [m].
-PositionsAtTimes = Callable[[Array], Array]
+PositionsAtTimesFunction = Callable[[Array], Array]
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
 # Longest exposure of one sample: a slow camera knows the time of a frame better than its period [s].
@@ -107,14 +107,14 @@ def _by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
     return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
 
 
-def check_robot_held_point_clock(
+def robot_held_point_clock_issues(
     joints: JointGroup,
     group: PointGroup,
     t: Array,
     seen: Array,
     by_angle: Array,
     std: float,
-    path: PositionsAtTimes,
+    path: PositionsAtTimesFunction,
 ) -> Iterator[Issue]:
     """Yield an issue if the clock of points held by the robot has an offset or drift relative to the joints' clock.
 
@@ -174,7 +174,7 @@ def timestamp_correction_advice(late: float, drift: float, middle: float) -> str
 
 
 def search_clock_offset_and_drift(
-    path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
+    path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
     """Find the clock offset [s] and relative drift for which measured points are nearest to a known path.
 
@@ -222,7 +222,7 @@ def drift_and_overstated_noise_issues(problem: EstimationProblem, x: Array, eval
 def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
     assert evaluation.jacobian is not None
     times = np.zeros(len(evaluation.residual))
-    for series in residual_channel_indices(problem):
+    for series in residual_channels(problem):
         times[series.residual_indices] = series.t
     size = np.ones(len(problem.initial_unknowns))
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
@@ -256,7 +256,7 @@ def _by_lateness(
     shared, _ = problem.theta_and_initial_state_deviation(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     state = result.rollout.state
-    none = np.zeros((*state.shape, len(problem.unknowns.free_parameters)))
+    none = np.zeros((*state.shape, len(problem.unknowns.free_parameter_names)))
     steps = np.ones(samples.value.shape[1])
     ahead, behind = (
         problem.predictor.readings_along_trajectory(samples.shifted_earlier_by_steps(s * steps), state, none, theta)[0]
@@ -269,7 +269,7 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     """Groups whose residuals, both per sample and summed over time blocks, are far below the stated noise."""
     by_group: dict[str, list[tuple[float, float, int]]] = {}
     units = {}
-    for series in residual_channel_indices(problem):
+    for series in residual_channels(problem):
         r = evaluation.residual[series.residual_indices]
         if len(r) >= MIN_DIFFERENCES_FOR_NOISE_STD:
             sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])

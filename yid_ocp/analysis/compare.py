@@ -122,7 +122,7 @@ def compare_methods(
         able: Solver = next((solver for solver in solvers if uses_process_noise_covariance(solver)), GaussNewton())
         judged = estimation.solve(whole, able, callback=listener(_SOLVE_LABEL))
     else:
-        judged = estimation.checked_solution(problem, best.solution)
+        judged = estimation.with_intervals_and_checks(problem, best.solution)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
     explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.has_process_noise))
     return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)
@@ -251,7 +251,7 @@ def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[f
     return found
 
 
-def explain_paper_estimates(
+def explain_paper_differences(
     experiment: str, estimates: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> tuple[str, ...]:
     """Explain why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours, one sentence each.

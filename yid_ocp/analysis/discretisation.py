@@ -15,7 +15,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, ParameterEstimate, verdict_by_relative_std
-from yid_ocp.inference.whitening import problem_whitened_at
+from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step, copy_of_step_with_time_step, simulate
@@ -24,10 +24,10 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
-from yid_ocp.problem.evaluation import INITIAL_STATE_PREFIX, Evaluation, ProcessNoiseWhitener
+from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.options import DiscretisationName
 
-_START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
+_START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
 # Ratio of the distance to the limit of many links or short steps to the shift of one halving, for an error proportional
 # to their size: m + m/2 + m/4 + ...
@@ -56,7 +56,7 @@ class _FinerDiscretisationProblem:
         made, at = self.problem.initial_unknowns, {name: i for i, name in enumerate(self.problem.unknown_names)}
         for name, value in zip(names, x, strict=True):
             base, bracket, recording = name.partition("[")
-            joint = base.rpartition(".")[2] if base.startswith(INITIAL_STATE_PREFIX) else ""
+            joint = base.rpartition(".")[2] if base.startswith(INITIAL_STATE_UNKNOWN_PREFIX) else ""
             parts = self.subdivided_joints.get(joint)
             if parts is None and name in at:
                 made[at[name]] = value * self._factor(name)
@@ -155,7 +155,7 @@ def longest_accurate_time_step(problem: EstimationProblem) -> float:
 def _half_step_error(problem: EstimationProblem, fine: EstimationProblem, x: Array) -> float | None:
     """Change of whitened predictions by a finer step as a fraction of their residual; None if not comparable."""
     try:
-        coarse = problem_whitened_at(problem, x)
+        coarse = problem_with_whitening_at(problem, x)
         if any(own is not None for own in coarse.whitening_filters):
             fine = _with_coarse_weights(fine, coarse)
         before, after = coarse.evaluate(x, False), fine.evaluate(x, False)
@@ -251,7 +251,7 @@ def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> _F
     return _FinerDiscretisationProblem(made, factors, joints)
 
 
-def inflate_estimates_by_discretisation(
+def inflate_stds_by_discretisation(
     estimates: Mapping[str, ParameterEstimate],
     found: Mapping[str, EstimateShiftByLinksAndTimeStep],
     sizes: Mapping[str, float],

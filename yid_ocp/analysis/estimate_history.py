@@ -102,7 +102,7 @@ def nearby_positive_definite_covariance(covariance: Array) -> Array:
     return np.asarray((clipped + clipped.T) / 2 * np.outer(scale, scale))
 
 
-def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
+def pool_estimates_and_chi2(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
     """Combine the estimates of several runs into one weighted mean.
 
     Returns the mean, chi2 of the differences between runs, and the degrees of freedom of chi2. Parameters that only
@@ -139,7 +139,7 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
     consistent without it than without any other run. With two runs no outlier is reported. A parameter is tested with
     its marginal variances, a run with its whole covariance. The significance `level` is divided by the number of
     parameters or of runs."""
-    mean, chi2, degrees = pool_estimates(runs)
+    mean, chi2, degrees = pool_estimates_and_chi2(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
     names, p = tuple(run.run_name for run in runs), chi2_p_value(chi2, degrees)
@@ -148,7 +148,7 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
 
 def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDrift:
     own = [run._only((name,)) for run in runs if name in run.parameter_names]
-    mean, chi2, degrees = pool_estimates(own)
+    mean, chi2, degrees = pool_estimates_and_chi2(own)
     p, places = chi2_p_value(chi2, degrees), tuple(run.run_name for run in own)
     values, std = tuple(float(run.values[0]) for run in own), tuple(float(run.std[0]) for run in own)
     pooled = float(mean.values[0]), float(mean.std[0])
@@ -159,7 +159,7 @@ def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierT
     """One run against the mean of all other runs; an outlier if these agree without it."""
     chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
     p = chi2_p_value(chi2, degrees)
-    without = [pool_estimates([*runs[:k], *runs[k + 1 :]])[1:] for k in range(len(runs))]
+    without = [pool_estimates_and_chi2([*runs[:k], *runs[k + 1 :]])[1:] for k in range(len(runs))]
     rest, free = without[i]
     agree = chi2_p_value(rest, free) >= level or rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i)
     alone = len(runs) > 2 and p < level and agree
@@ -167,7 +167,7 @@ def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierT
 
 
 def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, int, str]:
-    mean, _, _ = pool_estimates(others)
+    mean, _, _ = pool_estimates_and_chi2(others)
     shared = [name for name in run.parameter_names if name in mean.parameter_names]
     if not shared:
         return 0.0, 0, ""

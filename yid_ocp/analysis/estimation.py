@@ -64,12 +64,14 @@ def solve(
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.solve(problem, solver, initial_unknowns, callback, limits)
     safe = choose_cable_memory_fit(problem, solver, found, limits)
-    solution = checked_solution(safe.problem, safe.solution, progress)
+    solution = with_intervals_and_checks(safe.problem, safe.solution, progress)
     checks = replace(solution.checks or EstimateChecks(), cable_memory_message=safe.message)
     return replace(solution, checks=checks)
 
 
-def checked_solution(problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS) -> Solution:
+def with_intervals_and_checks(
+    problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
+) -> Solution:
     """Complete a fit with profile intervals, the error of the discretisation and `checks`. See `solve`."""
     start, problem = problem, solution.problem or problem
     if solution.evaluation is not None:
@@ -124,7 +126,7 @@ def _with_discretisation_errors(
         problem, solution.x, solution.evaluation, kinds, progress
     )
     sizes = typical_parameter_magnitudes(problem, solution.x)
-    inflated = discretisation.inflate_estimates_by_discretisation(solution.parameters, shifts, sizes)
+    inflated = discretisation.inflate_stds_by_discretisation(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}
     uncounted = tuple(words for kind, words in _UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
@@ -420,9 +422,9 @@ def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableTopolo
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
         parents, children = cable.parent_branch_vertex_names, cable.vertex_names_by_child_branch
-        carried = predictions.interpolated_displacement_position_baseline
+        carried = predictions.interpolated_displacement_baseline_prediction
         arrays = {
-            "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),
+            "stays": predictions.constant_position_baseline_prediction(recording, points, _START_FRAMES),
             "moves_with_clamps": predictions.mean_clamp_displacement_baseline_prediction(
                 recording, points, held, _START_FRAMES
             ),

@@ -14,12 +14,12 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns_by_name, with_nuisance_unknowns
-from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_sensor_information
+from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_sensor_fisher_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError, YidError, failed_rollout_error
-from yid_ocp.inference.whitening import problem_whitened_at
+from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
@@ -74,12 +74,12 @@ class RecordedExperiment:
         theta, _ = self.problem.theta_and_initial_state_deviation(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
-    def camera_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group, frame times [s] and typical std [m] of the camera; None and defaults without a camera."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_point_group_and_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group, sample times [s] and typical std [m] of points measured by arms; None and defaults if none."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
@@ -179,7 +179,7 @@ class CandidateExperimentSensitivities:
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
     with respect to the nx unknowns and to the episode's q torque-error unknowns (see
-    `point_sensitivities_and_joint_sensor_information`)."""
+    `point_sensitivities_and_joint_sensor_fisher_information`)."""
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
     x: Array
@@ -281,7 +281,7 @@ class CandidateExperimentSensitivityBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = point_sensitivities_and_joint_sensor_information(
+            points, by_joints[i] = point_sensitivities_and_joint_sensor_fisher_information(
                 problem, evaluation, x, i, finest, encoders
             )
             slopes |= {(i, *key): value for key, value in points.items()}
@@ -307,7 +307,7 @@ class CandidateExperimentSensitivityBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Smallest standard deviation of the points of each group in a recording [m]."""
         finest = {}
-        samplings = self.setting.camera_point_group_and_sampling, self.setting.arm_point_group_and_sampling
+        samplings = self.setting.camera_point_group_times_and_std, self.setting.arm_point_group_times_and_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
@@ -358,7 +358,7 @@ class CandidateExperimentSensitivityBuilder:
     @cached_property
     def _corrected(self) -> EstimationProblem:
         """The problem with the torque errors that its measurements determine."""
-        return problem_whitened_at(self.setting.problem, self.setting.x, rounds=2)
+        return problem_with_whitening_at(self.setting.problem, self.setting.x, rounds=2)
 
     def _cut(self, episode: Episode) -> Recording:
         """The part of a recording that the problem uses, with known torque errors subtracted."""
@@ -427,8 +427,8 @@ class CandidateExperimentSensitivityBuilder:
         wanted: dict[str, dict[str, None]] = {}
         for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
-        camera = setting.camera_point_group_and_sampling(episode)[0]
-        arm = setting.arm_point_group_and_sampling(episode)[0]
+        camera = setting.camera_point_group_times_and_std(episode)[0]
+        arm = setting.arm_point_group_times_and_std(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})

@@ -108,7 +108,7 @@ class _FrictionTorqueCloud:
     predicted: Array  # friction of the fitted law, shape (M,) [N m]
 
 
-def friction_torque_clouds(
+def measured_and_predicted_friction_torques(
     problem: EstimationProblem, solution: Solution, friction_parameters: Sequence[str]
 ) -> tuple[_FrictionTorqueCloud, ...]:
     """Measured and predicted friction torques of the driven joints that have some of `friction_parameters`.

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.profile import (
     ParameterProfileLikelihood,
+    call_for_each_parameter_at_optimum,
     compute_profile_likelihood_interval,
     mark_unidentifiable_near_zero_estimate,
-    results_by_parameter_at_optimum,
 )
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
@@ -26,7 +26,7 @@ from yid_ocp.errors import (
     failed_rollout_error,
     unknown_name_error_arguments,
 )
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
@@ -46,7 +46,7 @@ from yid_ocp.inference.uncertainty import (
     value_and_uncertainty_text,
     with_profile_interval,
 )
-from yid_ocp.inference.whitening import problem_whitened_at
+from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -169,7 +169,7 @@ def identifiability(
     x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
     # the matrices are small: threads of the linear algebra library cost more than they gain
     with threadpoolctl.threadpool_limits(1):
-        as_solved, wide = wide is problem, problem_whitened_at(wide, x, rounds=2)
+        as_solved, wide = wide is problem, problem_with_whitening_at(wide, x, rounds=2)
         evaluation = wide.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message)
@@ -179,7 +179,7 @@ def identifiability(
             # far from a fit, chi2 is no measure of the noise
             covariance, inflation = covariance / inflation**2, 1.0
         else:
-            own = wide if as_solved else problem_whitened_at(problem, given, rounds=2)
+            own = wide if as_solved else problem_with_whitening_at(problem, given, rounds=2)
             fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
             covariance = misfit_robust_covariance(wide, evaluation, fit)
         view = _Sensitivities.of(wide, x, evaluation, names, inflation)
@@ -210,7 +210,7 @@ def _profiles(
         return found, with_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    pairs = results_by_parameter_at_optimum(one, problem, view.x, wanted, progress)
+    pairs = call_for_each_parameter_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
 
@@ -293,7 +293,7 @@ class _Sensitivities:
     def of(
         problem: EstimationProblem, x: Array, evaluation: Evaluation, names: tuple[str, ...], inflation: float
     ) -> _Sensitivities:
-        jacobian = linearization_without_weak_priors(problem, evaluation)[1].copy()
+        jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)[1].copy()
         chosen = np.array([problem.unknown_names.index(name) for name in names], int)
         others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
         # prior knowledge of the parameters is not information of a sensor

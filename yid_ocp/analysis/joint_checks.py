@@ -159,7 +159,7 @@ def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMot
     return _SmoothedMotion(at, course(at), course(at, 1), course(at, 2), effort)
 
 
-def check_joint_limits(arm: RecordedJointsModel, recording: Recording) -> Iterator[Issue]:
+def joint_limit_issues(arm: RecordedJointsModel, recording: Recording) -> Iterator[Issue]:
     """Yield issues about recorded angles or speeds beyond the joint limits."""
     joints = recording.joints
     if joints is None:
@@ -209,7 +209,7 @@ def known_effect_config_line(kind: str, location: str, quantity: str, value: flo
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
 
-def check_inertial_effort_excitation(
+def inertial_effort_excitation_issues(
     arm: RecordedJointsModel, recording: Recording, effort: SensorOptions
 ) -> Iterator[Issue]:
     """Yield an issue if a motion is too slow to determine damping, friction and inertia from measured efforts.
@@ -250,7 +250,7 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
     return np.array([white_noise_std(joints.t, joints.effort[:, joints.names.index(name)]) for name in names])
 
 
-def check_joint_excitation(
+def joint_excitation_issues(
     recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
     """Yield an issue for each joint that hardly moves in any recording, although some of its parameters are free.
@@ -337,7 +337,7 @@ class _Fit(NamedTuple):
     cost: float
 
 
-def check_efforts_by_inverse_dynamics(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
+def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
     """Find recorded efforts that disagree with the inverse dynamics of the recorded motion."""
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)

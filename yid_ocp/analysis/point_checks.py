@@ -13,8 +13,8 @@ import numpy as np
 import scipy.interpolate
 
 from yid_ocp.analysis.clock_checks import (
-    PositionsAtTimes,
-    check_robot_held_point_clock,
+    PositionsAtTimesFunction,
+    robot_held_point_clock_issues,
     search_clock_offset_and_drift,
     timestamp_correction_advice,
 )
@@ -57,7 +57,7 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
 
 
-def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
+def robot_held_point_issues(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
     """Yield issues about points that disagree with forward kinematics; `choice` returns a group's sensor options."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
@@ -86,7 +86,7 @@ def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choi
         path = scipy.interpolate.CubicSpline(dense, arm.frame_positions_and_jacobians(places, course(dense))[0], axis=0)
         allowed = max(_HELD_POINT_TOLERANCE, 5 * noise)
         if not error > allowed:
-            found = check_robot_held_point_clock(joints, group, t, seen, by_angle, noise, path)
+            found = robot_held_point_clock_issues(joints, group, t, seen, by_angle, noise, path)
             yield from (replace(issue, recording=recording.name) for issue in found)
             continue
         changes = [
@@ -147,7 +147,9 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
         yield _Change("point_swapped", words, advice, _rms(seen[:, order] - place))
 
 
-def _changed_times(path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array) -> Iterator[_Change]:
+def _changed_times(
+    path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array
+) -> Iterator[_Change]:
     """Corrections for points recorded earlier or later than the angles, or by a faster or slower clock."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
 
@@ -227,7 +229,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
     return dict(zip(chain, np.cumsum(lengths)[::-1].tolist(), strict=True))
 
 
-def check_point_distances(
+def point_distance_issues(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, choice: _SensorChoices
 ) -> Iterator[Issue]:
     """Yield issues about points farther apart, or farther from the root, than the object's length allows."""
@@ -267,7 +269,7 @@ def check_point_distances(
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
-def check_object_points_against_rollout(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
+def object_point_rollout_issues(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
     """Yield issues about points far from the rollout `result` at initial parameters, relative to `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
@@ -306,7 +308,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
         yield _Change("point_mirrored", words, words, _rms(moved(pose @ flip @ back) - place))
 
 
-def check_cable_point_geometry(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
+def cable_point_geometry_issues(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
     """Yield issues about cable points above the clamps, or with edge lengths unlike the undeformed shape."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertex_names if name in group.names}
@@ -357,7 +359,7 @@ def _upside_down(
 ) -> Issue | None:
     """Issue for a cable that rises between its clamps by more than its shape does: gravity has the wrong sign."""
     pull = float(np.linalg.norm(gravity))
-    free = [name for name in cable.free_vertex_names if name in at]
+    free = [name for name in cable.unclamped_vertex_names if name in at]
     ends = [name for name in (cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[-1]) if name in at]
     if pull == 0 or len(ends) < 2 or not free:
         return None

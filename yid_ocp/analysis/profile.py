@@ -12,7 +12,10 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, PartsDoneCounter, Progress
-from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, linearization_without_weak_priors
+from yid_ocp.inference.linearized_residual import (
+    bounded_levenberg_marquardt_step,
+    residual_and_jacobian_without_weak_priors,
+)
 from yid_ocp.inference.uncertainty import (
     CHI2_95_TWO_SIDED,
     ConfidenceInterval,
@@ -119,11 +122,11 @@ def solution_with_profile_intervals(
 
     # each parameter takes about one and a half times as long as the solution
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood", 7.5 * len(asked), 5.2)
-    found = results_by_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
+    found = call_for_each_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def results_by_parameter_at_optimum(
+def call_for_each_parameter_at_optimum(
     judged: Callable[[str, Array, Evaluation], _Found],
     problem: EstimationProblem,
     x: Array,
@@ -326,7 +329,7 @@ class _Walk:
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
         """Residual and Jacobian by the coordinates, with logarithmic priors instead of the weak priors."""
-        residual, jacobian = linearization_without_weak_priors(self.problem, evaluation)
+        residual, jacobian = residual_and_jacobian_without_weak_priors(self.problem, evaluation)
         slope = np.where(self.positive, self._unknowns(s), 1.0)
         anchors = np.eye(len(s))[self.anchored] / _LOG_PRIOR_STD
         held = (s - self.centre)[self.anchored] / _LOG_PRIOR_STD

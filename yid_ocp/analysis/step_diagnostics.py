@@ -119,7 +119,7 @@ _RESPONSE_STEPS = 100
 
 
 @dataclass(frozen=True)
-class ParameterDetectability:
+class ParameterInfluence:
     """Step equations that contain one parameter, and the sensors' response to the parameter."""
 
     parameter: str
@@ -133,14 +133,14 @@ class ParameterDetectability:
     change_along_recordings: float | None = None  # root sum of squares over all readings, likewise
 
 
-def parameter_detectabilities(
+def parameter_influences(
     step: Step,
     symbols: NamedStepEquations,
     episode: Episode | None,
     state: Array,
     theta: Array,
     stages: StepEquationLinearizations,
-) -> tuple[ParameterDetectability, ...]:
+) -> tuple[ParameterInfluence, ...]:
     """Find for each parameter the step equations that contain it, and which sensors respond to it.
 
     For the response, one unit is added to one equation of a step that starts at `state`. The later steps are linear, x'
@@ -154,7 +154,7 @@ def parameter_detectabilities(
             entered[column - at.start].append(row)
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
     if episode is None:
-        return tuple(ParameterDetectability(*entry, None, "", (), None, 0.0) for entry in known)
+        return tuple(ParameterInfluence(*entry, None, "", (), None, 0.0) for entry in known)
     gain = np.zeros((step.sizes["nu"], step.sizes["nx"]))
     if episode.tracking_feedback is not None:
         gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
@@ -170,7 +170,7 @@ def parameter_detectabilities(
         best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
         seen, read = tuple(names[r] for r in answered), tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
         moved = float(np.max(by_theta[:, i], initial=0.0))
-        found.append(ParameterDetectability(*entry, seen, best, read, moved, span))
+        found.append(ParameterInfluence(*entry, seen, best, read, moved, span))
     return tuple(found)
 
 

@@ -17,7 +17,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
 from yid_ocp.integrator.step import step_derivatives_along_rollout
-from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
+from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel
 from yid_ocp.problem.evaluation import Evaluation
@@ -28,7 +28,7 @@ _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a read
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
-def point_sensitivities_and_joint_sensor_information(
+def point_sensitivities_and_joint_sensor_fisher_information(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -134,14 +134,14 @@ class _Motion:
 
     def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        momentum = course.model_functions.effect_momentum_shift_functions.momentum_derivative_by_previous_torque(
+        momentum = course.model_functions.recorded_momentum_correction.momentum_derivative_by_previous_torque(
             course.theta
         )
         self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
         nu, count = len(errors.torque_std), len(errors.sample_of_step)
         known, pulled = np.tile(np.eye(nu), (count, 1, 1)), np.zeros((count, nu, nu))
         if feedback is not None:
-            known = applied_torque_by_torque_error(feedback.gain, momentum)
+            known = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
             pulled = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         inputs = np.concatenate([known, pulled], axis=2)
         for state, _ in step_derivatives_along_rollout(step, course.theta, course.rollout, inputs, feedback):

@@ -18,10 +18,10 @@ from ruamel.yaml.comments import CommentedSeq
 from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
-from yid_ocp.effects.law import LawDependence
+from yid_ocp.effects.law import TorqueLawQuantitiesName
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
-from yid_ocp.model.objects import OBJECT_KINDS, ObjectKind
+from yid_ocp.model.objects import OBJECT_KINDS, ObjectBuilder
 from yid_ocp.model.objects.base import MountSettings
 from yid_ocp.model.servos_and_springs import PositionServoOptions
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
@@ -106,7 +106,7 @@ class EffectSettings:
     kind: Annotated[str, OptionInfo("kind of effect: kelvin_voigt, joint_coulomb, ..., or law")]
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
     values: Annotated[Mapping[str, float], OptionInfo("parameters that are not neutral")] = field(default_factory=dict)
-    depends_on: Annotated[LawDependence | None, OptionInfo("quantities on which a law depends")] = None
+    depends_on: Annotated[TorqueLawQuantitiesName | None, OptionInfo("quantities on which a law depends")] = None
     table: Annotated[_FilePath | None, OptionInfo("table of a law, in the format of a diagnosis' law.csv")] = None
 
 
@@ -190,7 +190,7 @@ class ModelSettings:
         OptionInfo("additional frames on robot, object or world, by name, such as a tool tip or a marker"),
     ] = field(default_factory=dict)
     object: Annotated[
-        ObjectKind | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
+        ObjectBuilder | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
     ] = None
     grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("grasps by name: left, right, gripper")] = field(
         default_factory=dict
@@ -480,7 +480,7 @@ class RunSettings:
     # file and line of every key, for error messages
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
-    def describe_location(self, *path: str | int) -> str:
+    def setting_location(self, *path: str | int) -> str:
         """Location of a setting (file, line and key), for the `where` of an error."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
@@ -490,7 +490,7 @@ class RunSettings:
 
     def config_error(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
         """Return a `ConfigError` with file, line and key of a setting, for the caller to raise."""
-        return ConfigError(what, where=self.describe_location(*path), allowed=allowed, hint=hint)
+        return ConfigError(what, where=self.setting_location(*path), allowed=allowed, hint=hint)
 
 
 def config_yaml_with_defaults(run: RunSettings) -> str:

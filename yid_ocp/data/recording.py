@@ -31,7 +31,7 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 """Channels of a joint group and their units."""
 
 _STD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
-JOINT_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
+JOINT_NOISE_AND_SERVO_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
 """Constants of a joint group that may be given, nonnegative, one for all joints or one for each."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
@@ -94,7 +94,7 @@ class JointGroup(ReprMixin):
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t", *JOINT_CHANNEL_UNITS))
-        for name in JOINT_CONSTANT_NAMES:
+        for name in JOINT_NOISE_AND_SERVO_CONSTANT_NAMES:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _constant(getattr(self, name), f"joints, attribute {name}"))
 
@@ -196,7 +196,7 @@ class SensorChannelGroup(ReprMixin):
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t",))
-        values = {key: read_only_array(value, f"{self.name}/{key}") for key, value in self.values_by_quantity.items()}
+        values = {key: read_only_copy(value, f"{self.name}/{key}") for key, value in self.values_by_quantity.items()}
         stds = {
             key: _constant(std, f"{self.name}, attribute {key}")
             for key, std in self.noise_and_bias_stds_by_attribute.items()
@@ -248,7 +248,7 @@ class Recording(ReprMixin):
         for name in ("points", "channel_groups", "notes"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if self.marker_reference_pose is not None:
-            object.__setattr__(self, "marker_reference_pose", read_only_array(self.marker_reference_pose, "straight"))
+            object.__setattr__(self, "marker_reference_pose", read_only_copy(self.marker_reference_pose, "straight"))
 
     def _summary(self) -> ReprLineAndTableRows:
         names = {"joint": self.joint_names, "point": self.point_names}
@@ -371,7 +371,7 @@ def require_data(condition: object, what: str, where: str, allowed: str = "", hi
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
-def read_only_array(value: ArrayLike, where: str) -> Array:
+def read_only_copy(value: ArrayLike, where: str) -> Array:
     """Copy an array as read-only float64. Raises `DataError` if it cannot be converted."""
     try:
         array = np.array(value, dtype=np.float64)
@@ -383,7 +383,7 @@ def read_only_array(value: ArrayLike, where: str) -> Array:
 
 
 def _constant(value: ArrayLike, where: str) -> float | Array:
-    array = read_only_array(value, where)
+    array = read_only_copy(value, where)
     return float(array) if array.ndim == 0 else array
 
 
@@ -391,7 +391,7 @@ def _freeze_arrays(group: JointGroup | PointGroup | SensorChannelGroup, names: I
     """Convert the named fields of a new group to read-only arrays, except None."""
     for name in names:
         if getattr(group, name) is not None:
-            object.__setattr__(group, name, read_only_array(getattr(group, name), f"{group.name}/{name}"))
+            object.__setattr__(group, name, read_only_copy(getattr(group, name), f"{group.name}/{name}"))
 
 
 def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> None:
@@ -419,7 +419,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
     require_data(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
-    for name in JOINT_CONSTANT_NAMES:
+    for name in JOINT_NOISE_AND_SERVO_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")

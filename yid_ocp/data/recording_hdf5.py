@@ -24,13 +24,13 @@ from yid_ocp import files
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
-    JOINT_CONSTANT_NAMES,
+    JOINT_NOISE_AND_SERVO_CONSTANT_NAMES,
     POINT_GROUP_NAME_PATTERN,
     JointGroup,
     PointGroup,
     Recording,
     SensorChannelGroup,
-    read_only_array,
+    read_only_copy,
     require_data,
     validated_recording,
 )
@@ -44,7 +44,7 @@ _STRAIGHT = "straight"
 _GAIN = "proportional_gain"
 _JOINT_UNITS = {"t": "s", **JOINT_CHANNEL_UNITS}
 _POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
-_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_CONSTANT_NAMES)
+_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_NOISE_AND_SERVO_CONSTANT_NAMES)
 _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
@@ -110,7 +110,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT, hint)
     joints, points, straight, channels, gain = None, [], None, [], {}
     if _GAIN in file.attrs:  # of all joints alike
-        gain = {_GAIN: read_only_array(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
+        gain = {_GAIN: read_only_copy(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
     further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
@@ -174,7 +174,7 @@ def _read_group(
         elif name in ("clock", "effort_kind", "sensor", "frame"):
             values[name] = _text(value, place)
         else:
-            values[name] = read_only_array(value, place)
+            values[name] = read_only_copy(value, place)
     return values
 
 

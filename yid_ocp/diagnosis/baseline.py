@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from yid_ocp.analysis.estimate_history import RunEstimates, nearby_positive_definite_covariance, pool_estimates
+from yid_ocp.analysis.estimate_history import RunEstimates, nearby_positive_definite_covariance, pool_estimates_and_chi2
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
-from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_channel_errors
+from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_rmse_and_unit_by_channel
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
 from yid_ocp.effects import EffectBase
@@ -29,9 +29,9 @@ from yid_ocp.errors import (
     failed_rollout_error,
     nearest_name_question,
 )
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import chi2_p_value
-from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
+from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers import Status
@@ -116,7 +116,7 @@ class EarlierRunsBaseline:
         """Make a baseline from the estimates of several runs and from reference recordings `without` the effect."""
         if not runs:
             return EarlierRunsBaseline(None, (), 0.0, 1.0, without)
-        known, chi2, degrees = pool_estimates(runs)
+        known, chi2, degrees = pool_estimates_and_chi2(runs)
         return EarlierRunsBaseline(
             known, tuple(run.run_name for run in runs), chi2, chi2_p_value(chi2, degrees), without
         )
@@ -181,7 +181,7 @@ class EarlierRunsBaseline:
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
     """Variance of every unknown from the stated noise and priors alone."""
     problem = fit.problem
-    jacobian = linearization_without_weak_priors(problem, fit.evaluation)[1] * problem.unknown_scales
+    jacobian = residual_and_jacobian_without_weak_priors(problem, fit.evaluation)[1] * problem.unknown_scales
     variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
     return dict(zip(problem.unknown_names, map(float, variance), strict=True))
 
@@ -264,12 +264,12 @@ def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProbl
 
 def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Sequence[EffectBase]) -> _ChannelErrors:
     if problem.has_process_noise:
-        problem = problem_whitened_by_sensor_noise(problem)
+        problem = problem_with_sensor_noise_only(problem)
     found = problem.predict_held_out(problem.vector({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:
         raise failed_rollout_error(failed[0], "held-out recordings")
-    return held_out_channel_errors(found)
+    return held_out_rmse_and_unit_by_channel(found)
 
 
 def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:

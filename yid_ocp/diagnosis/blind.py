@@ -252,7 +252,7 @@ class BlindCaseGenerator:
             drawn[name] = start[name] + priors[name] * rng.uniform(*_PRIOR_DEVIATIONS) * rng.choice([-1.0, 1.0])
         for effect in self._ordinary_friction:
             drawn |= {name: start[name] for name in effect.shape_parameter_names}
-            for name in effect.amplitude_names:
+            for name in effect.amplitude_parameter_names:
                 drawn[name] = rng.uniform(*ordinary_friction_range(effect, system))
         return {name: float(value) for name, value in drawn.items()}
 
@@ -310,15 +310,15 @@ class BlindCaseGenerator:
             for s in self._linearize_clean_recordings().signatures
         )
 
-    def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
+    def candidate_sensitivities_to_plain_data(self) -> list[dict[str, Any]]:
         """Compute JSON-compatible sensitivities of all candidates, which define their detectable sizes."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
-    def set_candidate_sensitivities_from_json(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Set the candidates' sensitivities to the values of another generator's `candidate_sensitivities_to_json`."""
+    def set_candidate_sensitivities_from_plain_data(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+        """Set the candidates' sensitivities to those of another generator's `candidate_sensitivities_to_plain_data`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -388,7 +388,7 @@ class BlindCaseGenerator:
         self, entry: _Detectable, rng: np.random.Generator, wanted: float
     ) -> tuple[InjectedEffect, float] | None:
         """Amplitudes in random proportion at a multiple of the detectable size, limited to the range."""
-        (effect, shape, factor), names = entry, entry[0].amplitude_names
+        (effect, shape, factor), names = entry, entry[0].amplitude_parameter_names
         neutral = np.array([effect.neutral_values[n] for n in names])
         low, high = np.array([effect.prior_ranges[n] for n in names]).T - neutral
         way = rng.uniform(low, high)

@@ -15,7 +15,7 @@ import scipy.stats
 
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
-from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics, SearchRecord, UnrecordedRefitError
+from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStatistics, UnrecordedRefitError
 from yid_ocp.diagnosis.screening import (
     AllCandidatesScoreModel,
     CandidateScore,
@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalEvidence, judge
+from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
@@ -431,7 +431,7 @@ _EVIDENCE_FORMAT = "yid-evidence/1"
 _MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of two candidates is recorded
 
 
-def evidence_to_json(finding: DiagnosisResult) -> dict[str, Any]:
+def diagnosis_evidence_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     """The numbers on which a diagnosis' rules are based; `judge_recorded_case` uses them to judge it again."""
     record, plain = finding.record, to_lossless_plain_data
     pairs = {
@@ -471,7 +471,7 @@ def _screening_to_json(screened: ScreeningResult) -> dict[str, Any]:
 
 
 class _RecordedCase:
-    """The output of `evidence_to_json`, as the objects that the rules need."""
+    """The output of `diagnosis_evidence_to_dict`, as the objects that the rules need."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         self._effects = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
@@ -479,9 +479,9 @@ class _RecordedCase:
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
         flags = (data["are_offsets_stated"], data["has_left_baseline"])
-        self.evidence = NominalEvidence(nominal, before, held, screened, *flags)
+        self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *flags)
         self.located_gap = None if located is None else restored(LocatedGap, located)
-        self.record = SearchRecord(
+        self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
             {
@@ -521,7 +521,7 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
 
 
 def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Judge a recorded case again, from the output of `evidence_to_json`, and return the part that is scored.
+    """Judge a recorded case again, from the output of `diagnosis_evidence_to_dict`, and return the part that is scored.
 
     The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
     `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,
@@ -539,7 +539,7 @@ def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> 
     except UnrecordedRefitError:
         judged = Judgement(_NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, ())
     where = () if case.located_gap is None else case.located_gap.locations
-    if judged.accepted:
+    if judged.accepted_selections:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
         where = gap_locations_from_effect_closures(where, judged.closure_by_location, rest, ())
     return judgement_to_dict(judged, case.evidence, where)

@@ -48,14 +48,14 @@ from yid_ocp.diagnosis.refit import (
 )
 from yid_ocp.diagnosis.screening import CandidateScore, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalEvidence, judge
+from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import DataError, SolverError, failed_rollout_error
 from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
     path_noise_spread,
-    residual_channel_indices,
+    residual_channels,
     residual_chi2_null_test,
     residuals_exceed_noise,
     whiten_with_extra_errors,
@@ -69,7 +69,7 @@ from yid_ocp.inference.smoother import (
     select_and_smooth_unknowns,
 )
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
-from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
+from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.measurements import subtract_estimated_biases
@@ -146,7 +146,7 @@ class _Examined:
     whole: EstimationProblem  # the problem with all samples
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all recordings, if it was run
-    evidence: NominalEvidence
+    evidence: NominalModelGapEvidence
     stated_and_finer_time_step: tuple[float, float] | None = None  # if the error of the stated step was part of the gap
 
     @property
@@ -177,7 +177,7 @@ def _examined(
         found = _examined_about_fit(problem, *_followed(finer, again, found.truncated), clock)
     little = 1 + limits.min_excess_chi2_per_dof
     poor = found.is_search_worthwhile and found.evidence.nominal_test.chi2_per_dof < little
-    if poor and not search.note_skip_past_deadline("the nominal model from other starts"):
+    if poor and not search.record_skip_if_past_deadline("the nominal model from other starts"):
         other = _better_nominal_fit(found.search, found.nominal)
         if other is not None:
             # the smoother's result belongs to another fit
@@ -229,7 +229,7 @@ def _diagnosed(
 
     judged = judge(search, evidence, located, finished)
     where = () if smoothed is None else located().locations
-    accepted, final = judged.accepted, nominal
+    accepted, final = judged.accepted_selections, nominal
     if accepted:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
         final = model_in_step_of_all_candidates(search.problem, accepted[-1].refitted_model)
@@ -331,7 +331,7 @@ def _happened(
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
     if own.system.unprescribed_coordinate_indices:
-        judged = weighted or problem_whitened_at(own, x, guesses)
+        judged = weighted or problem_with_whitening_at(own, x, guesses)
         residual = judged.evaluate(x, False, guesses)
         if not residual.ok:
             return NO_EVENTS, None
@@ -352,7 +352,7 @@ def _happened(
 def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     """r'r of a fit minus the number of used samples, over all recordings that can be predicted."""
     x, guesses = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
-    judged = problem_whitened_at(problem, x, guesses)
+    judged = problem_with_whitening_at(problem, x, guesses)
     evaluation = judged.evaluate(x, False, guesses)
     if not evaluation.ok:
         return math.inf
@@ -402,7 +402,7 @@ def _tested(
     before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     screened = screen_candidates(composed, (), nominal.values, limits)
-    evidence = NominalEvidence(nominal, before, held, screened, _offsets_stated(nominal.problem))
+    evidence = NominalModelGapEvidence(nominal, before, held, screened, _offsets_stated(nominal.problem))
     return _Examined(replace(search, problem=composed), nominal, cuts, whole, events, smoothed, evidence)
 
 
@@ -531,7 +531,7 @@ def fit_nominal_model(
             raise failed_rollout_error(f"its fit fails: {found.message}", "nominal model")
         start = dict(zip(found.unknown_names, map(float, found.x), strict=True))
         if found.problem is not None and composed.problem.has_process_noise:
-            begun = composed.about_input_errors(found.problem)
+            begun = composed.linearized_about_estimated_input_errors(found.problem)
     fit = _settled(RefitContext(begun, limits, NULL_PROGRESS, store), start, "")
     if fit is None and start:
         # a gap may move parameters so far that the solver's equilibrium is not found again from there
@@ -553,7 +553,7 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 
 def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
     """The null test of a residual after a fit of the given number of parameters."""
-    samples = residual_channel_indices(problem)
+    samples = residual_channels(problem)
     return residual_chi2_null_test(samples, residual, fitted, limits.significance_level, limits.residual_window)
 
 
@@ -601,7 +601,7 @@ def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnkno
     """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns."""
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.has_process_noise:
-        problem = problem_whitened_by_sensor_noise(problem)
+        problem = problem_with_sensor_noise_only(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
     if any(episode.has_uncertain_sensor_biases for episode in problem.episodes):
         less = [

@@ -14,10 +14,10 @@ from yid_ocp.diagnosis.screening import DetectableAmplitudes
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     Judgement,
-    NominalEvidence,
+    NominalModelGapEvidence,
 )
 from yid_ocp.effects import EffectBase
-from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
+from yid_ocp.effects.base import REQUIRED_EXCITATION_PHRASES
 from yid_ocp.inference.null_test import residuals_exceed_noise
 from yid_ocp.inference.smoother import GapLocation, main_gap_locations
 
@@ -59,7 +59,7 @@ _UNKNOWN_REASON_TEXTS = {
 def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
     """The experiment that separates confusable effects, from what their equations depend on."""
     said = dict.fromkeys(effect.required_excitation for effect in rivals if effect.required_excitation)
-    known = [aspect for aspect in ORDERED_EXCITATION_DESCRIPTIONS if aspect in said]
+    known = [aspect for aspect in REQUIRED_EXCITATION_PHRASES if aspect in said]
     aspects = [*known, *(aspect for aspect in said if aspect not in known)]
     places = list(dict.fromkeys(effect.location for effect in rivals))
     case = "separate" if len(aspects) > 1 else "places" if len(places) > 1 else "vary" if aspects else "other"
@@ -71,7 +71,9 @@ def recommended_experiment_text(
 ) -> str:
     """Recommend the next recording in a sentence, from verdict, gap location and confusable effects."""
     verdict = judged.verdict
-    rivals = next((entry.equivalent_effects for entry in judged.accepted if len(entry.equivalent_effects) > 1), ())
+    rivals = next(
+        (entry.equivalent_effects for entry in judged.accepted_selections if len(entry.equivalent_effects) > 1), ()
+    )
     if rivals:
         return _separating_experiment(rivals)
     unseen = [entry.effect.label for entry in seen if not entry.is_detectable]
@@ -85,7 +87,7 @@ def recommended_experiment_text(
     return _NEXT_EXPERIMENT_TEXTS[case].format(place=place, unseen=listed)
 
 
-def insufficient_data_message(verdict: str, seen: NominalEvidence, limits: Thresholds) -> str:
+def insufficient_data_message(verdict: str, seen: NominalModelGapEvidence, limits: Thresholds) -> str:
     """Explain why the data are insufficient. Empty if they suffice."""
     if verdict != "insufficient_data":
         return ""
@@ -197,7 +199,7 @@ def _nameless(finding: DiagnosisResult) -> str:
         least=100 * finding.thresholds.min_gap_closed,
         explained=100 * finding.explained_fraction,
         asked=f"of the former is required for {count} assumptions" if count > 1 else "is required of both",
-        enough=100 * finding.required_fraction(finding.thresholds),
+        enough=100 * finding.required_explained_fraction(finding.thresholds),
         apart="; ".join(apart[:2]),
         no="No effect tried so far" if finding.untried else "No known effect",
     )
@@ -237,7 +239,7 @@ def _effects(finding: DiagnosisResult) -> list[str]:
 
 
 def _model_error(finding: DiagnosisResult) -> str:
-    sizes = finding.model_error_by_unit.items()
+    sizes = finding.worst_held_out_channel_by_unit.items()
     said = " and ".join(f"{size:.2g} {unit} (rms) at {channel}" for unit, (channel, size) in sizes)
     return f" of {said}" if said else ""
 
@@ -253,7 +255,7 @@ def _figures(effect: EffectBase, fit: RefitStatistics) -> str:
 def _out_of_range(effect: EffectBase, fit: RefitStatistics) -> list[str]:
     """Sentence on amplitudes beyond their expected range."""
     found = []
-    for name in effect.amplitude_names:
+    for name in effect.amplitude_parameter_names:
         (low, high), value = effect.prior_ranges[name], fit.values[name]
         room = _PRIOR_RANGE_TOLERANCE * (high - low)
         if not low - room <= value <= high + room and effect.neutral_values[name] != value:

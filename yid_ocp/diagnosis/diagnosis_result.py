@@ -11,18 +11,18 @@ from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsR
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
-from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel, SearchRecord
-from yid_ocp.diagnosis.screening import bonferroni_min_p_value
+from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
+from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.select import (
     GapClosure,
     held_out_gap_closure,
-    penalized_chi2_difference,
+    penalized_chi2_excess_over,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     Judgement,
     LocatedGap,
-    NominalEvidence,
+    NominalModelGapEvidence,
 )
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin
 from yid_ocp.effects import EffectBase
@@ -30,7 +30,7 @@ from yid_ocp.files import object_attributes_to_json_dict, to_json_types
 from yid_ocp.inference.null_test import (
     AssumedChannelNoiseLevel,
     NullTestResult,
-    min_bonferroni_p_value,
+    bonferroni_corrected_min_test_p_value,
 )
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 
@@ -49,7 +49,7 @@ class NominalParameterChange:
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
+class DiagnosisResult(NominalModelGapEvidence, Judgement, ReprMixin):
     """Result of a diagnosis: verdict, gap, locations, effects and the statistics behind them.
 
     `to_dict` returns it in the format of result.json, with a unit for every value.
@@ -92,7 +92,7 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     located_gap: LocatedGap | None = None
-    record: SearchRecord = field(default_factory=SearchRecord)
+    record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first; empty if all were done
     search_seconds: float = 0.0  # duration until the end of the search for effects
@@ -114,17 +114,17 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
         """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
-        return tuple(entry.effect for entry in self.accepted)
+        return tuple(entry.effect for entry in self.accepted_selections)
 
     @property
     def final_model(self) -> RefittedModel:
         """The model with all accepted effects, or the nominal model if there are none."""
-        last = self.accepted[-1].refitted_model if self.accepted else self.nominal_model
+        last = self.accepted_selections[-1].refitted_model if self.accepted_selections else self.nominal_model
         assert isinstance(last, RefittedModel)
         return last
 
     @property
-    def model_error_by_unit(self) -> dict[str, tuple[str, float]]:
+    def worst_held_out_channel_by_unit(self) -> dict[str, tuple[str, float]]:
         """By unit, the channel with the largest held-out error beyond noise in the final model, and that RMS."""
         noise = {own.channel: own.noise_rmse for own in self.noise_floor}
         found: dict[str, tuple[str, float]] = {}
@@ -154,7 +154,8 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
             "remaining": {
                 "p_value": self.remaining_test.p_value,
                 "model_error": {
-                    channel: {"rms": size, "unit": unit} for unit, (channel, size) in self.model_error_by_unit.items()
+                    channel: {"rms": size, "unit": unit}
+                    for unit, (channel, size) in self.worst_held_out_channel_by_unit.items()
                 },
                 "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.remaining_gap_locations],
             },
@@ -196,16 +197,16 @@ class DiagnosisResult(NominalEvidence, Judgement, ReprMixin):
         }
 
 
-def judgement_to_dict(judged: Judgement, seen: NominalEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
+def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
     """Convert the rule-based, scored part of a diagnosis to a JSON-compatible dictionary."""
-    closed = judged.gap_closure if judged.accepted else None
-    rivals = [entry.equivalent_effects for entry in judged.accepted if len(entry.equivalent_effects) > 1]
+    closed = judged.gap_closure if judged.accepted_selections else None
+    rivals = [entry.equivalent_effects for entry in judged.accepted_selections if len(entry.equivalent_effects) > 1]
     return {
         "verdict": judged.verdict,
         "gap": {"before": _state(seen.nominal_model, seen.nominal_held_out_test), **_closure(closed)},
         "where": [object_attributes_to_json_dict(place, _PLACE) for place in where],
         "which": _ranked_candidates(judged, seen),
-        "effects": [object_attributes_to_json_dict(entry.effect, _EFFECT) for entry in judged.accepted],
+        "effects": [object_attributes_to_json_dict(entry.effect, _EFFECT) for entry in judged.accepted_selections],
         "confusable": [[object_attributes_to_json_dict(e, _EFFECT) for e in own] for own in rivals],
     }
 
@@ -231,10 +232,10 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
         own = (finding.gap_closure.fraction, finding.gap_closure.ci_low, finding.explained_fraction)
         of_effects = dict(zip(of_effects, own, strict=True))
     found = {
-        "p_value": min_bonferroni_p_value(tests),
+        "p_value": bonferroni_corrected_min_test_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
-        "candidate": min(1.0, bonferroni_min_p_value(finding.screening.candidate_scores)),
+        "candidate": min(1.0, bonferroni_corrected_min_candidate_p_value(finding.screening.candidate_scores)),
         "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
         **of_effects,
         "assumptions": finding.assumption_count,
@@ -242,7 +243,7 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
         "behind": {
             fit.effects[-1].label: {
                 "left": fit.held_out_loss.chi2_per_sample,
-                "squares": penalized_chi2_difference(fit, alone[0]),
+                "squares": penalized_chi2_excess_over(fit, alone[0]),
             }
             for fit in alone
         },
@@ -293,13 +294,13 @@ def _closure(closed: GapClosure | None) -> dict[str, Any]:
     return to_json_types({"closure": closed.fraction, "closure_ci": [closed.ci_low, closed.ci_high]})
 
 
-def _ranked_candidates(judged: Judgement, seen: NominalEvidence) -> list[dict[str, Any]]:
+def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list[dict[str, Any]]:
     """All candidates: selected effects, then other refits by held-out loss, then the rest by score."""
     ranked, first = seen.screening.candidate_scores, judged.single_effect_models
     scores = {score.effect.label: score for score in ranked}
     alone = {fit.effects[0].label: fit for fit in first}
     entries: list[tuple[EffectBase, RefitStatistics | None]] = [
-        *((entry.effect, judged.accepted[-1].refitted_model) for entry in judged.accepted),
+        *((entry.effect, judged.accepted_selections[-1].refitted_model) for entry in judged.accepted_selections),
         *((fit.effects[0], fit) for fit in first),
         *((score.effect, None) for score in ranked),
     ]

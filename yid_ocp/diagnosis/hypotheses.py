@@ -16,9 +16,9 @@ from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
     problem_relinearized_at_torque_bias,
-    problem_whitened_at,
     problem_with_relinearized_held_out_whitening,
     problem_with_whitened_held_out,
+    problem_with_whitening_at,
 )
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.model.system import System
@@ -165,10 +165,10 @@ class AllCandidatesProblem:
         # filters are linearised about the estimated torques, so these must be known first
         x, errors = self.problem.vector(values), (episode.input_errors for episode in self.problem.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
-        made = problem_whitened_at(self.problem, x, rounds=1 if known else 2)
+        made = problem_with_whitening_at(self.problem, x, rounds=1 if known else 2)
         return replace(self, problem=problem_with_whitened_held_out(made, x))
 
-    def about_input_errors(self, solved: EstimationProblem) -> AllCandidatesProblem:
+    def linearized_about_estimated_input_errors(self, solved: EstimationProblem) -> AllCandidatesProblem:
         """Problem linearised about the input errors that a solved problem of the same recordings estimated."""
         pairs = list(zip(self.problem.episodes, solved.episodes, strict=True))
         if any(own.grid.steps != other.grid.steps for own, other in pairs):
@@ -208,7 +208,7 @@ class AllCandidatesProblem:
         cut = problem.with_episodes(problem.episodes, kept) if kept else _in_blocks(problem)
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
-    def without_other_places(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
+    def restricted_to_effect_location(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
         """Return a cheaper problem whose step contains only the candidates at the location of `effects`.
 
         A step of all candidates costs three times as much. The problem is unchanged without process noise, if `effects`

@@ -20,15 +20,15 @@ from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, re
 from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.law import (
-    LAW_QUANTITY_UNITS,
-    Law,
-    LawTable,
-    allowed_law_quantity_names,
-    make_law,
-    quantity_values_along,
+    TORQUE_LAW_QUANTITY_UNITS,
+    TorqueLaw,
+    TorqueLawTable,
+    allowed_torque_law_quantity_names,
+    make_torque_law,
+    torque_law_quantity_values_along_rollout,
 )
 from yid_ocp.files import to_json_types
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
@@ -50,7 +50,7 @@ class GapLaw:
     """A law for a gap that no effect of the library explains, with its held-out closure."""
 
     location: str
-    tables: tuple[LawTable, ...]  # one table per quantity
+    tables: tuple[TorqueLawTable, ...]  # one table per quantity
     visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
     closure: GapClosure  # closure of the held-out gap of the model without the law
     runner_up: tuple[str, str, float] | None  # location, quantities and closure of the next best
@@ -74,7 +74,7 @@ class GapLaw:
         for table in self.tables:
             low, high = self.visited_range[table.quantity]
             seen = (table.knots >= low) & (table.knots <= high)
-            torque, unit = table.torque[seen], LAW_QUANTITY_UNITS[table.quantity]
+            torque, unit = table.torque[seen], TORQUE_LAW_QUANTITY_UNITS[table.quantity]
             if len(torque):
                 ends = f"from {torque.min():.2g} to {torque.max():.2g} N m"
                 sizes.append(f"{ends} between {low:.2g} and {high:.2g} {unit}")
@@ -85,7 +85,7 @@ class GapLaw:
     def to_dict(self) -> dict[str, Any]:
         """Convert the law to a dictionary: location, depends_on, table, closure, visited_range, runner_up."""
         rows = [
-            {"quantity": t.quantity, "unit": LAW_QUANTITY_UNITS[t.quantity], "at": x, "torque": f, "std": s}
+            {"quantity": t.quantity, "unit": TORQUE_LAW_QUANTITY_UNITS[t.quantity], "at": x, "torque": f, "std": s}
             for t in self.tables
             for x, f, s in zip(t.knots.tolist(), t.torque.tolist(), t.torque_std.tolist(), strict=True)
         ]
@@ -108,7 +108,7 @@ class GapLaw:
 class _Family:
     """A law as a function of some quantities at one location, with the results of a linearised fit."""
 
-    law: Law  # restricted to the quantities
+    law: TorqueLaw  # restricted to the quantities
     log_evidence: float
     values: dict[str, float]  # values of the linearised fit at the knots
     precision: Array  # inverse prior covariance of these values, in the order of the law's parameters
@@ -125,15 +125,15 @@ def find_gap_law(
 
     `problem` is the problem of the nominal model, without candidates. `last` is the model with the accepted effects, or
     the nominal model. `places` are the locations of the gap, the most likely first."""
-    places = [p for p in dict.fromkeys(places) if allowed_law_quantity_names(problem.system, p)][:_MAX_PLACES]
-    if not places or search.note_skip_past_deadline("a law"):
+    places = [p for p in dict.fromkeys(places) if allowed_torque_law_quantity_names(problem.system, p)][:_MAX_PLACES]
+    if not places or search.record_skip_if_past_deadline("a law"):
         return None
     search.progress.begin_stage(f"estimating a law at {' or '.join(places)}", 3.0, 2.5)
     # a torque over time would interpolate the held-out blocks
     left_out = ("time",) if search.problem.is_split_in_blocks else ()
     laws = []
     for place in places:
-        quantities = [q for q in allowed_law_quantity_names(problem.system, place) if q not in left_out]
+        quantities = [q for q in allowed_torque_law_quantity_names(problem.system, place) if q not in left_out]
         laws.append(_neutral_law(last, place, quantities))
     before, found = _refitted_families(search, problem, last, laws, events)
     if before is None or not found:
@@ -164,7 +164,7 @@ def find_gap_law(
 
 @dataclass(frozen=True)
 class _RefittedLaw:
-    law: Law
+    law: TorqueLaw
     fit: RefittedModel
     loss: HeldOutLoss  # without what the prior of the law adds
 
@@ -173,7 +173,7 @@ def _refitted_families(
     search: RefitContext,
     problem: EstimationProblem,
     last: RefittedModel,
-    laws: Sequence[Law],
+    laws: Sequence[TorqueLaw],
     events: EventSet,
     only: Sequence[str] = (),
 ) -> tuple[RefittedModel | None, list[_RefittedLaw]]:
@@ -215,7 +215,9 @@ def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, least:
     return gained > error and closure.ci_low > least
 
 
-def _neutral_law(model: RefittedModel, place: str, quantities: Sequence[str], system: System | None = None) -> Law:
+def _neutral_law(
+    model: RefittedModel, place: str, quantities: Sequence[str], system: System | None = None
+) -> TorqueLaw:
     """A neutral law at a location, a sum over quantities, with knots over the visited range."""
     tables, zeros = [], np.zeros(_N_KNOTS)
     for quantity in quantities:
@@ -224,8 +226,10 @@ def _neutral_law(model: RefittedModel, place: str, quantities: Sequence[str], sy
             low, high = min(low, -high), max(high, -low)
         room = max(high - low, _MIN_KNOT_RANGE) / (_N_KNOTS - 3)
         # half a gap of room, so that the ends are estimated and what lies beyond is flat
-        tables.append(LawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
-    return make_law(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * _torque_scale(model, place))
+        tables.append(TorqueLawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
+    return make_torque_law(
+        place, system or model.problem.system, tables, _RIDGE_STD_RATIO * _torque_scale(model, place)
+    )
 
 
 def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:
@@ -240,7 +244,7 @@ def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
         theta = problem.predictor.theta_with_episode_values(episode, problem.theta_and_initial_state_deviation(x, i)[0])
         nodes = _along(result, episode.grid.time_step)
-        found.append(quantity_values_along(problem.system, place, quantity, theta, nodes).ravel())
+        found.append(torque_law_quantity_values_along_rollout(problem.system, place, quantity, theta, nodes).ravel())
     values = np.concatenate(found)
     return values[np.isfinite(values)]
 
@@ -257,7 +261,7 @@ def _torque_scale(model: RefittedModel, place: str) -> float:
 
 
 def _composed_with_laws(
-    search: RefitContext, problem: EstimationProblem, last: RefittedModel, laws: Sequence[Law], events: EventSet
+    search: RefitContext, problem: EstimationProblem, last: RefittedModel, laws: Sequence[TorqueLaw], events: EventSet
 ) -> AllCandidatesProblem:
     """The problem with accepted effects and laws in one step, with the diagnosis' corrections and truncations."""
     held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
@@ -268,13 +272,13 @@ def _composed_with_laws(
     return composed.whitened_at(last.values) if composed.problem.has_process_noise else composed
 
 
-def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[Law]) -> list[_Family]:
+def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[TorqueLaw]) -> list[_Family]:
     """The families to refit, by the evidence of a fit linearised about the model without a law."""
     own = composed.with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
     evaluation = own.evaluate(own.vector(before.values), equilibrium_guesses=before.evaluation.equilibrium_guesses)
     if not evaluation.ok or evaluation.jacobian is None:
         return []
-    residual, jacobian = linearization_without_weak_priors(own, evaluation)
+    residual, jacobian = residual_and_jacobian_without_weak_priors(own, evaluation)
     names = list(own.unknown_names)
     ours = {name for law in laws for name in law.parameters.names}
     nuisance = [i for i, name in enumerate(names) if name not in ours]
@@ -295,7 +299,7 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
     return [*rest[: _MAX_REFITS - 1], *over_time[:1]]
 
 
-def _family(law: Law, residual: Array, slopes: Array) -> _Family:
+def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
     """Evidence, values and prior of one law, at the curvature weight and noise level with the largest evidence."""
     n, gram, pull = len(residual), slopes.T @ slopes, slopes.T @ residual
     total = float(residual @ residual)
@@ -314,7 +318,7 @@ def _family(law: Law, residual: Array, slopes: Array) -> _Family:
     return _Family(law, best[0], dict(zip(names, map(float, best[1]), strict=True)), best[2])
 
 
-def _prior_precision(law: Law, roughness_weight: float) -> Array:
+def _prior_precision(law: TorqueLaw, roughness_weight: float) -> Array:
     """Inverse prior covariance of the values at a law's knots, from their second differences and their size."""
     blocks = []
     for quantity in law.quantities:
@@ -343,10 +347,10 @@ def _refitted(
     return refit_with_effects(with_prior, effects, start, limits=search.thresholds)
 
 
-def _tables(law: Law, fit: RefittedModel) -> tuple[LawTable, ...]:
+def _tables(law: TorqueLaw, fit: RefittedModel) -> tuple[TorqueLawTable, ...]:
     made = []
     for quantity, knots in (law.knots or {}).items():
         names = law.parameter_names_of(quantity)
         torque, std = (np.array([own[name] for name in names]) for own in (fit.values, fit.std))
-        made.append(LawTable(quantity, knots, torque, std))
+        made.append(TorqueLawTable(quantity, knots, torque, std))
     return tuple(made)

@@ -151,7 +151,7 @@ class ForceEstimate:
         return replace(self, information=information, **parts)
 
     @property
-    def allowed_model_error(self) -> Array:
+    def assumed_model_error(self) -> Array:
         """Assumed model error (M,) of the force at every time point, in `unit`."""
         return np.hypot(self.model_error_std, self.friction_limit)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
-from yid_ocp.diagnosis.screening import CandidatePair, ScreeningResult, screen_candidates
+from yid_ocp.diagnosis.screening import ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
@@ -28,7 +28,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
-    problem_whitened_by_sensor_noise,
+    problem_with_sensor_noise_only,
     torque_bias_change_in_stds,
 )
 from yid_ocp.parallel import map_with_merged_calls
@@ -131,12 +131,14 @@ class NominalSolutionAndRefitStore:
 
 
 @dataclass(frozen=True)
-class SearchRecord:
+class EffectSearchRecord:
     """Record of all results that a search for effects requested, by name. Other rules can reuse it without refits."""
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # by name; next to effects in the model
-    pairs: dict[str, tuple[CandidatePair, ...]] = field(default_factory=dict)  # by the label of the excluded effect
+    pairs: dict[str, tuple[ScoredCandidatePair, ...]] = field(
+        default_factory=dict
+    )  # by the label of the excluded effect
 
 
 class UnrecordedRefitError(LookupError):
@@ -157,10 +159,10 @@ class RefitContext:
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
-    record: SearchRecord = field(default_factory=SearchRecord)  # likewise
+    record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     is_finished: bool = False
 
-    def note_skip_past_deadline(self, *what: str) -> bool:
+    def record_skip_if_past_deadline(self, *what: str) -> bool:
         """Whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
         is_late = time.perf_counter() >= self.deadline
         self.skipped.extend(what if is_late else ())
@@ -197,10 +199,10 @@ class RefitContext:
             self.record.screenings, name, lambda: screen_candidates(self.problem, base, values, self.thresholds)
         )
 
-    def ranked_pairs(self, screened: ScreeningResult, without: str = "") -> tuple[CandidatePair, ...]:
+    def ranked_candidate_pairs(self, screened: ScreeningResult, without: str = "") -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, without one label. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
-        found = screened.joint_score_model.ranked_pairs(labels)
+        found = screened.joint_score_model.ranked_candidate_pairs(labels)
         return self._answer(self.record.pairs, without, lambda: tuple(itertools.islice(found, _MAX_RECORDED_PAIRS)))
 
     def _answer(self, answers: dict[str, _Answer], name: str, work: Callable[[], _Answer]) -> _Answer:
@@ -242,7 +244,7 @@ def refit_with_effects(
 
     `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` is
     the name in the store of refits; the default, the labels of the effects, suffices if no other start is tried."""
-    problem = problem.without_other_places(effects)
+    problem = problem.restricted_to_effect_location(effects)
     known = load_stored_refit(problem, effects, store, name)
     if known is not None:
         return known
@@ -403,7 +405,9 @@ def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Arr
     gives the covariance F F'. Davies 1987, doi:10.1093/biomet/74.1.33."""
     found = {}
     for effect in effects:
-        shapes, sized = ([names.index(n) for n in of] for of in (effect.shape_parameter_names, effect.amplitude_names))
+        shapes, sized = (
+            [names.index(n) for n in of] for of in (effect.shape_parameter_names, effect.amplitude_parameter_names)
+        )
         away = x[sized] - [effect.neutral_values[names[i]] for i in sized]
         others = np.linalg.qr(factor[shapes].T)[0]
         rows = factor[sized] - factor[sized] @ others @ others.T
@@ -454,7 +458,7 @@ def refit_with_each_effect(
 
     fits: list[RefitStatistics | None] = []
     rest, begun = list(tried), time.perf_counter()
-    while rest and not search.note_skip_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
+    while rest and not search.record_skip_if_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
         # a batch is cheaper than single refits; with a deadline, only as many as fit, best first
         count, now = len(rest), time.perf_counter()
         if search.deadline < math.inf:
@@ -493,12 +497,14 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
         counts.append(count[count > 0])
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
-        found = problem_whitened_by_sensor_noise(problem).predict_held_out(x)
-    channels, contradiction = held_out_channel_errors(found), _contradiction(problem, x)
+        found = problem_with_sensor_noise_only(problem).predict_held_out(x)
+    channels, contradiction = held_out_rmse_and_unit_by_channel(found), _contradiction(problem, x)
     return HeldOutLoss(np.concatenate(squares), np.concatenate(counts), channels, contradiction)
 
 
-def held_out_channel_errors(found: Sequence[tuple[Episode, EpisodePrediction | str]]) -> dict[str, tuple[float, str]]:
+def held_out_rmse_and_unit_by_channel(
+    found: Sequence[tuple[Episode, EpisodePrediction | str]],
+) -> dict[str, tuple[float, str]]:
     """Root mean square error and unit of each channel over the predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_unit_and_count_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}

@@ -25,12 +25,12 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import (
     ResidualChannel,
     chi2_p_value,
     path_noise_spread,
-    residual_channel_indices,
+    residual_channels,
 )
 
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
@@ -97,20 +97,20 @@ def linearize_candidates(
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis, scatter, warm = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0)), None
     placed = problem.with_effects_and_relinearized_filters(base, values)
-    series, factor = residual_channel_indices(problem.problem), problem.problem.options.stated_std_factor
+    series, factor = residual_channels(problem.problem), problem.problem.options.stated_std_factor
     rows = problem.problem.residual_rows
     signatures: list[_EffectSignature] = []
     for k in range(max(map(len, grids.values()), default=0)):
         chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
-        amplitudes = [name for effect in chosen for name in effect.amplitude_names]
+        amplitudes = [name for effect in chosen for name in effect.amplitude_parameter_names]
         trial = placed.with_free_parameters_without_recompiling((*problem.nominal_free_parameters, *own, *amplitudes))
         trial = trial.with_parameter_values(shape)
         evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message, "model with the candidate effects")
         names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
-        data, jacobian = linearization_without_weak_priors(trial, evaluation)
+        data, jacobian = residual_and_jacobian_without_weak_priors(trial, evaluation)
         places = [names.index(name) for name in amplitudes]
         if k == 0:
             basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
@@ -118,7 +118,7 @@ def linearize_candidates(
             scatter = path_noise_spread(trial, trial.vector(values))[: len(data)]
         moved = jacobian[:, places]
         moved = moved - basis @ (basis.T @ moved)
-        edges = np.cumsum([len(effect.amplitude_names) for effect in chosen])[:-1]
+        edges = np.cumsum([len(effect.amplitude_parameter_names) for effect in chosen])[:-1]
         for effect, part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
             columns = np.ascontiguousarray(part)
             driven, priors = columns.T @ scatter, columns[rows.stated_priors] / factor
@@ -146,8 +146,11 @@ def _candidate_detectable_amplitudes(
         inverse = _pinv(information)
         variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
         sizes = np.where(np.diag(information) > 1e-16, z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
-        detectable = dict(zip(effect.amplitude_names, map(float, sizes), strict=True))
-        widths = {n: max(abs(bound - neutral[n]) for bound in effect.prior_ranges[n]) for n in effect.amplitude_names}
+        detectable = dict(zip(effect.amplitude_parameter_names, map(float, sizes), strict=True))
+        widths = {
+            n: max(abs(bound - neutral[n]) for bound in effect.prior_ranges[n])
+            for n in effect.amplitude_parameter_names
+        }
         visible = any(size < widths[name] for name, size in detectable.items())
         new, best = DetectableAmplitudes(effect, detectable, visible), found.get(effect.label)
         if best is None or (visible and not best.is_detectable):
@@ -214,7 +217,7 @@ def _score_candidates(
     return tuple(sorted(found, key=lambda s: -s.predicted_chi2_decrease))
 
 
-def bonferroni_min_p_value(ranked: Sequence[CandidateScore]) -> float:
+def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[CandidateScore]) -> float:
     """Bonferroni-corrected smallest p-value of the candidates; 1 without candidates."""
     return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
@@ -252,7 +255,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Residu
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
     """Amplitudes after a step from neutral."""
-    named = zip(effect.amplitude_names, map(float, step), strict=True)
+    named = zip(effect.amplitude_parameter_names, map(float, step), strict=True)
     return {name: effect.neutral_values[name] + moved for name, moved in named}
 
 
@@ -269,7 +272,7 @@ class ConfusabilityMatrix:
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
 
-CandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
+ScoredCandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
 """Two candidates, their values after the step of the linear model, and its decrease of r'r beyond chance."""
 
 
@@ -284,9 +287,11 @@ class AllCandidatesScoreModel:
 
     @property
     def _columns(self) -> list[IntArray]:
-        return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
+        return np.split(
+            np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_parameter_names) for e in self.effects])
+        )
 
-    def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
+    def ranked_candidate_pairs(self, among: Sequence[str]) -> Iterator[ScoredCandidatePair]:
         """Yield all pairs of the candidates `among`, largest penalised decrease of r'r first (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other."""
@@ -327,7 +332,7 @@ def _make_joint_score_model(
 
 def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:
     """Fractions of signatures that candidates explain of each other, with amplitudes scaled by prior range."""
-    ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_names]
+    ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_parameter_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram = everything.information * scale[:, None] * scale
     blocks = everything._columns[:-1]
@@ -360,6 +365,6 @@ def screen_candidates(
     """Screen all candidates not in `base` at `values` for detectability, scores and confusability."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
     visible = _candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
-    ranked = _score_candidates(point, residual_channel_indices(problem.problem), visible)
+    ranked = _score_candidates(point, residual_channels(problem.problem), visible)
     everything = _make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)

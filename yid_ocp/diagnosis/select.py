@@ -13,7 +13,7 @@ import numpy as np
 
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics, refit_with_each_effect
-from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_min_p_value
+from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
@@ -85,7 +85,7 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
-def penalized_chi2_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
+def penalized_chi2_excess_over(fit: RefitStatistics, other: RefitStatistics) -> float:
     """Difference of two fits' Bayesian information criterion (BIC): `fit` minus `other`, negative if `fit` is better.
 
     The BIC is r'r over estimation and held-out recordings (r: whitened residual) plus log(n) per effect parameter, with
@@ -108,9 +108,9 @@ def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> li
     simplest is best."""
     best = min(fits, key=_chi2)
     if _is_noise(best.held_out_loss, limits):
-        best = min(fits, key=lambda fit: penalized_chi2_difference(fit, best))
-        near = [fit for fit in fits if penalized_chi2_difference(fit, best) <= 2 * limits.min_log_bayes_factor]
-        near.sort(key=lambda fit: penalized_chi2_difference(fit, best))
+        best = min(fits, key=lambda fit: penalized_chi2_excess_over(fit, best))
+        near = [fit for fit in fits if penalized_chi2_excess_over(fit, best) <= 2 * limits.min_log_bayes_factor]
+        near.sort(key=lambda fit: penalized_chi2_excess_over(fit, best))
     else:
         near = [fit for fit in fits if _is_predicting_as_well(fit, best)]
         near.sort(key=lambda fit: (fit.effect_parameter_count, _chi2(fit)))
@@ -134,7 +134,7 @@ def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool
 def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds, *, in_shape: bool) -> bool:
     """Whether no amplitude is clearly outside its prior range, widened by a width or a factor, nor a shape if asked."""
     room = limits.prior_range_margin_in_widths
-    for name in effect.prior_ranges if in_shape else effect.amplitude_names:
+    for name in effect.prior_ranges if in_shape else effect.amplitude_parameter_names:
         low, high = effect.prior_ranges[name]
         unsure, width = limits.min_z * fit.std.get(name, 0.0), room * (high - low)
         least = low / (1 + room) if low > 0 else low - width
@@ -232,20 +232,24 @@ def select_effects(
         base, current = chosen.fit.effects, chosen.fit
         if base:
             beside = join_effect_labels(base)
-            if search.note_skip_past_deadline(f"the residual gap next to {beside}"):
+            if search.record_skip_if_past_deadline(f"the residual gap next to {beside}"):
                 break
             ahead = 3.5 if _is_explained(current, limits) else 20.0
             search.progress.begin_stage(f"scoring the residual gap next to {beside}", 1.0, ahead)
             screened = search.screen(base, current.values, f"beside {beside}")
             # a candidate can show a residual gap that the whole residual does not
-            p_value = bonferroni_min_p_value(screened.candidate_scores)
+            p_value = bonferroni_corrected_min_candidate_p_value(screened.candidate_scores)
             if _is_explained(current, limits) and p_value >= limits.gap_significance_level:
                 break
             if len(base) == 1 and _futile(search, [nominal, current, *first], alone, screened):
                 break
         shortlist = _refit_shortlist(screened, limits, base, places)
         fits = refit_with_each_effect(search, base, shortlist, current.values)
-        if moved and not base and not search.note_skip_past_deadline("candidates from the earlier run's parameters"):
+        if (
+            moved
+            and not base
+            and not search.record_skip_if_past_deadline("candidates from the earlier run's parameters")
+        ):
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
             pairs = _pairs_to_refit(search, alone, base[0])
@@ -298,7 +302,7 @@ def _reconsidered(search: RefitContext, chosen: _Choice, before: RefitStatistics
     while len(chosen.fit.effects) > 1:
         labels = frozenset(effect.label for effect in chosen.fit.effects)
         own = next((effect for effect in chosen.fit.effects if labels - {effect.label} not in tried), None)
-        if own is None or search.note_skip_past_deadline("each effect without the others' company"):
+        if own is None or search.record_skip_if_past_deadline("each effect without the others' company"):
             break
         tried.add(labels - {own.label})
         chosen = _revised(search, chosen, own)
@@ -352,7 +356,7 @@ def _futile(
     best = held_out_gap_closure(nominal.held_out_loss, min(tried, key=_chi2).held_out_loss)
     if nominal.has_process_noise or not best.fraction < 0.5:
         return False
-    *_, pair = next(iter(search.ranked_pairs(alone)), (0.0,))
+    *_, pair = next(iter(search.ranked_candidate_pairs(alone)), (0.0,))
     second = max((score.predicted_chi2_decrease for score in rest.candidate_scores), default=0.0)
     promised = max(pair, 2 * (nominal.cost - current.cost) + second)
     return promised < limits.min_explained_fraction * (2 * nominal.cost - nominal.residual_count)
@@ -367,7 +371,7 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
         return one.label == other.label or other.label in alike
 
     chosen: list[_Start] = []
-    for (a, b), values, _ in search.ranked_pairs(screened, without.label):
+    for (a, b), values, _ in search.ranked_candidate_pairs(screened, without.label):
         if len(chosen) == limits.n_refit_pairs:
             break
         before = (pair for pair, _ in chosen)
@@ -376,7 +380,7 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
     return chosen
 
 
-def selection_without(
+def refit_selection_without_effect(
     search: RefitContext, nominal: RefitStatistics, kept: Sequence[SelectedEffect], entry: SelectedEffect
 ) -> tuple[SelectedEffect, ...]:
     """Remove one of the selected effects and refit the others. Empty if the refit fails."""

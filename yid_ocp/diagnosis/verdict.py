@@ -16,8 +16,8 @@ from yid_ocp.diagnosis.select import (
     UNDEFINED_GAP_CLOSURE,
     GapClosure,
     SelectedEffect,
+    refit_selection_without_effect,
     select_effects,
-    selection_without,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
@@ -67,7 +67,7 @@ class LocatedGap:
 
 
 @dataclass(frozen=True)
-class NominalEvidence:
+class NominalModelGapEvidence:
     """Evidence for a gap before the search for effects."""
 
     nominal_model: RefitStatistics
@@ -110,7 +110,7 @@ class Judgement:
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
 
     @property
-    def accepted(self) -> tuple[SelectedEffect, ...]:
+    def accepted_selections(self) -> tuple[SelectedEffect, ...]:
         """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
@@ -130,13 +130,13 @@ class Judgement:
         """Fraction of the gap that the accepted effects at each location close beyond those added before."""
         closed: dict[str, float] = {}
         most = 0.0
-        for entry in self.accepted:
+        for entry in self.accepted_selections:
             place, part = entry.effect.location, entry.cumulative_closure.fraction
             closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
             most = max(part, most)
         return closed
 
-    def required_fraction(self, limits: Thresholds) -> float:
+    def required_explained_fraction(self, limits: Thresholds) -> float:
         """Fraction of the smoother's explanation that the effects are required to explain.
 
         For k assumptions it is 1 - (1 - `min_explained_fraction`)^k: each assumption must explain that part of the
@@ -147,7 +147,7 @@ class Judgement:
 def _is_little_explained(said: Judgement, limits: Thresholds) -> bool:
     """Whether effects explain too little of the fitted data; one effect may close enough held out instead."""
     elsewhere = said.assumption_count == 1 and said.gap_closure.ci_low >= limits.min_explained_fraction
-    return said.explained_fraction < said.required_fraction(limits) and not elsewhere
+    return said.explained_fraction < said.required_explained_fraction(limits) and not elsewhere
 
 
 _REASONS_FOR_UNKNOWN: Mapping[UnknownVerdictReason, Callable[[Judgement, Thresholds], bool]] = {
@@ -178,7 +178,7 @@ def _with_verdict(said: Judgement, gap: bool, are_data_sufficient: bool, limits:
 
 def judge(
     search: RefitContext,
-    seen: NominalEvidence,
+    seen: NominalModelGapEvidence,
     locate: Callable[[], LocatedGap],
     finished: Callable[[str], None] = lambda _: None,
 ) -> Judgement:
@@ -229,7 +229,7 @@ def _effects_with_transfer_checks(
     places = [entry.effect.location for entry in added]
     shared = [entry for entry in reversed(added) if places.count(entry.effect.location) > 1]
     for entry in shared if any(not check.is_consistent for check in checks) else ():
-        fewer = selection_without(search, nominal, added, entry)
+        fewer = refit_selection_without_effect(search, nominal, added, entry)
         own = _check_effect_amplitude_transfer(search, fewer[-1].refitted_model) if fewer else ()
         if own and all(check.is_consistent for check in own):
             added, checks = fewer, own
@@ -258,8 +258,10 @@ def _compare(
     """Comparison of the amplitudes of one effect in two fits."""
     neutral, found = effect.neutral_values, []
     width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
-    size = max(abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_names)
-    for name in effect.amplitude_names:
+    size = max(
+        abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_parameter_names
+    )
+    for name in effect.amplitude_parameter_names:
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)

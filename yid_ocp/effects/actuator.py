@@ -207,7 +207,7 @@ class _EffortOffset(_DistortedEffort):
     declared_parameters = (
         replace(
             ParameterDefinition("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured less true effort"),
-            range_scale=base.effort_limit_over_baxter,
+            range_scale=base.effort_limit_ratio_to_baxter,
         ),
     )
 

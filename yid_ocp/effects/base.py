@@ -19,7 +19,7 @@ from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, System
 from yid_ocp.registry import Registry
 
-ORDERED_EXCITATION_DESCRIPTIONS = (
+REQUIRED_EXCITATION_PHRASES = (
     *("how fast it moves", "how long it is held", "how hard it accelerates", "how far it bends"),
     *("its orientation to gravity", "how hard it pulls at its ends", "when it is read", "the camera's pose"),
     "how long it is",
@@ -85,7 +85,7 @@ class EffectBase(Effect):
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
     equation: ClassVar[str] = ""  # equation that the kind adds, as text
-    # what a motion must vary to distinguish the kind from others: one of `ORDERED_EXCITATION_DESCRIPTIONS`, or text
+    # what a motion must vary to distinguish the kind from others: one of `REQUIRED_EXCITATION_PHRASES`, or text
     # that continues "vary ..."
     required_excitation: ClassVar[str] = ""
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
@@ -135,7 +135,7 @@ class EffectBase(Effect):
         return {f"{self.label}.{q.name}": q.neutral_value for q in self.definitions}
 
     @property
-    def amplitude_names(self) -> tuple[str, ...]:
+    def amplitude_parameter_names(self) -> tuple[str, ...]:
         """Names of the amplitude parameters. The effect vanishes if they are neutral."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if not q.is_shape_parameter)
 
@@ -272,7 +272,7 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
     return tuple(tips)
 
 
-def effort_limit_over_baxter(system: System, joint: str) -> float:
+def effort_limit_ratio_to_baxter(system: System, joint: str) -> float:
     """Effort limit of a joint relative to that of Baxter's joints, at least 1. It is 1 for unlimited joints."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
@@ -347,7 +347,7 @@ def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
     """Define an arm joint's parameter, neutral at zero. `upper` and `expected` are scaled by the effort limit."""
-    prior, scale = (0.0, expected), effort_limit_over_baxter
+    prior, scale = (0.0, expected), effort_limit_ratio_to_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
 

@@ -238,7 +238,7 @@ def _bearable(system: System, frame: str) -> tuple[float, float]:
         whole = sum(_carried_body(system, tree.joint_index(name)).mass for name in base.object_joint_names(system))
         return max(0.5, whole), max(0.05, whole)
     moving = set(base.arm_joint_names(system)) & {tree.joints[i].name for i in tree.ancestor_joint_indices(joint)}
-    size = max((base.effort_limit_over_baxter(system, name) for name in moving), default=1.0)
+    size = max((base.effort_limit_ratio_to_baxter(system, name) for name in moving), default=1.0)
     return 10.0 * size, 3.0 * size
 
 

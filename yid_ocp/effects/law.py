@@ -28,21 +28,27 @@ from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
-LawDependence = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
+TorqueLawQuantitiesName = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
 """Quantities on which a law's torque depends: one, or two with a sum of functions."""
-LAW_QUANTITY_UNITS: Mapping[str, str] = {"angle": "rad", "speed": "rad/s", "load": "N m", "command": "N m", "time": "s"}
+TORQUE_LAW_QUANTITY_UNITS: Mapping[str, str] = {
+    "angle": "rad",
+    "speed": "rad/s",
+    "load": "N m",
+    "command": "N m",
+    "time": "s",
+}
 """Unit of each quantity on which a law may depend, for revolute joints."""
 _TABLE_COLUMNS = ("quantity", "unit", "at", "torque", "std")
 _SPACING_RTOL = 1e-3  # relative tolerance on equal spacing of knots in a file
 
 
 @dataclass(frozen=True)
-class LawTable:
+class TorqueLawTable:
     """Torque as a function of one quantity: values and standard deviations at equally spaced knots (k,).
 
     A natural cubic spline interpolates the values. Beyond the knots the torque is constant."""
 
-    quantity: str  # one of `LAW_QUANTITY_UNITS`
+    quantity: str  # one of `TORQUE_LAW_QUANTITY_UNITS`
     knots: Array
     torque: Array  # [N m]
     torque_std: Array  # [N m]; NaN where it is not known
@@ -54,7 +60,7 @@ class LawTable:
 
 
 @dataclass(frozen=True)
-class Law(EffectBase):
+class TorqueLaw(EffectBase):
     """Torque as a smooth function F = f(x) on an arm joint, or on every joint that bends a segment.
 
     x is the joint's own angle, speed, load or command, or the time since the start of the recording (an internal
@@ -73,7 +79,7 @@ class Law(EffectBase):
         """Quantities on which the torque depends."""
         return tuple(self.knots or ())
 
-    def restricted_to(self, quantities: Sequence[str]) -> Law:
+    def restricted_to(self, quantities: Sequence[str]) -> TorqueLaw:
         """Return a copy of the law for some of its quantities, without the parameters of the other quantities."""
         kept = {name: own for name, own in (self.knots or {}).items() if name in quantities}
         definitions = [d for d in self.definitions if d.name.rstrip("0123456789") in kept]
@@ -155,7 +161,7 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
     )
 
 
-def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
+def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
     """Quantities on which a law at a location may depend, empty if no law is possible.
 
     `load` needs a driven joint, `command` a servo."""
@@ -167,7 +173,7 @@ def allowed_law_quantity_names(system: System, location: str) -> tuple[str, ...]
     return ("angle", "speed", *driven, *(("command",) if location in system.servos else ()), "time")
 
 
-def quantity_values_along(
+def torque_law_quantity_values_along_rollout(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
     """Values (N, joints) of `quantity`, such as speed or load, at the midpoints of the N steps of a rollout.
@@ -213,11 +219,13 @@ def quantity_values_along(
     return values
 
 
-def make_law(location: str, system: System, tables: Sequence[LawTable], torque_scale: float = math.inf) -> Law:
+def make_torque_law(
+    location: str, system: System, tables: Sequence[TorqueLawTable], torque_scale: float = math.inf
+) -> TorqueLaw:
     """Make a law at a joint or segment from its tables. `torque_scale` is the expected size of its torque [N m].
 
     Raises `ConfigError` if the location allows no law, or no law of these quantities."""
-    label, possible = f"law@{location}", allowed_law_quantity_names(system, location)
+    label, possible = f"law@{location}", allowed_torque_law_quantity_names(system, location)
     if not possible:
         places = (*segment_names(system), *arm_joint_names(system))
         what, choice = f"there is no location '{location}' for a law", unknown_name_error_arguments(location, places)
@@ -228,17 +236,17 @@ def make_law(location: str, system: System, tables: Sequence[LawTable], torque_s
             allowed, what = ", ".join(possible), f"a law at {location} cannot depend on '{table.quantity}'"
             raise ConfigError(what, where=label, allowed=allowed, hint="set depends_on to an allowed quantity")
         for k, (at, torque) in enumerate(zip(table.knots, table.torque, strict=True)):
-            said = f"torque at {at:.4g} {LAW_QUANTITY_UNITS[table.quantity]}"
+            said = f"torque at {at:.4g} {TORQUE_LAW_QUANTITY_UNITS[table.quantity]}"
             name, size = f"{table.quantity}{k}", min(torque_scale, 1e6)
             definitions.append(ParameterDefinition(name, "N m", 0.0, -math.inf, math.inf, (-size, size), said))
             entries.append(Parameter(f"{label}.{name}", float(torque), "N m", description=said))
     inner = {f"{label}.time": ca.SX.sym(f"{label}.time")} if any(t.quantity == "time" for t in tables) else {}
     knots = {table.quantity: np.asarray(table.knots, float) for table in tables}
-    return Law("law", location, Parameters(entries), inner, tuple(definitions), (), knots)
+    return TorqueLaw("law", location, Parameters(entries), inner, tuple(definitions), (), knots)
 
 
-def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ...]:
-    """Read a law's tables from a CSV file in the format of `law_tables_csv`.
+def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> tuple[TorqueLawTable, ...]:
+    """Read a law's tables from a CSV file in the format of `torque_law_tables_csv`.
 
     Raises `DataError` if the file is malformed, its knots are not evenly spaced and increasing, or its quantities
     differ from `depends_on`."""
@@ -269,15 +277,15 @@ def read_law_tables(path: Path, depends_on: LawDependence) -> tuple[LawTable, ..
         if len(knots) < 4 or np.any(gaps <= 0) or np.ptp(gaps) > _SPACING_RTOL * float(np.mean(gaps)):
             what, hint = f"the knots of {quantity} are not a grid", "interpolate the table at evenly spaced values"
             raise DataError(what, where=str(path), allowed="four or more evenly spaced, increasing numbers", hint=hint)
-        tables.append(LawTable(quantity, knots, torque, std))
+        tables.append(TorqueLawTable(quantity, knots, torque, std))
     return tuple(tables)
 
 
-def law_tables_csv(tables: Sequence[LawTable]) -> str:
-    """Return a law's tables as CSV text, which `read_law_tables` reads."""
+def torque_law_tables_csv(tables: Sequence[TorqueLawTable]) -> str:
+    """Return a law's tables as CSV text, which `read_torque_law_tables` reads."""
     lines = [",".join(_TABLE_COLUMNS)]
     for table in tables:
-        unit = LAW_QUANTITY_UNITS[table.quantity]
+        unit = TORQUE_LAW_QUANTITY_UNITS[table.quantity]
         for at, torque, std in zip(table.knots, table.torque, table.torque_std, strict=True):
             lines.append(f"{table.quantity},{unit},{at:.10g},{torque:.10g},{std:.6g}")
     return "\n".join(lines) + "\n"

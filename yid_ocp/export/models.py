@@ -199,7 +199,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
-        amplitudes, neutral = getattr(effect, "amplitude_names", ()), getattr(effect, "neutral_values", {})
+        amplitudes, neutral = getattr(effect, "amplitude_parameter_names", ()), getattr(effect, "neutral_values", {})
         if amplitudes and all(theta[name] == neutral[name] for name in amplitudes):
             found[label] = _NEUTRAL
         else:

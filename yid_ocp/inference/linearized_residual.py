@@ -78,7 +78,9 @@ class ResidualDerivativesAtNodes:
         parts: list[tuple[Array, ...]] = []
         functions = [course.model_functions.compiled_sensor_function(s.sensor) for s in course.measurements]
         pairs = zip(functions, course.measurements, strict=True)
-        readings = [function(course.state_values_at_nodes.at(s.evaluation_nodes), theta) for function, s in pairs]
+        readings = [
+            function(course.state_values_at_nodes.select_nodes(s.evaluation_nodes), theta) for function, s in pairs
+        ]
         n_forces, width = (step.sizes["m"], 4) if any(read.needs_neighbours for read in readings) else (0, 2)
         for samples, read in zip(course.measurements, readings, strict=True):
             used = samples.evaluation_nodes
@@ -153,7 +155,9 @@ class ResidualDerivativesAtNodes:
 _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
-def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
+def residual_and_jacobian_without_weak_priors(
+    problem: EstimationProblem, evaluation: Evaluation
+) -> tuple[Array, Array]:
     """Noise-scaled residual (r,) and Jacobian (r, nx) of the data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows

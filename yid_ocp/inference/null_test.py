@@ -157,7 +157,7 @@ def path_noise_spread(
     residual_of = predicted or evaluated
     before = residual_of(problem)
     points = {group.name for episode in problem.episodes for group in episode.recording.points}
-    rows = [c.residual_indices for c in residual_channel_indices(problem) if c.group in points]
+    rows = [c.residual_indices for c in residual_channels(problem) if c.group in points]
     moves_object = problem.system.prescribed and problem.system.unprescribed_coordinate_indices
     if before is None or not rows or not moves_object:
         return np.zeros((0 if before is None else len(before), 0))
@@ -192,11 +192,11 @@ def residuals_exceed_noise(
     tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
 ) -> bool:
     """Whether one model's residuals exceed noise by a significant and relevant amount, in at least one of `tests`."""
-    significant = min_bonferroni_p_value(tests) < limits.significance_level
+    significant = bonferroni_corrected_min_test_p_value(tests) < limits.significance_level
     return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2_per_dof
 
 
-def min_bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
+def bonferroni_corrected_min_test_p_value(tests: Sequence[NullTestResult]) -> float:
     """Bonferroni-corrected smallest p-value of several tests."""
     return min(1.0, len(tests) * min(test.p_value for test in tests))
 
@@ -242,7 +242,7 @@ def times_since_recording_start(episode: Episode, samples: SensorMeasurements) -
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
+def residual_channels(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
     """Sample times and residual indices of every scalar sensor output of every recording."""
     series: list[ResidualChannel] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):

@@ -31,7 +31,7 @@ from yid_ocp.inference.smoother_model import (
     LinearResidualModel,
     SmoothedUnknownGroup,
     SmootherThresholds,
-    recording_models_with_unknown_forces,
+    residual_models_with_unknown_forces,
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
@@ -333,7 +333,7 @@ def select_and_smooth_unknowns(
     """Choose and estimate the groups of unknowns with the largest evidence at a whitened fit `x`."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
-        models = recording_models_with_unknown_forces(problem, x, evaluation, limits)
+        models = residual_models_with_unknown_forces(problem, x, evaluation, limits)
         sources = tuple(dict.fromkeys(source for model in models for source in model.unknown_groups))
         none = dict.fromkeys(sources, 0.0)
         nothing = _run(models, none)

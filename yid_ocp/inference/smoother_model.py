@@ -259,7 +259,7 @@ class LinearResidualModel:
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 
-def recording_models_with_unknown_forces(
+def residual_models_with_unknown_forces(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,

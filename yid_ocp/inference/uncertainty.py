@@ -11,10 +11,10 @@ import numpy as np
 import scipy.special
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import (
     DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-    residual_channel_indices,
+    residual_channels,
     residual_chi2_null_test,
     residuals_exceed_noise,
 )
@@ -102,7 +102,7 @@ def assess_goodness_of_fit(
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
                 parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
         residual = np.concatenate(parts)
-    series = residual_channel_indices(problem)
+    series = residual_channels(problem)
     found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.no_data_issue_exceeds_warning)
@@ -117,7 +117,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
     spread, chi2 = unknowns_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
     scale = max(1.0, chi2)
-    priors = linearization_without_weak_priors(problem, evaluation)[1][problem.residual_rows.stated_priors]
+    priors = residual_and_jacobian_without_weak_priors(problem, evaluation)[1][problem.residual_rows.stated_priors]
     pull = spread @ (priors @ spread).T * math.sqrt(max(0.0, problem.options.stated_std_factor**-2 - scale))
     return spread @ spread.T * scale + pull @ pull.T, chi2
 
@@ -125,7 +125,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
     """Factor F (nx, nx) of the covariance F F' from noise alone; F F' itself loses digits in uninformed directions."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
-    _, jacobian = linearization_without_weak_priors(problem, evaluation)
+    _, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
     if len(vectors) < count:
         rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
@@ -135,7 +135,7 @@ def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluatio
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
     """Chi2 of the data per degree of freedom. Stated priors count as observations."""
-    residual, _ = linearization_without_weak_priors(problem, evaluation)
+    residual, _ = residual_and_jacobian_without_weak_priors(problem, evaluation)
     data = residual[problem.residual_rows.data]
     return float(data @ data) / max(len(residual) - len(problem.initial_unknowns), 1)
 
@@ -149,7 +149,7 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     enough, for constant errors such as a sensor offset; and whole recordings. The largest result counts."""
     if evaluation.jacobian is None or not len(covariance):
         return covariance
-    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
+    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     jacobian = jacobian * (scale := problem.unknown_scales)
     priors = jacobian[problem.residual_rows.stated_priors] / problem.options.stated_std_factor
     information = jacobian.T @ jacobian
@@ -193,7 +193,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     blocks: dict[tuple[str, int], list[IntArray]] = {}
     recordings: dict[str, list[IntArray]] = {}
     channels: list[list[IntArray]] = []
-    for series in residual_channel_indices(problem):
+    for series in residual_channels(problem):
         channels.append([series.residual_indices])
         recordings.setdefault(series.recording, []).append(series.residual_indices)
         at = (series.t / length).astype(int)
@@ -401,7 +401,7 @@ def parameter_estimates(
             std = math.inf
         elif side:
             # slope of the cost in units of the noise, which includes the misfit
-            residual, jacobian = linearization_without_weak_priors(problem, evaluation)
+            residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
             pull = std * abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
             # one-sided 95 % end: pull d/std + d^2/(2 std^2) = 2.71/2 at a distance d from the bound
             reach = std * (math.sqrt(pull**2 + _CHI2_95_ONE_SIDED) - pull)

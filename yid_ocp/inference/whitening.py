@@ -7,7 +7,7 @@ recording. Encoders have the error v. To first order, the error d of a rollout's
     d_{k+1} = (A_k - B_k K_k) d_k + B_k (G_k (w_k + b) - K_k v_k)      if they are not.
 
 du_k is the correction of the recorded torque by the tracking filter K_k. G_k is the derivative of the applied torque
-with respect to an error of the recorded torque (`applied_torque_by_torque_error`). In the first form du is known, and
+by an error of the recorded torque (`applied_torque_derivative_by_torque_error`). In the first form du is known, and
 the result does not depend on the tracking filter. In the second form the tracking filter is part of the model, because
 its reference is not a measurement. Residuals are r = H d + v. With the filter's prediction m of (d, w, b),
 
@@ -45,7 +45,7 @@ from yid_ocp.inference.linearized_residual import (
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import moving_observable_state_mask, step_derivatives_along_rollout
-from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
+from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -191,10 +191,10 @@ def _filter_steps(
         feedback = None
     elif feedback is not None:
         # momenta that the filter follows contain torques of the previous step
-        momentum = course.model_functions.effect_momentum_shift_functions.momentum_derivative_by_previous_torque(
+        momentum = course.model_functions.recorded_momentum_correction.momentum_derivative_by_previous_torque(
             course.theta
         )
-        driving = applied_torque_by_torque_error(feedback.gain, momentum)
+        driving = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
         # only errors of the filter's reference angles count; those of momenta average out
         shaken = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         inputs = np.concatenate([driving, shaken], axis=2)
@@ -306,7 +306,7 @@ def _behind_effects(
     return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=none - without)
 
 
-def problem_whitened_at(
+def problem_with_whitening_at(
     problem: EstimationProblem, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
 ) -> EstimationProblem:
     """Return a problem whose residuals are whitened by sensor and process noise, linearized at `x`.
@@ -329,7 +329,7 @@ def problem_whitened_at(
     if any(m is None and e.input_errors is not None for m, e in zip(made, episodes, strict=True)):
         return problem
     found = problem.with_episodes(episodes, problem.held_out, made)
-    return found if rounds < 2 else problem_whitened_at(found, x, equilibrium_guesses, rounds - 1)
+    return found if rounds < 2 else problem_with_whitening_at(found, x, equilibrium_guesses, rounds - 1)
 
 
 def problem_with_whitened_held_out(
@@ -371,7 +371,7 @@ def problem_with_relinearized_held_out_whitening(
     return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
 
 
-def problem_whitened_by_sensor_noise(problem: EstimationProblem) -> EstimationProblem:
+def problem_with_sensor_noise_only(problem: EstimationProblem) -> EstimationProblem:
     """Whiten a problem by sensor noise alone. Torque offsets estimated so far are kept."""
     return _with_errors(problem, lambda errors: errors.torque_bias_part)
 
@@ -393,7 +393,7 @@ def _with_errors(
 def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
     """Estimate the constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
 
-    The entry of a recording is None if its torques are exact, or if it has no whitening filter (`problem_whitened_at`).
+    An entry is None if torques are exact, or without a whitening filter (`problem_with_whitening_at`).
     """
     x = np.asarray(x, float)
     found: list[tuple[Array, Array] | None] = []

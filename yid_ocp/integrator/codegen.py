@@ -75,8 +75,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
-    if e.impulses_of_force_with_derivatives is not None:
-        bodies = [part + push for part, push in zip(bodies, e.impulses_of_force_with_derivatives, strict=True)]
+    if e.closed_form_force_impulses is not None:
+        bodies = [part + push for part, push in zip(bodies, e.closed_form_force_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)
@@ -233,7 +233,7 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
     return StepSparsityTables(unknown_row, order, tuple(fill), ancestors, *varying)
 
 
-def kernel_source_text(functions: StepFunctions, tables: StepSparsityTables) -> str:
+def kernel_cache_key_text(functions: StepFunctions, tables: StepSparsityTables) -> str:
     """Collect the text that identifies a kernel in the cache: generators, index tables and serialized equations."""
     folder = resources.files("yid_ocp.integrator")
     files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]

@@ -292,7 +292,7 @@ def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and its number of members. None if compiler or processor do not support it."""
     parts = model.functions, model.index_tables
     source = functools.partial(codegen.kernel_c_source, *parts, batched=True)
-    library = compiler.compile_and_load_library(f"batched\0{codegen.kernel_source_text(*parts)}", source)
+    library = compiler.compile_and_load_library(f"batched\0{codegen.kernel_cache_key_text(*parts)}", source)
     count = 0 if library is None else int(library.yid_simd_width())
     return None if library is None or not count else (library, count)
 

@@ -195,7 +195,7 @@ def compile_step(
     if use_compiler:
         parts = model.functions, model.index_tables
         source = functools.partial(codegen.kernel_c_source, *parts)
-        library = compiler.compile_and_load_library(codegen.kernel_source_text(*parts), source)
+        library = compiler.compile_and_load_library(codegen.kernel_cache_key_text(*parts), source)
     if library is None:
         return Step(model, InterpretedKernel(model), is_compiled=False)
     return Step(model, CompiledKernel(model, library), is_compiled=True)

@@ -157,7 +157,7 @@ class JointMotionWithSensitivities:
         return _one_before(self.angles[:-1]), self.angles[:-1]
 
 
-class EffectMomentumShift:
+class RecordedMomentumCorrection:
     """Computes the momentum that effects add to the recorded motion, so that the feedback does not oppose it.
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
@@ -280,12 +280,12 @@ class EffectMomentumShift:
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 
-def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
+def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> Array:
     """Derivative of the applied torque (recorded plus feedback) with respect to an error of the recorded torque.
 
     The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
     is assumed to be the same in this step and the previous step. `gain` (..., nu, nb) is the feedback gain of the step.
-    `by_torque` (nu, nu) is `EffectMomentumShift.momentum_derivative_by_previous_torque`."""
+    `by_torque` (nu, nu) is `RecordedMomentumCorrection.momentum_derivative_by_previous_torque`."""
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
 

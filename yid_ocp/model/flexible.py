@@ -66,7 +66,7 @@ class Segment:
     """Rotation axes of each joint, base to tip. About the other axes the segment is rigid."""
     cross_section_size: tuple[float, float] | None = None
     """Side lengths of a rectangular cross-section along the links' x and y axes [m]."""
-    has_link_length_parameters: bool = False
+    has_length_parameter_per_link: bool = False
     """Whether each link has a length parameter, for markers that move between recordings; masses do not change."""
     clamped_edge_length: float | None = None
     """Length of a flexible edge that a clamp keeps straight before a root segment [m]. With
@@ -161,7 +161,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
     parts.parameters.extend(own.values())
     mass, shares = own["mass"].symbol, _length_shares(segment)
     square_x, square_y, radius = _cross_section(own)
-    if segment.has_link_length_parameters:
+    if segment.has_length_parameter_per_link:
         lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
     else:
         lengths = tuple(own["length"].symbol * share for share in shares)
@@ -255,7 +255,7 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
     length = segment.length if segment.link_lengths is None else float(np.sum(segment.link_lengths))
     small, shares = 1e-9, enumerate(_length_shares(segment))
     rows = [("length", length, "m", small, "length of the segment")]
-    if segment.has_link_length_parameters:
+    if segment.has_length_parameter_per_link:
         rows = [(f"length_{i}", length * share, "m", small, f"length of link {i}") for i, share in shares]
     rows.append(("mass", segment.mass, "kg", small, "mass of the segment"))
     if segment.radius is not None:

@@ -27,7 +27,7 @@ from yid_ocp.planning.motion_search import (
     MotionSearchResult,
     PlanResidualAndLimitFunctions,
 )
-from yid_ocp.planning.planned_experiment import ParameterizedExperiment
+from yid_ocp.planning.planned_experiment import SplineMotionExperiment
 from yid_ocp.problem import EstimationProblem
 
 _UNOBSERVABLE_STDS = 1e-2  # [data stds], for a change of a parameter by its whole value; below, it is unobservable
@@ -92,9 +92,9 @@ def plan_informative_motion(
         recordings = [episode.recording for episode in problem.episodes]
         extra, step = [name for e in rivals for name in e.parameters.names], compile_step_like(problem.step, system)
         composed = EstimationProblem(step, recordings, problem.free, problem.options, known, (), extra)
-    names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_names))
+    names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_parameter_names))
     shapes = {name: e.parameters[name].value for e in rivals for name in e.shape_parameter_names}
-    experiment = ParameterizedExperiment.from_options(composed, known | shapes, options, names)
+    experiment = SplineMotionExperiment.from_options(composed, known | shapes, options, names)
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
     points = FramePositionEvaluator(system, system.point_frames)
     limits = PlanResidualAndLimitFunctions(experiment.simulator, options, points, np.zeros(3), still)
@@ -160,7 +160,7 @@ def _effects(
 
 
 def _criterion(
-    experiment: ParameterizedExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
+    experiment: SplineMotionExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
 ) -> DOptimalityOrDiscriminationCriterion:
     columns = [name.split("[")[0] for name in experiment.sensitivity_column_names]
     parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
@@ -168,7 +168,7 @@ def _criterion(
         return DOptimalityCriterion(tuple(i for i, name in enumerate(columns) if name in chosen), parameters)
     places, sizes = [], []
     for effect in rivals:
-        own = tuple(columns.index(name) for name in effect.amplitude_names)
+        own = tuple(columns.index(name) for name in effect.amplitude_parameter_names)
         places.append(own)
         sizes.append(_size(effect) / experiment.unknown_scales[list(own)][:, None])
     return EffectDiscriminationCriterion(tuple(places), tuple(sizes), parameters)
@@ -177,10 +177,12 @@ def _criterion(
 def _size(effect: EffectBase) -> Array:
     """Amplitudes of an effect relative to neutral: the known ones together, else half of each range, one at a time."""
     neutral = effect.neutral_values
-    known = np.array([effect.parameters[name].value - neutral[name] for name in effect.amplitude_names])
+    known = np.array([effect.parameters[name].value - neutral[name] for name in effect.amplitude_parameter_names])
     if np.any(known):
         return known[:, None]
-    half = [(effect.prior_ranges[name][1] - effect.prior_ranges[name][0]) / 2 for name in effect.amplitude_names]
+    half = [
+        (effect.prior_ranges[name][1] - effect.prior_ranges[name][0]) / 2 for name in effect.amplitude_parameter_names
+    ]
     return np.diag(half)
 
 
@@ -193,7 +195,9 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
             allowed = "positions within the limits of the joints"
             hint = "set plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
-    broken = limits.worst_violated_row_by_limit(limits.limited_quantity_values(mover.simulate_path(still), still)[0])
+    broken = limits.worst_value_and_bound_by_violated_limit(
+        limits.limited_quantity_values(mover.simulate_path(still), still)[0]
+    )
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{name}: {x:.4g}, limit {bound:.4g}, {what}" for what, name, x, bound in parts)
@@ -202,11 +206,11 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
         raise ConfigError(what, where="plan.limits", allowed=allowed, hint=hint)
 
 
-def _random(experiment: ParameterizedExperiment, seed: int) -> Array:
+def _random(experiment: SplineMotionExperiment, seed: int) -> Array:
     return _RANDOM_COEFFICIENT_STD * np.random.default_rng(seed).normal(size=experiment.zero_coefficients.shape)
 
 
-def _smooth(experiment: ParameterizedExperiment, w: Array) -> tuple[Array, Array | None]:
+def _smooth(experiment: SplineMotionExperiment, w: Array) -> tuple[Array, Array | None]:
     """Scale a motion down until its sensitivities change smoothly with it. Returns the motion and its sensitivities."""
     for _ in range(10):
         rows = experiment.search_problem_sensitivities(w)
@@ -221,7 +225,7 @@ def _is_near(there: Array, rows: Array) -> bool:
     return bool(np.linalg.norm(there - rows) <= _MAX_RELATIVE_SENSITIVITY_CHANGE * np.linalg.norm(rows))
 
 
-def _unseen(experiment: ParameterizedExperiment, told: Sequence[Array | None]) -> dict[str, float]:
+def _unseen(experiment: SplineMotionExperiment, told: Sequence[Array | None]) -> dict[str, float]:
     """Parameters to which no measurement of any motion is sensitive, with the largest sensitivity of each [stds]."""
     largest = np.zeros(len(experiment.sensitivity_column_names))
     for rows in told:
@@ -236,7 +240,7 @@ def _check_seen(
     chosen: Sequence[str],
     rivals: Sequence[EffectBase],
     unseen: Mapping[str, float],
-    experiment: ParameterizedExperiment,
+    experiment: SplineMotionExperiment,
 ) -> None:
     lost = [name for name in chosen if name in unseen]
     if chosen and len(lost) == len(chosen):
@@ -246,13 +250,13 @@ def _check_seen(
         hint = "; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost)
         raise ConfigError(what, where="plan.identify", allowed="a parameter that changes readings", hint=hint)
     for effect in rivals:
-        if all(name in unseen for name in effect.amplitude_names):
+        if all(name in unseen for name in effect.amplitude_parameter_names):
             what = f"{effect.label} is unobservable: its first-order sensitivity is zero in every sensor"
             allowed, hint = "effects that change readings", "add a sensor whose readings it changes, or leave it out"
             raise ConfigError(what, where="plan.discriminate", allowed=allowed, hint=hint)
 
 
-def _would_see(experiment: ParameterizedExperiment, name: str, w: Array) -> str:
+def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
     """Sentence on a sensor that would observe a parameter."""
     mover, n = experiment.simulator, experiment.simulator.step.system.n_coordinates
     wide, seen = extended_step_and_observable_frames(mover.step)
@@ -275,7 +279,7 @@ def _would_see(experiment: ParameterizedExperiment, name: str, w: Array) -> str:
 
 
 def _plan(
-    experiment: ParameterizedExperiment,
+    experiment: SplineMotionExperiment,
     limits: PlanResidualAndLimitFunctions,
     search: InformativeMotionSearch,
     criterion: DOptimalityOrDiscriminationCriterion,
@@ -314,7 +318,7 @@ def _plan(
 
 
 def _judged(
-    experiment: ParameterizedExperiment, criterion: DOptimalityOrDiscriminationCriterion, found: MotionSearchResult
+    experiment: SplineMotionExperiment, criterion: DOptimalityOrDiscriminationCriterion, found: MotionSearchResult
 ) -> float:
     try:
         rows = experiment.configured_problem_sensitivities(found.w)
@@ -323,9 +327,7 @@ def _judged(
     return criterion.value_and_gradient_by_sensitivities(rows, False)[0]
 
 
-def _parameters(
-    experiment: ParameterizedExperiment, w: Array
-) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:
+def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:
     """Parameter precisions from the recordings, the plan and both, and the directions left unidentifiable."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
@@ -346,7 +348,7 @@ def _parameters(
 
 
 def _distances(
-    experiment: ParameterizedExperiment,
+    experiment: SplineMotionExperiment,
     criterion: DOptimalityOrDiscriminationCriterion,
     rivals: Sequence[EffectBase],
     w: Array,

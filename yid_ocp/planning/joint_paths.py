@@ -140,7 +140,7 @@ _N_REST_CONTROL_POINTS = 3  # equal control points at each end, for zero velocit
 
 
 @dataclass(frozen=True)
-class SplinePath:
+class RestToRestSplineBasis:
     """Spline path of joints between standstills: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
     The coefficients w_k are the control points. The spline has degree 5 and clamped ends. The path and its derivatives
@@ -185,7 +185,7 @@ class PathSimulator:
     step: Step  # all moving joints are prescribed, none is driven
     theta: Array  # (ntheta,)
     start_equilibrium: Equilibrium
-    path: SplinePath
+    path: RestToRestSplineBasis
     hold_duration: float  # time for which the joints stand still at the end [s]
 
     @property

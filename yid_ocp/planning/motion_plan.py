@@ -21,7 +21,7 @@ from yid_ocp.planning.joint_paths import (
     PathSimulator,
     PlannedMotion,
     PlanOptions,
-    SplinePath,
+    RestToRestSplineBasis,
     check_standstill_limits,
     solve_equilibrium_at_point_target,
     solve_start_equilibrium,
@@ -83,7 +83,7 @@ def plan_motion_to_target(
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
     progress.begin_stage("finding where the motion begins and ends")
     start = solve_start_equilibrium(step, values, _posture(system, options, values))
-    path = SplinePath(options.duration, options.n_spline_coefficients)
+    path = RestToRestSplineBasis(options.duration, options.n_spline_coefficients)
     mover = PathSimulator(step, values, start, path, options.hold_duration)
     point, inside = _points(system, options)
     place = _place(options, mover.frame_positions_along_states(point, start.state[None])[0, 0])
@@ -251,7 +251,7 @@ def _outcome(
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
     course = rows.point_reference_trajectory
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
-    broken = rows.worst_violated_row_by_limit(rows.limited_quantity_values(rollout, shot.w)[0])
+    broken = rows.worst_value_and_bound_by_violated_limit(rows.limited_quantity_values(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
         message += f"; {name} passes its limit of {what}: {value:.4g} where {bound:.4g} is allowed"

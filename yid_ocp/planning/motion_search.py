@@ -26,7 +26,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions, memoize_last_call
-from yid_ocp.planning.planned_experiment import ParameterizedExperiment
+from yid_ocp.planning.planned_experiment import SplineMotionExperiment
 
 _LIMIT_NODE_STRIDE = 2  # node spacing at which limits on free coordinates are evaluated
 _QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]
@@ -154,7 +154,7 @@ class PlanResidualAndLimitFunctions:
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
-    def worst_violated_row_by_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
+    def worst_value_and_bound_by_violated_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
         """For each violated kind of limit: name, value and bound of its worst row."""
         found = {}
         for rows, own in self.split_values_by_limit_kind(value):
@@ -368,7 +368,7 @@ class InformativeMotionSearch:
 
     def __init__(
         self,
-        experiment: ParameterizedExperiment,
+        experiment: SplineMotionExperiment,
         limits: PlanResidualAndLimitFunctions,
         criterion: DOptimalityOrDiscriminationCriterion,
     ) -> None:

@@ -19,15 +19,15 @@ from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, failed_rollout_error
-from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.whitening import problem_whitened_at
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.planning.joint_paths import (
     FramePositionEvaluator,
     PathSimulator,
     PlanOptions,
-    SplinePath,
+    RestToRestSplineBasis,
     solve_start_equilibrium,
     start_joint_positions_as_array,
 )
@@ -46,7 +46,7 @@ _SPLINE_DIFFERENCE_STEP = 1e-5  # difference step of a motion's coefficient [rad
 
 
 @dataclass(frozen=True, eq=False)
-class ParameterizedExperiment:
+class SplineMotionExperiment:
     """A planned experiment whose predicted recording and sensitivities depend on spline coefficients w (K, nc)."""
 
     configured_problem: EstimationProblem  # from the settings; its first recording defines sensors, noise and rates
@@ -57,7 +57,7 @@ class ParameterizedExperiment:
     @staticmethod
     def from_options(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
-    ) -> ParameterizedExperiment:
+    ) -> SplineMotionExperiment:
         """Make a planned experiment from a plan's options, at parameter `values` and with the free parameters `names`.
 
         Raises `ConfigError` if there is no joint whose motion can be planned, or if the arms have servos. Raises
@@ -77,10 +77,10 @@ class ParameterizedExperiment:
         first = np.array(episode.initial_known_coordinates)
         if options.start_joint_positions is not None:
             first = start_joint_positions_as_array(step.system, options.start_joint_positions)
-        path = SplinePath(options.duration, options.n_spline_coefficients)
+        path = RestToRestSplineBasis(options.duration, options.n_spline_coefficients)
         mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
         _check_long_enough(problem, float(mover.node_times[-1]))
-        return ParameterizedExperiment(problem, known, mover, tuple(names) or problem.free)
+        return SplineMotionExperiment(problem, known, mover, tuple(names) or problem.free)
 
     def _noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
         """Noise-free predicted recording of a motion; points above the rate `fastest` [Hz] are thinned."""
@@ -181,7 +181,7 @@ class ParameterizedExperiment:
         return self._weighted(problem.with_free_parameters_without_recompiling(self.free_parameters))
 
     def _weighted(self, problem: EstimationProblem) -> Array:
-        problem = problem_whitened_at(problem, problem.initial_unknowns)
+        problem = problem_with_whitening_at(problem, problem.initial_unknowns)
         evaluation = problem.evaluate(problem.initial_unknowns)
         if not evaluation.ok:
             raise failed_rollout_error(evaluation.message, "planned motion, with its torques")
@@ -189,7 +189,7 @@ class ParameterizedExperiment:
 
     def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
         """Sensitivities to relative changes, without the prior information on parameters."""
-        jacobian = linearization_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
+        jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
         jacobian[problem.residual_rows.stated_priors] *= ~own
         return jacobian

@@ -131,7 +131,7 @@ class EpisodePredictor:
                 none = np.zeros((nx, len(wanted) + len(rows)))
                 return InitialStateWithSensitivity(rest.state, none, rest, f"{episode.name}: {rest.message}")
             state = rest.state.copy()
-            by_known = inputs.initial_known_coordinates_sensitivity(len(wanted))
+            by_known = inputs.initial_known_coordinate_derivatives(len(wanted))
             by_theta = rest.state_by_theta + rest.state_by_known_coordinates @ by_known
             if inputs.first_torque_sensitivity is not None:
                 by_theta += rest.state_by_torque @ inputs.first_torque_sensitivity
@@ -140,12 +140,12 @@ class EpisodePredictor:
 
     def has_no_input_corrections(self, episode: Episode, theta: Array) -> bool:
         """Whether all effects that correct the episode's inputs, times or tracked reference are neutral and fixed."""
-        wanted = self.unknowns.free_parameters
+        wanted = self.unknowns.free_parameter_names
         inputs = self.corrected_inputs(episode, theta, wanted)
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
         recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
-        if self._follows_momenta and self.model_functions.effect_momentum_shift_functions.is_active(theta, wanted):
+        if self._follows_momenta and self.model_functions.recorded_momentum_correction.is_active(theta, wanted):
             return False
         slopes += self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
@@ -171,7 +171,7 @@ class EpisodePredictor:
         rows = slice(2 * self.system.n_coordinates, None)
         recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
-        shift, measured = self.model_functions.effect_momentum_shift_functions, episode.measured_driven_angles
+        shift, measured = self.model_functions.recorded_momentum_correction, episode.measured_driven_angles
         return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
@@ -231,7 +231,9 @@ class EpisodePredictor:
             pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 
-        width = len(self.unknowns.free_parameters) + len(self.estimated_initial_state_indices) if derivatives else 0
+        width = (
+            len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices) if derivatives else 0
+        )
         each = [8 * (episode.grid.steps + 1) * self.integrator_step.sizes["nx"] * (width + 1) for episode, *_ in asked]
         found: list[EpisodePrediction | str] = []
         while len(found) < len(asked):
@@ -244,7 +246,7 @@ class EpisodePredictor:
         self, episode: Episode, theta: Array, offset: Array, guess: Array | None, derivatives: bool
     ) -> _Prepared | str:
         """Initial state and inputs of an episode's rollout, or an error message."""
-        wanted = self.unknowns.free_parameters if derivatives else ()
+        wanted = self.unknowns.free_parameter_names if derivatives else ()
         theta = self.theta_with_episode_values(episode, theta)
         start = self.initial_state_of_episode(episode, theta, offset, wanted, guess)
         if start.failure_message:
@@ -255,7 +257,7 @@ class EpisodePredictor:
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
-            by_torque = inputs.nominal_torque_sensitivity(feedback, driven, width)
+            by_torque = inputs.nominal_torque_derivatives(feedback, driven, width)
             by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
         feedback = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
@@ -305,7 +307,7 @@ class EpisodePredictor:
 
         `by_state` (N + 1, nx, d) is the derivative of the trajectory; its first columns are the free parameters."""
         read = _Trajectory(TimeGridStateValues.from_trajectory(self.integrator_step, state), by_state, None, None, None)
-        y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
+        y, total = self._read(samples, read, theta, self.unknowns.free_parameter_names)
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
     def state_values_at_nodes(self, rollout: Rollout) -> TimeGridStateValues:
@@ -375,7 +377,9 @@ class EpisodePredictor:
     ) -> tuple[Array, Array]:
         """Readings (nodes, k) at the samples' nodes, and their derivatives (nodes, k, d) in d directions."""
         n, nodes = self.system.n_coordinates, samples.evaluation_nodes
-        read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(along.values.at(nodes), theta)
+        read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(
+            along.values.select_nodes(nodes), theta
+        )
         if along.by_state is None:
             return read.output, np.zeros((*read.output.shape, 0))
         total = read.by_q @ along.by_state[nodes, :n]
@@ -391,7 +395,7 @@ class EpisodePredictor:
                 total += by_load @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
         if read.by_lam.shape[2]:
             if along.by_multipliers is None:
-                raise node_state_sensor_error(samples.sensor.group_name)
+                raise sensor_not_predictable_at_nodes_error(samples.sensor.group_name)
             last = np.minimum(nodes, len(along.by_multipliers) - 1)
             total += read.by_lam @ along.by_multipliers[last] / self.integrator_step.time_step
         total[:, :, : len(wanted)] += read.by_theta
@@ -403,7 +407,7 @@ class EpisodePredictor:
         """Gradient of a cost of one episode's predictions, with respect to its (shared, local, initial state) unknowns.
 
         `result` holds the predictions, `pulls` (M, k) the derivatives of the cost with respect to each prediction."""
-        wanted, rollout = self.unknowns.free_parameters, result.rollout
+        wanted, rollout = self.unknowns.free_parameter_names, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
         pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}
         total, read = np.zeros(len(wanted)), self.state_values_at_nodes(self._recorded(episode, rollout, theta, ()))
@@ -425,7 +429,7 @@ class EpisodePredictor:
         start = self.initial_state_of_episode(episode, theta, offset, wanted, result.equilibrium_guess)
         inputs = self.inputs_with_effect_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
-        by_torque = inputs.nominal_torque_sensitivity(feedback, self.system.driven_coordinate_indices, len(own))
+        by_torque = inputs.nominal_torque_derivatives(feedback, self.system.driven_coordinate_indices, len(own))
         if by_torque is not None:
             own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.prescribed_path_sensitivity is not None:
@@ -443,12 +447,12 @@ class EpisodePredictor:
         pulled: dict[str, Array],
     ) -> Array:
         """Add the adjoint of one sensor's samples to `pulled`. Returns the direct derivative by the parameters."""
-        n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
+        n, wanted = self.system.n_coordinates, self.unknowns.free_parameter_names
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
             samples = samples.shifted_earlier_by_steps(late[0])
         at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_nodes
-        read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(values.at(nodes), theta)
+        read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(values.select_nodes(nodes), theta)
         direct = np.einsum("mk,mkq->q", at_nodes, read.by_theta)
         if late is not None:
             direct -= np.sum(pull * samples.prediction_change_per_step(read.output, unmoved, late[0]), axis=0) @ late[1]
@@ -482,7 +486,9 @@ class _Trajectory:
     by_multipliers: Array | None
 
 
-def with_seen_equilibrium_and_denoised_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+def with_observed_equilibrium_and_denoised_loads(
+    predictor: EpisodePredictor, episode: Episode, theta: Array
+) -> Episode:
     """Start an episode at the equilibrium near its first points, and remove effort noise from gear loads."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
@@ -533,7 +539,9 @@ def _error(
     state = start.state[None]
     squares: list[Array] = []
     for samples in seen:
-        read = predictor.model_functions.compiled_sensor_function(samples.sensor, predictor.unknowns.free_parameters)
+        read = predictor.model_functions.compiled_sensor_function(
+            samples.sensor, predictor.unknowns.free_parameter_names
+        )
         predicted = read(TimeGridStateValues.from_trajectory(predictor.integrator_step, state), theta).output
         squares.append(samples.whitened_residual(predicted)[samples.positive_weight_mask] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))
@@ -557,7 +565,7 @@ def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epis
     return replace(episode, joint_loads=load)
 
 
-def node_state_sensor_error(group: str) -> SolverError:
+def sensor_not_predictable_at_nodes_error(group: str) -> SolverError:
     """Make the `SolverError` for a sensor whose readings do not follow from the states at nodes."""
     what = f"multiple shooting cannot use '{group}', which measures velocities, accelerations or constraint forces"
     hint = f"set solver.name: gauss_newton, or sensors.{group}.use: false"

@@ -15,7 +15,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
-from yid_ocp.problem.episode_prediction import EpisodePredictor, with_seen_equilibrium_and_denoised_loads
+from yid_ocp.problem.episode_prediction import EpisodePredictor, with_observed_equilibrium_and_denoised_loads
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
@@ -109,7 +109,7 @@ class EstimationProblem(ReprMixin):
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
         ready, other = (
-            tuple(with_seen_equilibrium_and_denoised_loads(self.predictor, e, theta) for e in group)
+            tuple(with_observed_equilibrium_and_denoised_loads(self.predictor, e, theta) for e in group)
             for group in (fitted, others)
         )
         self._set(functions, options, tuple(free), theta, ready, other)
@@ -206,7 +206,7 @@ class EstimationProblem(ReprMixin):
     @property
     def initial_state_prior_std(self) -> Array:
         """Prior standard deviations of the estimated initial state components, ordered as `initial_state_names`."""
-        at = len(self.unknowns.free_parameters)
+        at = len(self.unknowns.free_parameter_names)
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
     @property
@@ -307,7 +307,7 @@ class EstimationProblem(ReprMixin):
         `guess` (n,) is a configuration near the equilibrium."""
         own = self.predictor.theta_with_episode_values(episode, theta)
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
-        return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameters, guess)
+        return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameter_names, guess)
 
     def predict_held_out(
         self, x: ArrayLike, derivatives: bool = False
@@ -460,7 +460,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
         guess = result.equilibrium_guess
         rows, slopes = [weight * offset], [np.diag(weight)]
         for k, samples in enumerate(short.measurements):
-            by_start = result.output_sensitivities[k][:, :, len(predictor.unknowns.free_parameters) :]
+            by_start = result.output_sensitivities[k][:, :, len(predictor.unknowns.free_parameter_names) :]
             part = samples.residual_and_jacobian(result.predicted_outputs[k], by_start)
             rows.append(part.residual)
             slopes += [] if part.jacobian is None else [part.jacobian]

@@ -21,7 +21,7 @@ from yid_ocp.problem.measurements import (
     ResidualAndJacobian,
     SensorMeasurements,
     huber_loss_and_residual_factors,
-    whitened_for_sensor_biases,
+    whiten_against_sensor_biases,
     whitened_measurement_sensitivities_to_biases,
 )
 from yid_ocp.problem.options import ProblemOptions
@@ -121,7 +121,7 @@ def whitened_episode_residual(
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
-    Constant sensor errors count as noise (`whitened_for_sensor_biases`). `threshold` is the Huber threshold."""
+    Constant sensor errors count as noise (`whiten_against_sensor_biases`). `threshold` is the Huber threshold."""
     by_constants = whitened_measurement_sensitivities_to_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
@@ -136,13 +136,13 @@ def whitened_episode_residual(
         innovations, _ = whitening.whiten_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
-        columns = whitened_for_sensor_biases(by_constants, columns)
+        columns = whiten_against_sensor_biases(by_constants, columns)
     cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
 
 
-INITIAL_STATE_PREFIX = "start."
+INITIAL_STATE_UNKNOWN_PREFIX = "start."
 SOFT_LOGARITHM_MIN_RATIO = 1e-3
 """Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
 
@@ -159,12 +159,12 @@ class UnknownVectorLayout:
     @cached_property
     def unknown_names(self) -> tuple[str, ...]:
         """Names of all unknowns. Local parameters and initial states include the recording's name."""
-        own = [*self.local_parameters, *(f"{INITIAL_STATE_PREFIX}{name}" for name in self.initial_state_names)]
+        own = [*self.local_parameters, *(f"{INITIAL_STATE_UNKNOWN_PREFIX}{name}" for name in self.initial_state_names)]
         each = (f"{name}[{recording}]" for recording in self.recording_names for name in own)
         return (*self.shared_parameters, *each)
 
     @property
-    def free_parameters(self) -> tuple[str, ...]:
+    def free_parameter_names(self) -> tuple[str, ...]:
         """Names of the free parameters, shared then local: the order of one recording's derivative columns."""
         return (*self.shared_parameters, *self.local_parameters)
 
@@ -185,9 +185,9 @@ class UnknownVectorLayout:
         """Copy of `theta` with one recording's values from `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
         result = theta.copy()
-        for name, value in zip(self.free_parameters, own, strict=False):
+        for name, value in zip(self.free_parameter_names, own, strict=False):
             result[system.parameters.index(name)] = value
-        return result, own[len(self.free_parameters) :]
+        return result, own[len(self.free_parameter_names) :]
 
     def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
         """Pack an unknown vector with the same local parameters and initial state offset for all recordings."""
@@ -209,13 +209,13 @@ def stated_prior_stds(
     known = dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)).tolist(), strict=True))
     for name in unknowns.unknown_names:
         base = name.split("[")[0]
-        if base.startswith(f"{INITIAL_STATE_PREFIX}q."):
+        if base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}q."):
             stds.append(options.initial_configuration_std)
-        elif base.startswith(f"{INITIAL_STATE_PREFIX}p."):
-            mass = float(inertia((base.removeprefix(f"{INITIAL_STATE_PREFIX}p."),))[0])
+        elif base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}p."):
+            mass = float(inertia((base.removeprefix(f"{INITIAL_STATE_UNKNOWN_PREFIX}p."),))[0])
             stds.append(options.initial_velocity_std * max(mass, 1e-9))
-        elif base.startswith(f"{INITIAL_STATE_PREFIX}z."):
-            stds.append(limits[base.removeprefix(f"{INITIAL_STATE_PREFIX}z.")] / math.sqrt(3))
+        elif base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}z."):
+            stds.append(limits[base.removeprefix(f"{INITIAL_STATE_UNKNOWN_PREFIX}z.")] / math.sqrt(3))
         else:
             stds.append(known.get(name, float(options.prior_stds.get(base, np.inf))))
     return np.array(stds)
@@ -250,7 +250,7 @@ def estimated_initial_state_names(
     for effect in system.effects:
         if isinstance(effect, EffectBase) and effect.max_abs_unknown_initial_states:
             index = system.parameters.index
-            names = effect.amplitude_names
+            names = effect.amplitude_parameter_names
             if any(name in free or theta[index(name)] != effect.neutral_values[name] for name in names):
                 found += [f"z.{name}" for name in effect.max_abs_unknown_initial_states]
     return tuple(found)

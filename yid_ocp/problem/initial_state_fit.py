@@ -15,7 +15,7 @@ from yid_ocp.integrator.statics import steady_effect_internal_coordinates
 from yid_ocp.integrator.step import Step, generalized_momentum_from_velocity
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.objects.cable import START_ANGLE_AND_LOAD_SUFFIXES, START_SPEED_PARAMETER_NAME
+from yid_ocp.model.objects.cable import START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES, START_SPEED_PARAMETER_NAME
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import Sensor, sensor_reading_function
@@ -97,7 +97,7 @@ class InitialStateFitter:
         self._presets = tuple(
             (index, spring.joint_name)
             for index, spring in zip(at, system.elastic_joints, strict=True)
-            if f"{spring.joint_name}.{START_ANGLE_AND_LOAD_SUFFIXES[0]}" in system.parameters
+            if f"{spring.joint_name}.{START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES[0]}" in system.parameters
         )
         loads = [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
         self._load = ca.Function("load", e.arguments, loads)
@@ -183,7 +183,7 @@ class InitialStateFitter:
         columns = np.array(ca.densify(pull))[:, at].T
         reaction = np.linalg.lstsq(weight[:, None] * columns, weight * (stiffness[at] * q[at] - free), rcond=None)[0]
         load = free + columns @ reaction
-        angle_suffix, load_suffix = START_ANGLE_AND_LOAD_SUFFIXES
+        angle_suffix, load_suffix = START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES
         angles = {f"{joint}.{angle_suffix}": float(q[index]) for index, joint in self._presets}
         loads = zip(self._presets, load, strict=True)
         return angles | {f"{joint}.{load_suffix}": float(value) for (_, joint), value in loads}

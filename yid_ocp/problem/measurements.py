@@ -98,7 +98,7 @@ class SensorMeasurements:
         return bool(np.any(self.bias_std > 0)) or self.change_by_clock is not None
 
     @property
-    def error_directions(self) -> Array:
+    def output_changes_per_error_std(self) -> Array:
         """Change (M, k, m) of the outputs by one std of each constant error and of the clock offset."""
         own = self.bias_std * np.eye(len(self.bias_std))[self.bias_std > 0]
         constant = np.broadcast_to(own.T, (len(self.value), *own.T.shape))
@@ -271,7 +271,7 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
     return float(np.sum(cost)), factor
 
 
-def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
+def whiten_against_sensor_biases(slopes: Array, columns: Array) -> Array:
     """Whiten a residual and its derivatives, already in units of noise, against constant sensor errors as well.
 
     The first column of `columns` (r, c) is the residual, all other columns are its derivatives. `slopes` (r, m) are the
@@ -290,7 +290,7 @@ def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasure
     """Derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
 
     Derivatives of the residual, prediction minus measurement, have the opposite sign."""
-    parts = [s.weight[:, :, None] * s.error_directions for s in samples]
+    parts = [s.weight[:, :, None] * s.output_changes_per_error_std for s in samples]
     count, before = sum(part.shape[2] for part in parts), 0
     found = np.zeros((sum(s.n_residuals for s in samples), count))
     rows = 0
@@ -313,7 +313,7 @@ def subtract_estimated_biases(
     left = _estimated_constant_errors(slopes, residual)
     made = []
     for s in samples:
-        directions = s.error_directions
+        directions = s.output_changes_per_error_std
         own, left = left[: directions.shape[2]], left[directions.shape[2] :]
         none = np.zeros_like(s.bias_std)
         made.append(replace(s, value=s.value - directions @ own, bias_std=none, change_by_clock=None))

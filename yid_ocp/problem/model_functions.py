@@ -15,8 +15,8 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, copy_of_step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
-    EffectMomentumShift,
     JointMotionWithSensitivities,
+    RecordedMomentumCorrection,
     compile_driven_arms_only_step,
 )
 from yid_ocp.model.system import System
@@ -45,7 +45,7 @@ class CorrectedInputs:
         """Coordinates (nk,) of driven, then prescribed joints at node 0."""
         return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
 
-    def initial_known_coordinates_sensitivity(self, width: int) -> Array:
+    def initial_known_coordinate_derivatives(self, width: int) -> Array:
         """Derivative (nk, d) of `initial_known_coordinates` with respect to the parameters."""
         by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
@@ -67,7 +67,7 @@ class CorrectedInputs:
 
     def with_effect_momentum_shift(
         self,
-        shift: EffectMomentumShift,
+        shift: RecordedMomentumCorrection,
         recorded: JointMotionWithSensitivities,
         measured: Array,
         theta: Array,
@@ -88,7 +88,7 @@ class CorrectedInputs:
         momentum, slope = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, wanted)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
-    def nominal_torque_sensitivity(
+    def nominal_torque_derivatives(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
         """Derivatives (N, nu, width) of the nominal torque, including those through the tracking filter's reference."""
@@ -248,7 +248,7 @@ class TimeGridStateValues:
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
         return TimeGridStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
 
-    def at(self, nodes: IntArray) -> TimeGridStateValues:
+    def select_nodes(self, nodes: IntArray) -> TimeGridStateValues:
         """Select the values at the nodes with the given indices."""
         return TimeGridStateValues(*(values[nodes] for values in vars(self).values()))
 
@@ -320,7 +320,7 @@ class ModelFunctions:
             lambda _: InitialStateFitter(step, start_parameters)
         )
         self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_arms_only_step(step))
-        self._momentum = CasadiLockedCache[None, EffectMomentumShift](lambda _: EffectMomentumShift(step))
+        self._momentum = CasadiLockedCache[None, RecordedMomentumCorrection](lambda _: RecordedMomentumCorrection(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
@@ -348,7 +348,7 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def effect_momentum_shift_functions(self) -> EffectMomentumShift:
+    def recorded_momentum_correction(self) -> RecordedMomentumCorrection:
         """Calculator of the momentum that effects add to the tracking filter's reference in each step."""
         return self._momentum(None)
 

@@ -80,7 +80,7 @@ class Animation:
     motions: tuple[_AnimatedMotion, ...]
 
 
-def scenes_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dict[str, Any]:
+def animations_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dict[str, Any]:
     """Convert scenes to JSON-ready data, with meshes by joint. Positions are integers in 0.1 mm, null if unknown.
 
     The meshes of the robot's URDF are drawn on the arm of a scene's last model or, in a scene without a model, on the

@@ -33,7 +33,7 @@ from yid_ocp.inference.uncertainty import (
     unknowns_covariance_and_reduced_chi2,
     value_and_uncertainty_text,
 )
-from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
+from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
 from yid_ocp.options import check_option_bounds
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
@@ -180,7 +180,7 @@ class Solution(ReprMixin):
         """Prediction of each recording from its torques minus their offsets. A failed rollout gives a message."""
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
-        problem = problem_whitened_by_sensor_noise(self.problem)
+        problem = problem_with_sensor_noise_only(self.problem)
         found = problem.evaluate(self.x, False, self.evaluation.equilibrium_guesses)
         if found.ok:
             return found.episode_predictions
@@ -326,8 +326,8 @@ def solve(
     `initial_unknowns`, free effects start with a small amplitude (`unknowns_with_neutral_effects_activated`). If the
     rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over a short horizon,
     which then grows. With process noise, methods that can whiten by process noise run in several passes, each with a
-    fixed covariance (`problem_whitened_at`). The result of a method whose unknowns include torque errors is judged in
-    the same way. A search that does not converge raises no error; see `status` and `message` of the solution.
+    fixed covariance (`problem_with_whitening_at`). The result of a method whose unknowns include torque errors is
+    judged in the same way. A search that does not converge raises no error; see `status` and `message` of the solution.
 
     Parameters
     ----------
@@ -425,7 +425,7 @@ class _MultiStartSearch:
 
     def _no_better_minimum(self, x: Array, note: str) -> _Fit | None:
         """The best fit, where under its weights a start leads to it or to a worse one; else None."""
-        best, coarse = self._best, getattr(self._solver, "coarse", None)
+        best, coarse = self._best, getattr(self._solver, "with_coarse_tolerances", None)
         if coarse is None or not (best.evaluation.ok and self._problem.has_process_noise):
             return None
         near = _minimize_cost(coarse, best.weighted, x, _noting(self._callback, note))
@@ -521,9 +521,9 @@ def _fit_from(
     passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
     weighted = problem
     for number in range(passes):
-        weighted = problem_whitened_at(weighted, x, warm) if passes > 1 else problem
+        weighted = problem_with_whitening_at(weighted, x, warm) if passes > 1 else problem
         noted = _noting(callback, f"pass {number + 1} of at most {passes}" if passes > 1 else "")
-        begun, coarse = x, getattr(solver, "coarse", solver) if passes > 1 else solver
+        begun, coarse = x, getattr(solver, "with_coarse_tolerances", solver) if passes > 1 else solver
         for own in (solver,) if coarse == solver else (coarse, solver):
             result = _minimize_cost(own, weighted, x, noted)
             x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
@@ -541,7 +541,7 @@ def _fit_from(
     finish = result.evaluation
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # torque errors were unknowns; the fit is judged by their likelihood about the result
-        weighted, finish = problem_whitened_at(problem, x, warm, rounds=2), None
+        weighted, finish = problem_with_whitening_at(problem, x, warm, rounds=2), None
     finish = finish or weighted.evaluate(x, equilibrium_guesses=warm)
     return _Fit(result, finish, weighted, evaluations, history)
 

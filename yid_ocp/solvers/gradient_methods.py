@@ -69,7 +69,7 @@ class GaussNewton(SolverWithCheckedSettings):
     uses_process_noise_covariance: ClassVar[bool] = True
 
     @property
-    def coarse(self) -> GaussNewton:
+    def with_coarse_tolerances(self) -> GaussNewton:
         """The same method for a search whose result is only a start, to a small part of the standard deviations."""
         steps, costs = max(self.step_tolerance, 1e-3), max(self.cost_tolerance, 1e-5)
         return replace(self, step_tolerance=steps, cost_tolerance=costs)

@@ -94,7 +94,7 @@ def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, tra
     """Mean square whitened residual, without effort channels, of a trajectory (N + 1, nx) of recording `i`."""
     shared, _ = problem.theta_and_initial_state_deviation(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
-    slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
+    slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameter_names)))
     parts = [np.zeros(1)]
     for samples in problem.episodes[i].measurements:
         if not samples.sensor.effort_joints:
@@ -162,7 +162,7 @@ def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array
         if not isinstance(effect, EffectBase):
             continue
         free = [name for name in effect.parameters.names if name in place]
-        amplitudes = [name for name in effect.amplitude_names if name in free]
+        amplitudes = [name for name in effect.amplitude_parameter_names if name in free]
         if not amplitudes or any(x[place[name]] != effect.neutral_values[name] for name in amplitudes):
             continue
         begun = _with_effect_begun(problem, x, effect, place)
@@ -179,7 +179,7 @@ def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array
 
 def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase, place: dict[str, int]) -> Array | None:
     """The start with an effect at its best shape; None if only its amplitude is free, and observable at neutral."""
-    amplitudes = [place[name] for name in effect.amplitude_names if name in place]
+    amplitudes = [place[name] for name in effect.amplitude_parameter_names if name in place]
     shapes = [place[name] for name in effect.shape_parameter_names if name in place]
     expected = {place[name]: limits for name, limits in effect.prior_ranges.items() if name in place}
     grids = [[float(x[at]), *np.linspace(*expected[at], _N_SHAPE_VALUES)] for at in shapes]

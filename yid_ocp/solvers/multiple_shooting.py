@@ -434,7 +434,7 @@ class _ShootingIntervals:
         self, i: int, theta: Array, start: InitialStateWithSensitivity, nodes: Array
     ) -> tuple[Array, Array, Array, Array, float] | str:
         """Trajectory (N + 1, nx), derivatives of it and of the nodes by unknowns and defects, largest defect."""
-        wanted, by_start = self.problem.unknowns.free_parameters, start.state_sensitivity
+        wanted, by_start = self.problem.unknowns.free_parameter_names, start.state_sensitivity
         nx, width = by_start.shape
         steps = self.problem.episodes[i].grid.steps
         trajectory, slopes = np.zeros((steps + 1, nx)), np.zeros((steps + 1, nx, width + 1))

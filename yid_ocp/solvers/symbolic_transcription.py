@@ -28,7 +28,7 @@ from yid_ocp.errors import SolverError
 from yid_ocp.integrator.discrete import NlpStepConstraints, nlp_step_constraints
 from yid_ocp.integrator.statics import measured_angle_holding_stiffness
 from yid_ocp.parallel import CASADI_LOCK
-from yid_ocp.problem.episode_prediction import node_state_sensor_error
+from yid_ocp.problem.episode_prediction import sensor_not_predictable_at_nodes_error
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import SOFT_LOGARITHM_MIN_RATIO
@@ -238,7 +238,7 @@ class _Maker:
     def __init__(self, problem: EstimationProblem, compiled: bool) -> None:
         self._problem, self._compiled = problem, compiled
         self._step, self._sizes = problem.step, problem.step.sizes
-        self._names = problem.unknowns.free_parameters
+        self._names = problem.unknowns.free_parameter_names
         self._w, self._p = ProgramVectorLayout(), ProgramVectorLayout()
         system = problem.system
         free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
@@ -337,7 +337,7 @@ class _Maker:
         """The stage with the inputs of a recording."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
-            feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_shift_functions
+            feedback, shift = episode.tracking_feedback, self._problem.model_functions.recorded_momentum_correction
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
             made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
@@ -463,7 +463,7 @@ class _Maker:
         if key not in self._sensors:
             function = sensor_reading_function(self._problem.system, sensor, self._names)
             if any(function.size2_out(name) for name in ("by_v", "by_a", "by_lam")):
-                raise node_state_sensor_error(sensor.group_name)
+                raise sensor_not_predictable_at_nodes_error(sensor.group_name)
             loaded = function.nnz_out("by_load") > 0
             made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function)
             self._sensors[key] = made, loaded

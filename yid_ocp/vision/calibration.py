@@ -97,7 +97,7 @@ def stamp_delay_beyond_clock_offset(
     frames [m^2], only nearby delays are searched."""
     t, origin = float(state.stamps_to_joint_clock(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_MAX_START_POINTS]]
-    chosen = points[arm.is_near_moving_surface_off_grasps(points, t, 2 * _OFF_ARM_DISTANCE)][:_MAX_ARM_POINTS]
+    chosen = points[arm.near_moving_surface_off_grasps_mask(points, t, 2 * _OFF_ARM_DISTANCE)][:_MAX_ARM_POINTS]
     if len(chosen) < MIN_ARM_POINTS_PER_FRAME:
         return None
     trial = _nearby(arm, origin, t, chosen, 0.0)
@@ -381,7 +381,7 @@ class _Calibrator:
         for glimpse in frames:
             points = state.measured_to_world_points(glimpse.points)
             t = float(state.stamps_to_joint_clock(glimpse.stamp))
-            near = np.flatnonzero(self.arm.is_near_moving_surface_off_grasps(points, t, 1.5 * reach))
+            near = np.flatnonzero(self.arm.near_moving_surface_off_grasps_mask(points, t, 1.5 * reach))
             if len(near) > most:
                 near = self.rng.choice(near, most, replace=False)
             if len(near) >= MIN_ARM_POINTS_PER_FRAME:

@@ -167,10 +167,10 @@ class ArmSurface:
         points = _START_INTRINSICS.pixel_rays_at_unit_depth[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
-    def is_near_moving_surface_off_grasps(self, points: Array, t: float, within: float) -> BoolArray:
+    def near_moving_surface_off_grasps_mask(self, points: Array, t: float, within: float) -> BoolArray:
         """Whether world points are near a moving surface and not near a grasp."""
         q = self.configuration_at(t)
-        result = self.robot_surfaces.is_within_surface_distance(points, q, within, moving_only=True)
+        result = self.robot_surfaces.within_surface_distance_mask(points, q, within, moving_only=True)
         for held in self.grasp_positions_at(q):
             result &= np.linalg.norm(points - held, axis=1) > self.grasp_exclusion_radius
         return np.asarray(result)

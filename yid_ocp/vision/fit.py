@@ -28,7 +28,7 @@ from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
 from yid_ocp.vision import shape_evidence
-from yid_ocp.vision.initial_shapes import ObservedObjectEnd, ShapeFitInitialGuesses
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, ObservedObjectEnd
 from yid_ocp.vision.shape_evidence import (
     FrameShapeFit,
     FrameTubeDimensionCost,
@@ -403,10 +403,10 @@ class ShapeFitter:
         hessian += by_held.T @ by_held + np.diag(self._prior**2)
         return LocalQuadraticModel(cost, gradient, hessian)
 
-    def shape_fit_initial_guesses(self) -> ShapeFitInitialGuesses:
+    def make_initial_shape_finder(self) -> InitialShapeFinder:
         """Make a finder of initial shapes for a system with a free root (`initial_shapes.system_with_free_root`)."""
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
-        return ShapeFitInitialGuesses(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
+        return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
 
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses

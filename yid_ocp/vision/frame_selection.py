@@ -255,7 +255,9 @@ _SAME_ROOT_FRACTION = 0.1  # of the length between the ends; closer roots are th
 _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends; height difference that makes one end higher
 
 
-def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
+def frames_with_consistent_root_end(
+    frames: Sequence[FrameReport], options: TrackOptions
+) -> tuple[list[FrameReport], str]:
     """Make the object's root the same end in all fits. Also returns a text that says how the end was chosen.
 
     A choice is needed if a shape fits equally well with its root at another end. Ends are first followed from frame to

@@ -249,7 +249,7 @@ class OcclusionMap:
     expected_points: Array | None = None
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
-    def is_hidden(self, places: Array, radius: Array, margin: float) -> BoolArray:
+    def hidden_mask(self, places: Array, radius: Array, margin: float) -> BoolArray:
         """Whether world positions (S, 3) are occluded, shadowed by something nearer, or outside the image.
 
         A surface occludes a position if it is nearer to the camera by more than `radius` (S,) plus `margin` [m].

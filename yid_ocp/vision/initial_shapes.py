@@ -234,7 +234,7 @@ class _Link(NamedTuple):
     tip: int = -1
 
 
-class ShapeFitInitialGuesses:
+class InitialShapeFinder:
     """Finds object shapes along a centerline by bending joints from `rest` (n,); `lengths` are of links [m]."""
 
     def __init__(

@@ -181,7 +181,7 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
     return WeightedCloud(total / count[:, None], count.astype(np.float64))
 
 
-def is_statistical_inlier(
+def statistical_inlier_mask(
     cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None
 ) -> BoolArray:
     """Find the inliers (N,) of a cloud by statistical outlier removal. False outside the mask `asked`.
@@ -206,7 +206,7 @@ def is_statistical_inlier(
     return stays
 
 
-def has_wanted_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
+def wanted_colour_mask(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
     """Whether each point has one of the wanted colours, (N,).
 
     `colours` (N, 3) and `wanted` (C, 3) are red, green and blue, 0 to 255 (sRGB). `angle` [rad] is the largest angle
@@ -260,7 +260,7 @@ class CloudSkeleton:
     component_of_node: IntArray  # (K,), connected part of each node, largest part first
 
     @property
-    def is_point_assigned_to_node(self) -> BoolArray:
+    def points_assigned_to_node_mask(self) -> BoolArray:
         """Whether each point (N,) of the cloud belongs to a node."""
         return self.node_of_point >= 0
 

@@ -48,7 +48,7 @@ class BackgroundPoints:
     def _tree(self) -> cKDTree:
         return cKDTree(self.points)
 
-    def is_near_background(self, points: Array, beyond: float = 0.0) -> BoolArray:
+    def near_background_mask(self, points: Array, beyond: float = 0.0) -> BoolArray:
         """Whether points (N, 3) lie within `match_distance + beyond` [m] of the background, (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)

@@ -148,7 +148,7 @@ class ProcessedFrameCloud:
         """Whether positions (S,) are hidden from the camera or removed by filters."""
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
-            hidden |= self.occlusion_map.is_hidden(places, radius, margin)
+            hidden |= self.occlusion_map.hidden_mask(places, radius, margin)
         return hidden if self.is_filtered_out is None else hidden | self.is_filtered_out(places)
 
 

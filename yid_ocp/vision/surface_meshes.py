@@ -163,7 +163,7 @@ class ArticulatedSurfaces:
         near = np.flatnonzero(inside)
         return near, local[near]
 
-    def is_within_surface_distance(
+    def within_surface_distance_mask(
         self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
     ) -> BoolArray:
         """Whether world points (N, 3) are within `reach` [m] of any (or any moving) surface at a configuration."""

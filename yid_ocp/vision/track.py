@@ -30,7 +30,7 @@ from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
-from yid_ocp.vision.initial_shapes import ShapeFitInitialGuesses, cloud_centerline_tree, system_with_free_root
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, cloud_centerline_tree, system_with_free_root
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
@@ -120,7 +120,7 @@ class FrameTracker:
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
         self.shape_fitter = self._shape_of(values)
-        self.shape_fit_initial_guesses = self.shape_fitter.shape_fit_initial_guesses() if anywhere else None
+        self.make_initial_shape_finder = self.shape_fitter.make_initial_shape_finder() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
         self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
         # a root to be found needs no recorded joints
@@ -247,9 +247,9 @@ class FrameTracker:
         within = self.options.filters.robot_padding + self._widest
 
         def removed(places: Array) -> BoolArray:
-            gone = ~is_inside(places) | background.is_near_background(places, self._widest)
+            gone = ~is_inside(places) | background.near_background_mask(places, self._widest)
             if self.robot_surfaces is not None:
-                gone |= self.robot_surfaces.is_within_surface_distance(places, q, within)
+                gone |= self.robot_surfaces.within_surface_distance_mask(places, q, within)
             return gone
 
         return removed
@@ -281,7 +281,7 @@ class FrameTracker:
             if colours is None:
                 raise DataError("the cloud has no colours")
             wanted = filters.object_colours, filters.max_colour_angle
-            inside[inside] = point_cloud.has_wanted_colour(colours[finite][inside], *wanted)
+            inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], *wanted)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
@@ -296,7 +296,7 @@ class FrameTracker:
         fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
         fits.sort(key=lambda fit: fit.mean_distance)
         reason = frame_selection.frame_rejection_reason(fits[0], shape, self.options)
-        anywhere = self.shape_fit_initial_guesses is not None
+        anywhere = self.make_initial_shape_finder is not None
         if anywhere and not reason and frame_selection.is_shape_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
         other = (
@@ -325,7 +325,7 @@ class FrameTracker:
 
     def mark_outlying_frames_and_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Drop outlying frames and choose the root end, with a note on how it was chosen."""
-        rooted, note = frame_selection.with_consistent_root_end(frames, self.options)
+        rooted, note = frame_selection.frames_with_consistent_root_end(frames, self.options)
         return frame_selection.mark_outlying_frames(rooted, self.options), note
 
     def track_result_from_frame_reports(
@@ -333,7 +333,7 @@ class FrameTracker:
     ) -> TrackResult:
         """Make the tracking result from frame reports. Raises `DataError` if no frame is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
-        things = self.foreign_objects(frames)
+        things = self.find_foreign_objects(frames)
         of = common, things, self.options, self.sequence.source
         measured = frame_selection.tracked_states_and_points(frames, columns, *of)
         place = self._shape(common.dimensions).points_at_configuration
@@ -348,7 +348,7 @@ class FrameTracker:
             _place=lambda q: place(q)[columns],
         )
 
-    def foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
+    def find_foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
         """Find foreign objects in the fitted frames."""
         fitted = [(frame.joint_time, frame.shape_fit) for frame in frames if frame.shape_fit is not None]
         if not fitted:
@@ -400,11 +400,11 @@ class FrameTracker:
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:
-            kept = ~self.robot_surfaces.is_within_surface_distance(cloud.points, q, filters.robot_padding)
-        kept[kept] = ~background.is_near_background(cloud.points[kept])
+            kept = ~self.robot_surfaces.within_surface_distance_mask(cloud.points, q, filters.robot_padding)
+        kept[kept] = ~background.near_background_mask(cloud.points[kept])
         # relative to the robot's points: among all surfaces, outliers are few
         alone = filters.outlier_neighbours, filters.outlier_z_max
-        cloud = cloud.select(point_cloud.is_statistical_inlier(cloud, *alone, kept))
+        cloud = cloud.select(point_cloud.statistical_inlier_mask(cloud, *alone, kept))
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
         if len(cloud) < filters.min_points:
@@ -415,10 +415,10 @@ class FrameTracker:
         begun = time.process_time()
         view = OcclusionMap(raw, state.pose, self.sequence.intrinsics, cloud.points)
         given = calibration.camera_position, view, self._removed(q, calibration, background)
-        if self.shape_fit_initial_guesses is None:
+        if self.make_initial_shape_finder is None:
             look = self._held(work, cloud, q, rng, given)
         else:
-            look = self._anywhere(self.shape_fit_initial_guesses, work, cloud, rng, given)
+            look = self._anywhere(self.make_initial_shape_finder, work, cloud, rng, given)
         work.say(cpu_seconds=time.process_time() - begun)
         return look
 
@@ -429,11 +429,11 @@ class FrameTracker:
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
-        work.filtered = rest = cloud.select(found.is_point_assigned_to_node)
+        work.filtered = rest = cloud.select(found.points_assigned_to_node_mask)
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
     def _anywhere(
-        self, starts: ShapeFitInitialGuesses, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
+        self, starts: InitialShapeFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
     ) -> _Look:
         """Views of an object with an unknown root position, with its possible ends."""
         diameter, options = 2.0 * self._widest, self.options

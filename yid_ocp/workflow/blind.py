@@ -252,7 +252,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     first = Path(folder) / f"{name}.h5"
     _BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = ensemble.candidate_sensitivities_to_json()
+    detectable = ensemble.candidate_sensitivities_to_plain_data()
     write_strict_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
@@ -262,7 +262,7 @@ def _draw_case(
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.set_candidate_sensitivities_from_json(read_input_json(detectable))
+    ensemble.set_candidate_sensitivities_from_plain_data(read_input_json(detectable))
     case, label = ensemble.draw_planned_case(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")
@@ -289,7 +289,7 @@ def _diagnose_case_from_recordings_task(
     evidence = None
     try:
         finding = blind.diagnose_blind_case(ensemble, case, candidates, run.diagnosis)
-        result, evidence = finding.to_dict(), blind_scores.evidence_to_json(finding)
+        result, evidence = finding.to_dict(), blind_scores.diagnosis_evidence_to_dict(finding)
     except YidError as error:
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})

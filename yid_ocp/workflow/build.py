@@ -19,7 +19,7 @@ from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.effects.bodies import with_link_mass_parameters
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, with_sign_smoothing_speed
-from yid_ocp.effects.law import make_law, read_law_tables
+from yid_ocp.effects.law import make_torque_law, read_torque_law_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
@@ -183,7 +183,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     if run.model.arms.link_mass_std > 0:
         system = with_link_mass_parameters(system, _LINK_MASS_PARAMETER)
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
-    for joint in friction_joints(run, system):
+    for joint in friction_joint_names(run, system):
         assert run.model.friction is not None
         kinds, speed = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law], run.model.friction.sign_smoothing_speed
         made = [make_effect(kind, joint, system) for kind in kinds if f"{kind}@{joint}" not in named]
@@ -220,7 +220,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
         what, hint = "the law lacks `table` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
         allowed = "`table` and `depends_on`, without `values`"
         raise ConfigError(what, where=f"law@{said.location}", allowed=allowed, hint=hint)
-    return make_law(said.location, system, read_law_tables(Path(said.table), said.depends_on))
+    return make_torque_law(said.location, system, read_torque_law_tables(Path(said.table), said.depends_on))
 
 
 def _with_robot_file_constants(run: RunSettings, system: System) -> System:
@@ -268,7 +268,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
     return result | {name: replace(result[name], prior_std=None) for name in fixed}
 
 
-def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
+def friction_joint_names(run: RunSettings, system: System) -> tuple[str, ...]:
     """Joints with friction by `model.friction`: the named joints or all arm joints. Empty without that section."""
     if run.model.friction is None:
         return ()

@@ -85,7 +85,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         clamps = cable.clamp_pose_definitions_from_points
         for name in {group.name for group in groups}:
             said = sensors.get(name, SensorOptions())
-            sensors[name] = said if said.points is not None else replace(said, points=cable.free_vertex_names)
+            sensors[name] = said if said.points is not None else replace(said, points=cable.unclamped_vertex_names)
         for recording in recordings:
             lengths = typical_point_pair_distances(cable.edges, [recording], _START_FRAMES)
             if values := run.model.object.recording_parameter_values(lengths):
@@ -187,7 +187,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_initial_closure_error_by_grasp(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
-                where, allowed = run.describe_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
+                where, allowed = run.setting_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
                 raise DataError(f"{what}: {1e3 * gap:.3g} mm are missing", where=where, allowed=allowed, hint=hint)
 
@@ -243,7 +243,7 @@ def _check_recordings(
     if not kept[0]:
         hint = "; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump"))
         what, allowed = "no part of the recordings is long enough between gaps", "a recording without gaps"
-        raise DataError(what, where=run.describe_location("recordings", "estimate"), allowed=allowed, hint=hint)
+        raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(doubts)
 
 
@@ -274,7 +274,7 @@ def _once(
     for recording in held_out:
         if same := _duplicate(used, recording):
             what = f"a measurement is both estimated on and held out: {same[0].what}"
-            where = run.describe_location("recordings", "held_out")
+            where = run.setting_location("recordings", "held_out")
             hint = f"leave out {recording.name} or {same[1].name}"
             raise DataError(what, where=where, allowed="one of the two", hint=hint)
         if _duplicate(others, recording):
@@ -295,17 +295,17 @@ def _beside_the_model(
     gravity = np.array(run.model.gravity, float)
     recording = recording.with_effort_sampling_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_sampling_kind)
     if cable is not None:
-        return list(point_checks.check_cable_point_geometry(cable, recording, gravity))
+        return list(point_checks.cable_point_geometry_issues(cable, recording, gravity))
     found: list[Issue] = []
     if arm is not None and arm.has_all_angles_recorded(recording):
-        found += joint_checks.check_joint_limits(arm, recording)
+        found += joint_checks.joint_limit_issues(arm, recording)
         if any(doubt.weight == "refused" for doubt in found):
             return found
-        told = list(joint_checks.check_efforts_by_inverse_dynamics(arm, recording))
-        told += point_checks.check_robot_held_points(arm, recording, _choice(run))
+        told = list(joint_checks.inverse_dynamics_effort_issues(arm, recording))
+        told += point_checks.robot_held_point_issues(arm, recording, _choice(run))
         found += [doubt for doubt in told if not _is_modelled(system, doubt)]
     theta = system.parameters.vector()
-    return found + list(point_checks.check_point_distances(arm, system, theta, recording, _choice(run)))
+    return found + list(point_checks.point_distance_issues(arm, system, theta, recording, _choice(run)))
 
 
 def _excitation(
@@ -317,11 +317,11 @@ def _excitation(
         joint, _, quantity = name.rpartition(".")
         if joint in arm.joint_names and quantity in ("damping", "stiffness"):
             asked.setdefault(joint, []).append(name)
-    found = list(joint_checks.check_joint_excitation(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
+    found = list(joint_checks.joint_excitation_issues(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
     if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
         options = _choice(run)(JOINT_EFFORT_GROUP_NAME)
         whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
-        weak = [list(joint_checks.check_inertial_effort_excitation(arm, one, options)) for one in whole]
+        weak = [list(joint_checks.inertial_effort_excitation_issues(arm, one, options)) for one in whole]
         if all(weak):  # one informative recording is enough
             found += [doubt for doubts in weak for doubt in doubts]
     return found
@@ -349,7 +349,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
         own = problem.theta_and_initial_state_deviation(problem.initial_unknowns, i)
         result = problem.predictor.predict_episode(episode, *own, False, None)
         if isinstance(result, EpisodePrediction):
-            found += point_checks.check_object_points_against_rollout(episode, result, size)
+            found += point_checks.object_point_rollout_issues(episode, result, size)
     return found
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import maximum_filter1d
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import white_noise_std
-from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
@@ -261,7 +261,7 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
 
 def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bool) -> tuple[str, str]:
     wrists = [group.name for group in recording.channel_groups if group.name.startswith("wrist")]
-    wrists = [name for name in wrists if name != ESTIMATED_WRENCH_GROUP]
+    wrists = [name for name in wrists if name != ESTIMATED_WRENCH_GROUP_NAME]
     seen = ", ".join([*(group.name for group in recording.points), *wrists])
     is_servo = joints.effort is None and _commanded(joints)
     if not has_object and not is_servo and joints.effort is None and not wrists:

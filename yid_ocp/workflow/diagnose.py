@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.estimate_history import pool_estimates
+from yid_ocp.analysis.estimate_history import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
@@ -21,7 +21,7 @@ from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.effects.law import law_tables_csv
+from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import (
     dataclass_from_plain_data,
@@ -34,7 +34,7 @@ from yid_ocp.files import (
 )
 from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
-from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
+from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
@@ -82,7 +82,7 @@ def run_diagnose(
         problem = build_problem(run, reference_recordings=without)
         run_history.require_recordings_not_in_baseline(run, problem, runs, without)
         if runs:
-            problem = with_baseline_prior(problem, pool_estimates(runs)[0])
+            problem = with_baseline_prior(problem, pool_estimates_and_chi2(runs)[0])
         nominal: Solution | None = None
         try:
             if run.diagnosis.noise_fraction_of_std < 1 and problem.held_out:
@@ -106,7 +106,7 @@ def run_diagnose(
         predicted = _held_out_predictions(finding)
         prediction_outputs.write_diagnosis_hdf5(folder.path / "trajectories.h5", finding, predicted)
         if finding.law is not None:
-            write_text(folder.path / "law.csv", law_tables_csv(finding.law.tables))
+            write_text(folder.path / "law.csv", torque_law_tables_csv(finding.law.tables))
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
         moving = not last.problem.options.clamp_pose_definitions_from_points and bool(
@@ -229,7 +229,7 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
 
 def _held_out_predictions(finding: DiagnosisResult) -> list[EpisodeWithNominalAndEffectPredictions]:
     before, after = (
-        problem_whitened_by_sensor_noise(fit.problem).predict_held_out(fit.problem.vector(fit.values))
+        problem_with_sensor_noise_only(fit.problem).predict_held_out(fit.problem.vector(fit.values))
         for fit in (finding.nominal_model, finding.final_model)
     )
     return [

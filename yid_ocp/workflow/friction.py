@@ -14,7 +14,7 @@ from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, Status, solve
-from yid_ocp.workflow.build import friction_joints, friction_parameter_names
+from yid_ocp.workflow.build import friction_joint_names, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -38,7 +38,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
                 allowed = "two recordings or more in which the motors are on"
                 hint = "list more under recordings.estimate or recordings.held_out"
                 what = "a law is tested on recordings that are not fitted, but there is only one recording"
-                raise DataError(what, where=settings.describe_location("recordings"), allowed=allowed, hint=hint)
+                raise DataError(what, where=settings.setting_location("recordings"), allowed=allowed, hint=hint)
             solution = solve(problem, run.solver, restarts=False)
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
@@ -47,16 +47,16 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             solved[law] = (settings, problem, solution)
         if not fits:
             what, hint = "no friction law could be fitted", "run `yid-ocp check` with this configuration"
-            where = run.describe_location("recordings")
+            where = run.setting_location("recordings")
             raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
         best = friction_ladder.simplest_fit_within_std_error(fits, kinds)
         settings, problem, solution = solved[best.law]
         names = friction_parameter_names(settings, problem.system.parameters)
-        more = {"friction_clouds": friction_ladder.friction_torque_clouds(problem, solution, names)}
+        more = {"friction_clouds": friction_ladder.measured_and_predicted_friction_torques(problem, solution, names)}
         result: dict[str, Any] = {
             "format": "yid-friction/1",
             "kinds": {kind: list(own) for kind, own in kinds.items()},
-            "joints": list(friction_joints(settings, problem.system)),
+            "joints": list(friction_joint_names(settings, problem.system)),
             "unit": best.unit,
             "laws": {fit.law: _law_result(fit, best, kinds) for fit in fits},
             "warranted": best.law,

@@ -17,7 +17,7 @@ from yid_ocp.data.checks import recording_quality_issues
 from yid_ocp.data.merge import merge_recordings
 from yid_ocp.data.readers import reader_option_names
 from yid_ocp.data.readers.base import (
-    CURRENT_UNITS,
+    MOTOR_CURRENT_UNITS,
     SelectionAndUnitOptions,
     convert_to_si_and_validate,
     guess_units,
@@ -80,7 +80,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         else:
             recording = read_third_party_recording(files[0], options, progress)
         write_recording(recording, arguments.out)
-    out, doubts = arguments.out, recording_doubt_lines(recording)
+    out, doubts = arguments.out, recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording), "doubts": doubts}
     lines = [*recording_summary_lines(recording), *doubts]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)
@@ -139,12 +139,12 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
     except DataError as error:
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
-    doubts = recording_doubt_lines(recording)
+    doubts = recording_issue_lines(recording)
     what = "it" if len(files) == 1 else "them as one recording"
     return [*doubts, "", f"to import {what}:", f"  {_import_command_line(files, options)}"]
 
 
-def recording_doubt_lines(recording: Recording) -> list[str]:
+def recording_issue_lines(recording: Recording) -> list[str]:
     """Describe issues of a recording itself, such as units, clocks, few samples, no motion or channels."""
     units, reasons = guess_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
@@ -167,7 +167,7 @@ def _merged(
             raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint="leave it out")
     late = {name: options[name] for name in ("joints", "points", "torque_constants", "gears") if name in options}
     units = dict(options.get("units") or {})
-    if units.get("effort") in CURRENT_UNITS:
+    if units.get("effort") in MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}
     columns, matched = options.get("columns") or {}, set[str]()
     parts = []

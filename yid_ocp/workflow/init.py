@@ -14,7 +14,7 @@ from typing import Any, cast
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
-from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
@@ -72,7 +72,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         "proposal": proposal.to_dict(),
     }
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
-    doubts = [line for own in recordings for line in import_recording.recording_doubt_lines(own) if line]
+    doubts = [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]
     print_result(
         arguments,
         result,
@@ -460,7 +460,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
             why = "torques with noise move the arms: set mode: prescribed to use it"
             entries = ["use: false", *entries]
             said = why if proposal.arm_mode == "driven" else "its frame is not known"
-        elif group.startswith(ESTIMATED_WRENCH_GROUP):
+        elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
             entries = ["use: false", *entries]
             said = "an estimate from joint torques, less the loads that the driver knows: in place of efforts only"
         # a comment, if there is no setting

@@ -219,10 +219,10 @@ def _dependence(
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepEquationLinearizations,
-) -> tuple[step_diagnostics.ParameterDetectability, ...]:
+) -> tuple[step_diagnostics.ParameterInfluence, ...]:
     """Equations and sensors that depend on each parameter; along the recordings if the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
-    found = step_diagnostics.parameter_detectabilities(step, symbols, episode, point.state, point.theta, rows)
+    found = step_diagnostics.parameter_influences(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found

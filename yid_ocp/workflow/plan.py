@@ -183,7 +183,7 @@ def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict
         raise run.config_error(what, *where, allowed=" or ".join(formats), hint=hint)
     if result.get("status") == "failed":
         what, hint = f"the solve in {folder} failed: {result['message']}", "give the folder of a successful run"
-        raise DataError(what, where=run.describe_location(*where), allowed="a successful run", hint=hint)
+        raise DataError(what, where=run.setting_location(*where), allowed="a successful run", hint=hint)
     return result, folder
 
 

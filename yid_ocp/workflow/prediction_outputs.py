@@ -55,7 +55,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     return found
 
 
-def numbers_to_use(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
+def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
     """Make lines to copy from an estimate, for the identifiable parameters. Empty if there are none.
 
     The result holds `values` with total standard deviations, `joints` (number of links and range of joint stiffness [N
@@ -197,7 +197,7 @@ def write_diagnosis_hdf5(
         for force in finding.events.force_estimates:
             group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit
-            _store(group, {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.allowed_model_error})
+            _store(group, {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.assumed_model_error})
 
 
 def _store_sensor(

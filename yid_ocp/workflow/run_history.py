@@ -16,7 +16,7 @@ from yid_ocp.analysis.estimate_history import (
     DriftAndOutlierTests,
     RunEstimates,
     assess_drift_and_outlier_runs,
-    pool_estimates,
+    pool_estimates_and_chi2,
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
@@ -25,7 +25,7 @@ from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recordi
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.files import file_sha256, is_file, named_attributes, read_input_json
-from yid_ocp.model.objects import ObjectKind
+from yid_ocp.model.objects import ObjectBuilder
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import ChannelPrediction
 from yid_ocp.report.animation import Animation, ConfigurationTrajectory, animation_of_trajectories
@@ -182,7 +182,7 @@ def _difference(run: RunSettings, there: RunSettings | None) -> str:
         here, other = getattr(run.model, key), getattr(there.model, key)
         if key == "robot" and here is not None and other is not None:
             here, other = Path(here).name, Path(other).name  # a folder may have been moved
-        if isinstance(here, ObjectKind) and isinstance(other, ObjectKind):
+        if isinstance(here, ObjectBuilder) and isinstance(other, ObjectBuilder):
             here, other = here.with_file_names_only(), other.with_file_names_only()
         if here != other:
             return key
@@ -200,7 +200,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
     """Settings with a baseline's effects at their estimated values. Parameters estimated in the baseline are free."""
     if not runs:
         return run
-    known, _, _ = pool_estimates(runs)
+    known, _, _ = pool_estimates_and_chi2(runs)
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     estimated = parameter_values_by_effect_label(dict(zip(known.parameter_names, known.values, strict=True)))
     added = {label: {**said, **estimated.get(label, {})} for label, said in known.effects.items()}

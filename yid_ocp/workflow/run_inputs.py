@@ -41,7 +41,7 @@ def load_plugins(run: RunSettings) -> None:
                 entry.load()
             _loaded[name] = of
     for i, plugin in enumerate(run.plugins):
-        path, where = Path(plugin), run.describe_location("plugins", i)
+        path, where = Path(plugin), run.setting_location("plugins", i)
         name, digest = str(path.resolve()), file_sha256(path)
         if _loaded.get(name, digest) != digest:
             what, hint = "the plug-in changed after it was loaded", "start a new Python process"
@@ -116,7 +116,7 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
     try:
         yield
     except YidError as error:
-        where = run.describe_location(*path)
+        where = run.setting_location(*path)
         if error.where and error.where not in where:
             where = f"{where} ({error.where})"
         raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error

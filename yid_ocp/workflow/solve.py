@@ -59,7 +59,7 @@ def run_solve(
             "discretisation": discretisation_shifts_to_dict(checks.discretisation_shifts, checks.data_std),
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
-            "to_use": prediction_outputs.numbers_to_use(problem, solution, os.path.relpath(folder.final_path)),
+            "to_use": prediction_outputs.copyable_estimate_texts(problem, solution, os.path.relpath(folder.final_path)),
             "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
         result = solution_to_result_dict(problem, solution, held_out) | more

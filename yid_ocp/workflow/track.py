@@ -90,7 +90,7 @@ def _run_track(
             stages = tracker.frame_processing_stages(frame, common)
             if stages is not None:
                 track_result.draw_frame_processing_stages(stages, folder.path / "pictures")
-        result = _track_result(frames, common, tracker.foreign_objects(frames), found) | {"root": note}
+        result = _track_result(frames, common, tracker.find_foreign_objects(frames), found) | {"root": note}
         told = []
         if found is not None:
             track_result.write_tracked_points_plot(found, folder.path / "track.png")

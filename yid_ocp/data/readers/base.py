@@ -59,7 +59,7 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
     "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60},
     "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "A": 1.0, "mA": 1e-3},
 }
-CURRENT_UNITS = ("A", "mA")
+MOTOR_CURRENT_UNITS = ("A", "mA")
 """Units of `effort` for motor currents."""
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
 _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
@@ -206,7 +206,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
             if not (math.isfinite(value) and value != 0):
                 allowed = "a finite number that is not zero"
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed=allowed)
-    if _spaceless((options.units or {}).get("effort", "")) not in CURRENT_UNITS:
+    if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
         if constants or gears:
             what = "torque constants or gears are given, but the unit of the efforts is not that of a current"
             allowed = "torque constants and gears with --units effort=A or effort=mA"

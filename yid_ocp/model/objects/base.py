@@ -25,7 +25,7 @@ START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
 _Vector3 = tuple[float, float, float]
 _STANDARD_GRAVITY = 9.81
 _DAMPING_TIME = 0.02  # initial ratio of damping to rigidity [s]
-SIZE_DESCRIPTIONS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
+SIZE_AND_MASS_DESCRIPTIONS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
 _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 
@@ -98,7 +98,7 @@ class CableTopology:
         return (*self.parent_branch_vertex_names[:2], *self.parent_branch_vertex_names[-2:])
 
     @property
-    def free_vertex_names(self) -> tuple[str, ...]:
+    def unclamped_vertex_names(self) -> tuple[str, ...]:
         """Names of the vertices that no clamp holds, at which predictions are evaluated."""
         return tuple(vertex for vertex in self.vertex_names if vertex not in self.clamped_vertex_names)
 
@@ -128,7 +128,7 @@ class CableTopology:
 class InitCommandObject:
     """An object from the command line of `init`, with initial values of its free parameters."""
 
-    settings: ObjectKind  # without its mount
+    settings: ObjectBuilder  # without its mount
     start_values: Mapping[str, tuple[float, str]]  # initial value of each free parameter, with a comment
     parameters_comment: str = "`yid-ocp inspect` lists all that there are"
     # whether its root is fixed in the world and arms hold its ends; otherwise a robot frame carries its root
@@ -153,7 +153,9 @@ def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Map
     """Return the numbers that an object requires, in the order of `meanings`. Raises `ConfigError` if one is absent."""
     for name, meaning in meanings.items():
         if name not in numbers:
-            flag, value = (f"--{name}", " NUMBER") if name in SIZE_DESCRIPTIONS else ("--number", f" {name}=NUMBER")
+            flag, value = (
+                (f"--{name}", " NUMBER") if name in SIZE_AND_MASS_DESCRIPTIONS else ("--number", f" {name}=NUMBER")
+            )
             raise ConfigError(f"{noun} needs a {name}", where=flag, allowed=meaning, hint=f"add {flag}{value}")
     return [float(numbers[name]) for name in meanings]
 
@@ -172,7 +174,7 @@ def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
     return values
 
 
-def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
+def initial_bending_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
     """Initial bending rigidity (`rigidity_ratio` x weight x length^2) and damping of `segments`, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
@@ -183,7 +185,7 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectKind:
+class ObjectBuilder:
     """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
     A subclass overrides `kind`, and `build_segments` or `build`. A kind that is a whole system is also a
@@ -235,7 +237,7 @@ class ObjectKind:
             if any(isinstance(m, OptionInfo) and m.is_path for m in split_annotated(option.type_hint)[1])
         }
 
-    def with_file_names_only(self) -> ObjectKind:
+    def with_file_names_only(self) -> ObjectBuilder:
         """Return a copy with file names instead of paths, to compare objects of different runs."""
         names = {key: Path(file).name for key, file in self.input_file_paths().items()}
         return replace(self, **names)
@@ -256,7 +258,7 @@ class ClampedObject(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedObjectKind(ObjectKind):
+class MountedObjectBuilder(ObjectBuilder):
     """Base class of objects mounted on a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[
@@ -276,7 +278,7 @@ class MountedObjectKind(ObjectKind):
         return self.mount is None or not self.mount.parent_frame
 
 
-OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
+OBJECT_KINDS: Registry[type[ObjectBuilder]] = Registry("kind")
 
 
 def init_command_object_factories() -> dict[str, InitCommandObjectFactory]:

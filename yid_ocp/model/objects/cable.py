@@ -37,7 +37,7 @@ from yid_ocp.model.flexible import (
     flexible_object,
 )
 from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement, symbolic_rotation_from_axis_angle
-from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
+from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectBuilder
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, System, SystemBuildArguments, floating_joint_mechanism
 from yid_ocp.options import OptionInfo
@@ -47,7 +47,7 @@ MEMORY_HALVING_SPEED_PARAMETER_NAME = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
 # Parameters of a joint whose rest angle follows from the start: its angle [rad] and torque [N m] there.
-START_ANGLE_AND_LOAD_SUFFIXES = ("start", "load")
+START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES = ("start", "load")
 # Parameter set to the root mean square speed of the measured points at the start [m/s].
 START_SPEED_PARAMETER_NAME = "start.speed"
 
@@ -189,7 +189,7 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     for spring in item.elastic_joints:
         angle, load = (
             Parameter(f"{spring.joint_name}.{suffix}", 0.0, unit, description=text)
-            for suffix, (unit, text) in zip(START_ANGLE_AND_LOAD_SUFFIXES, told, strict=True)
+            for suffix, (unit, text) in zip(START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES, told, strict=True)
         )
         entries += [angle, load]
         shift = angle.symbol - load.symbol / (spring.stiffness + _MIN_STIFFNESS)
@@ -268,7 +268,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             damping=branch.bend_damping,
             twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
             stiffness_given_as_rigidity=True,
-            has_link_length_parameters=options.has_edge_lengths_per_recording,
+            has_length_parameter_per_link=options.has_edge_lengths_per_recording,
         )
         segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
         segment = replace(segment, rest_rotation=own[0], link_rest_rotations=own[1:], clamped_edge_length=before)
@@ -278,7 +278,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
 
 @OBJECT_KINDS.register("cable")
 @dataclass(frozen=True, kw_only=True)
-class Cable(CableOptions, ObjectKind):
+class Cable(CableOptions, ObjectBuilder):
     """A branched cable held by clamps at two ends. The clamps follow measured points; recordings give edge lengths."""
 
     settings_examples: ClassVar[Mapping[str, str]] = {

@@ -12,7 +12,7 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectKind
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectBuilder
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -49,9 +49,11 @@ class FlexibleSegmentSettings:
     stiffness_given_as_rigidity: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
-    has_link_length_parameters: Annotated[bool, OptionInfo("whether every link has its own length parameter")] = False
+    has_length_parameter_per_link: Annotated[bool, OptionInfo("whether every link has its own length parameter")] = (
+        False
+    )
 
-    def segment(self, name: str, damping: float, link_division: int) -> Segment:
+    def build_segment(self, name: str, damping: float, link_division: int) -> Segment:
         """Build the named `Segment`. Links are divided into `link_division` links at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
             what, where, hint = f"segment '{name}' has no length", f"model.object.segments.{name}", "set one of the two"
@@ -69,7 +71,7 @@ class FlexibleSegmentSettings:
             "joint_axes",
             "cross_section_size",
         )
-        options: dict[str, Any] = {key: getattr(self, key) for key in (*same, "has_link_length_parameters")}
+        options: dict[str, Any] = {key: getattr(self, key) for key in (*same, "has_length_parameter_per_link")}
         return Segment(
             name,
             self.length if self.length is not None else float(sum(lengths or ())),
@@ -95,23 +97,23 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
 
 def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
     item = SegmentedObject(segments=segments)
-    return InitCommandObject(item, base.bending_start_values(item.build_segments(), _RIGIDITY_RATIO[word]))
+    return InitCommandObject(item, base.initial_bending_values(item.build_segments(), _RIGIDITY_RATIO[word]))
 
 
 def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_DESCRIPTIONS)
+    length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_AND_MASS_DESCRIPTIONS)
     section = _section(numbers)
     segment = _init_segment(links, length, mass, None if section else radius, cross_section_size=section)
     return _init_object("cable", {"cable": segment})
 
 
 def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    sizes = {name: base.SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
+    sizes = {name: base.SIZE_AND_MASS_DESCRIPTIONS[name] for name in ("length", "mass")}
     length, mass = base.required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
     if section is None and "radius" not in numbers:
         what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
-        raise ConfigError(what, where="--radius", allowed=base.SIZE_DESCRIPTIONS["radius"], hint=hint)
+        raise ConfigError(what, where="--radius", allowed=base.SIZE_AND_MASS_DESCRIPTIONS["radius"], hint=hint)
     radius = None if section else float(numbers["radius"])
     return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section_size=section)})
 
@@ -123,7 +125,9 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
         allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
         hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
         raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
-    length, mass, radius = base.required_object_numbers("each branch of a tree", numbers, base.SIZE_DESCRIPTIONS)
+    length, mass, radius = base.required_object_numbers(
+        "each branch of a tree", numbers, base.SIZE_AND_MASS_DESCRIPTIONS
+    )
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="a whole number from 1 to 16")
@@ -172,7 +176,7 @@ def _branch(text: str, links: int) -> tuple[str, FlexibleSegmentSettings]:
 
 @OBJECT_KINDS.register("segments")
 @dataclass(frozen=True, kw_only=True)
-class SegmentedObject(MountedObjectKind):
+class SegmentedObject(MountedObjectBuilder):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
@@ -208,4 +212,4 @@ stiffness_given_as_rigidity: true, clamped_at_base: true}
     )
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        return [s.segment(name, damping, link_division) for name, s in self.segments.items()]
+        return [s.build_segment(name, damping, link_division) for name, s in self.segments.items()]

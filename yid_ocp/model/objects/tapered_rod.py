@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, Segment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectKind
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectBuilder
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -23,15 +23,15 @@ _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     length, mass, radius, tip = base.required_object_numbers(
-        "a tapered rod", numbers, base.SIZE_DESCRIPTIONS | _FURTHER_NUMBERS
+        "a tapered rod", numbers, base.SIZE_AND_MASS_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitCommandObject(item, base.bending_start_values(item.build_segments(), 1.0))
+    return InitCommandObject(item, base.initial_bending_values(item.build_segments(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
 @dataclass(frozen=True, kw_only=True)
-class TaperedRod(MountedObjectKind):
+class TaperedRod(MountedObjectBuilder):
     """A solid round rod whose radius changes linearly from the clamped base to the tip. The segment is named `rod`.
 
     `rod.bend` and `rod.twist` [N m^2] and `rod.damping` [N m^2 s] are the values at the base. At radius r they are

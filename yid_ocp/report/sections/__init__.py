@@ -65,7 +65,7 @@ def register_report_section(name: str, order: int, title: str) -> Callable[[_Pre
     return enter
 
 
-def figures_by_unit(
+def draw_figure_per_unit(
     rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any]
 ) -> list[tuple[str, Any]]:
     """Draw one figure per unit from rows (name, unit, row). Returns pairs (empty title, figure)."""

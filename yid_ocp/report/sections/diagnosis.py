@@ -12,13 +12,13 @@ from yid_ocp.arrays import Array
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
-from yid_ocp.effects.law import LAW_QUANTITY_UNITS, LawTable
-from yid_ocp.inference.null_test import residual_channel_indices
+from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
+from yid_ocp.inference.null_test import residual_channels
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
-from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
+from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
 from yid_ocp.report.terminal import format_error_value_and_unit, scale_and_unit_with_metres_as_mm
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
@@ -88,7 +88,9 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
 def _before_after_figures(
     rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
 ) -> _TitledFigures:
-    return figures_by_unit(rows, lambda own, unit: figures.values_before_after_figure(own, f"{axis} [{unit}]", words))
+    return draw_figure_per_unit(
+        rows, lambda own, unit: figures.values_before_after_figure(own, f"{axis} [{unit}]", words)
+    )
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
@@ -193,7 +195,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         found = [event for event in events.for_recording(force.recording) if event.channel == force.coordinate]
         pulses = [(e.detected_pulse, e.start_time, e.end_time) for e in found if e.detected_pulse is not None]
         shape = sum((pulse.filtered_force_at(force.t) for pulse, *_ in pulses), np.zeros(len(force.t)))
-        courses = (shape, force.allowed_model_error, -force.allowed_model_error)
+        courses = (shape, force.assumed_model_error, -force.assumed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
         plot = TimePlotData(title, lines, force.t, force.max_likelihood_forces, marked_intervals=spans)
@@ -211,7 +213,7 @@ def _recording_figures(
 def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
     # predicted decrease of r'r in per cent of its excess over noise, or absolute if there is little excess
     fit = finding.nominal_model
-    rows = np.concatenate([series.residual_indices for series in residual_channel_indices(fit.problem)])
+    rows = np.concatenate([series.residual_indices for series in residual_channels(fit.problem)])
     excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
     percent = finding.verdict != "no_gap" and excess > 0
     factor = 100 / excess if percent else 1.0
@@ -256,7 +258,7 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
         at = np.linspace(low, high, 200)
         torque, std = table.interpolated_torque(at), np.interp(at, table.knots, table.torque_std)
         nearest = _library_curves(table, at)
-        words = (f"{table.quantity} [{LAW_QUANTITY_UNITS[table.quantity]}]", "torque [N m]")
+        words = (f"{table.quantity} [{TORQUE_LAW_QUANTITY_UNITS[table.quantity]}]", "torque [N m]")
         visited = law.visited_range[table.quantity]
         shown.append((law.location, figures.estimated_curve_figure((at, torque, std), nearest, visited, *words)))
     rival = law.runner_up
@@ -270,7 +272,7 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
     return "A law without a name", sentences, shown
 
 
-def _library_curves(table: LawTable, at: Array) -> dict[str, Array]:
+def _library_curves(table: TorqueLawTable, at: Array) -> dict[str, Array]:
     """The curve of the library's laws that best fits a table, by weighted least squares of its amplitudes."""
     shapes: dict[str, Callable[[Array], Sequence[Array]]] = {}
     if table.quantity == "speed":

@@ -19,10 +19,10 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.predictions import ChannelPrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
-from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, scenes_to_dict
+from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, animations_to_dict
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import interval_and_p_value_calibration_rates
-from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
+from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
 from yid_ocp.report.terminal import (
     SUMMARY_BY_RESULT_FORMAT,
     StatementTableOrCode,
@@ -77,7 +77,7 @@ def _estimates(findings: ReportData) -> list[tuple[str, Any]]:
         if entry.get("free") and "initial" in entry:
             found = entry["verdict"] not in lost and result["status"] != "failed"
             rows.append((name, entry["unit"], (entry["value"], entry["std"], entry["initial"], found)))
-    return figures_by_unit(rows, figures.estimates_figure)
+    return draw_figure_per_unit(rows, figures.estimates_figure)
 
 
 @register_report_section("search", 40, "How it was found")
@@ -117,7 +117,7 @@ def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
             known = {r: own for r, own in entry["values"].items() if own.get("verdict") != "not_identifiable"}
             values = {run: (own["value"], own["std"]) for run, own in known.items()}
             rows.append((name, entry["unit"], values))
-    return figures_by_unit(rows, figures.parameter_values_by_source_figure)
+    return draw_figure_per_unit(rows, figures.parameter_values_by_source_figure)
 
 
 @register_report_section("methods", 10, "Methods")
@@ -131,7 +131,7 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
             own = {method: e["parameters"][name] for method, e in findings.result["methods"].items()}
             values = {m: (e["value"], None if comparison.has_process_noise else e["std"]) for m, e in own.items()}
             rows.append((name, entry["unit"], values | {"solve": (entry["value"], entry["std"])}))
-    for _, figure in figures_by_unit(rows, figures.parameter_values_by_source_figure):
+    for _, figure in draw_figure_per_unit(rows, figures.parameter_values_by_source_figure):
         yield "Estimates", figure
     costs = {}
     for run in comparison.method_results:
@@ -260,7 +260,7 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
             told = ConfigurationTrajectory("predicted", system, own.theta, grid.node_times, q)
             scenes.append(animation_of_trajectories(f"{own.episode.name} ({own.role})", [told], own.episode.recording))
     scenes = [entry for entry in scenes if len(entry.t) > 1]
-    text = json.dumps(scenes_to_dict(scenes[:_MAX_ANIMATIONS], findings.robot), separators=(",", ":"))
+    text = json.dumps(animations_to_dict(scenes[:_MAX_ANIMATIONS], findings.robot), separators=(",", ":"))
     both = any(
         motion.name == "measured" and motion.point_indices and len(entry.motions) > 1
         for entry in scenes
