@@ -268,7 +268,7 @@ def test_no_weak_prior_stays_none_and_encoders_without_noise_need_none(problem_o
     ],
 )
 def test_a_fraction_of_what_is_not_stated_is_refused(problem_of, role, group, entry, missing):
-    with pytest.raises(ConfigError, match=f"noise in the {missing} of '{group}'"):
+    with pytest.raises(ConfigError, match=f"needs the {missing} of '{group}'"):
         _with_noise_only_stds(problem_of(role, STATED | {group: entry}), SETTINGS)
 
 

@@ -242,7 +242,7 @@ def test_a_file_is_run_once_and_its_kind_is_there(kinds, pendulum) -> None:
         ("import sys\nsys.exit(3)\n", ["raised SystemExit: 3", "line 2"]),
         ("def f(:\n", ["raised SyntaxError", "line 1"]),
         ("import nothing_like_this\n", ["raised ModuleNotFoundError", "line 1"]),
-        (EFFECT.format(kind="density"), ["'density' is taken", "another name"]),
+        (EFFECT.format(kind="density"), ["already has the name 'density'", "another name"]),
         (EFFECT.format(kind="half") + "1 / 0\n", ["raised ZeroDivisionError", "line 21"]),
     ],
 )
