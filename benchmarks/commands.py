@@ -41,9 +41,41 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "diagnose_baxter": ("diagnose", "configs/baxter_arm.yaml"),
     "diagnose_cable": ("diagnose", "configs/deft_bdlo1.yaml"),
 }
+NOISY: Mapping[str, str] = {"diagnose_torque_noise": "clean", "diagnose_torque_noise_gap": "damped_trunk"}
+"""Diagnoses of one arm with two recordings of 5 s that state errors of torques, by the case of `diagnosis_cases.py`."""
 USUAL = ("solve", "diagnose", "check", "identifiability", "simulate")
 UNIT_CALLS = 100_000
 LIMIT = 7200.0  # [s]
+
+
+def with_torque_noise(case: str, folder: Path) -> tuple[str, ...]:
+    """The command that diagnoses a case whose recordings, made in a folder, state noise and offsets of torques."""
+    from diagnosis_cases import CASES
+    from make_recordings import TRAVEL, TRUTH
+
+    from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+    from yid_ocp.data.recording_hdf5 import write_recording
+    from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
+    from yid_ocp.virtual.injected import run_experiment_with_effects
+    from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
+    from yid_ocp.workflow.build import build_system
+
+    system = build_system(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
+    posture, travel = grasping_joint_angles(system, TRUTH), MultisineOptions(gripper_travel=TRAVEL[1])
+    command = ["diagnose", "--set", "diagnosis.candidates=all"]
+    for role, seed, noise_seed in (("estimate", 1, 401), ("held_out", 7, 402)):
+        file, noise = folder / f"{case}_{role}.h5", ArmSensorNoise(effort_std=0.1, effort_bias_std=0.3)
+        start = {"seed": seed, "initial_joint_angles": posture, "excitation": travel}
+        motion = random_multisine_motion(system, TRUTH, **start)
+        settings = VirtualExperimentSettings(
+            motion=motion, initial_joint_angles=posture, seed=noise_seed, recording_name=file.stem, arm_noise=noise
+        )
+        withheld = CASES[case].withheld
+        run = (withheld, settings) if withheld else (settings,)
+        recording = (run_experiment_with_effects if withheld else run_virtual_experiment)(system, TRUTH, *run)
+        write_recording(recording, file)
+        command += ["--set", f"recordings.{role}=[{file}]"]
+    return tuple(command)
 
 
 @dataclass(frozen=True)
@@ -101,13 +133,14 @@ def compared(
     """Costs of every command of every checkout, in turn."""
     costs: dict[tuple[str, str], list[Cost]] = {(name, which): [] for name in names for which in checkouts}
     with tempfile.TemporaryDirectory() as folder:
+        commands = {**COMMANDS, **{n: with_torque_noise(NOISY[n], Path(folder)) for n in names if n in NOISY}}
         for repeat in range(repeats if cold else repeats + 1):
             for name, which in costs:
                 cache = Path(folder) / which
                 if cold:
                     shutil.rmtree(cache, ignore_errors=True)
                 cache.mkdir(mode=0o700, exist_ok=True)
-                cost = measured(COMMANDS[name], checkouts[which], cache)
+                cost = measured(commands[name], checkouts[which], cache)
                 if repeat or cold:
                     costs[name, which].append(cost)
     return costs
@@ -116,15 +149,17 @@ def compared(
 def main(arguments: list[str] | None = None) -> int:
     """Measure, show, and hold against what was stored; 1 where `--gate` finds a regression."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(COMMANDS)}; usual: {', '.join(USUAL)}")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"{', '.join([*COMMANDS, *NOISY])}; usual: {', '.join(USUAL)}"
+    )
     parser.add_argument("--base", type=Path, metavar="DIR", help="another checkout, run in turn with this one")
     parser.add_argument("--cold", action="store_true", help="with an empty cache each time")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the multiples")
     parser.add_argument("--gate", action="store_true", help="exit with 1 where one regressed against baseline.json")
     given = parser.parse_args(arguments)
-    if unknown := sorted(set(given.names) - set(COMMANDS)):
-        parser.error(f"there is no command '{unknown[0]}'; known: {', '.join(COMMANDS)}")
+    if unknown := sorted(set(given.names) - {*COMMANDS, *NOISY}):
+        parser.error(f"there is no command '{unknown[0]}'; known: {', '.join([*COMMANDS, *NOISY])}")
     names = given.names or list(USUAL)
     checkouts = {"here": REPOSITORY} | ({"base": given.base.resolve()} if given.base else {})
     first = unit()
