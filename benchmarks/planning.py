@@ -238,9 +238,9 @@ def found(run: RunSettings, folder: Path) -> tuple[Array, Step]:
             std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
             print(f"  {name}: {entry['value']:.4g} +- {std} {entry['unit']} (true {TRUTH.get(name, HANGING.values)})")
     step = compile_step_for_planning(run)
-    return identified_parameters_with_covariance(replace(run, plan=replace(run.plan, parameter_run=str(folder))), step)[
-        0
-    ], step
+    return identified_parameters_with_covariance(
+        replace(run, plan=replace(run.plan, parameter_run_folder=str(folder))), step
+    )[0], step
 
 
 def ten_goals(folder: Path, count: int, noise: int) -> None:

@@ -80,7 +80,7 @@ def default(value: Any) -> str:
 
 EXAMPLES: Mapping[str, str] = {
     "virtual_arm": """\
-virtual_arm: {friction: load, link_mass_deviation: 0.03, encoder_counts: 4096}
+virtual_arm: {friction: load, max_relative_link_mass_error: 0.03, encoder_counts: 4096}
 """,
     **{section: text for kind in OBJECT_KINDS for section, text in OBJECT_KINDS[kind].settings_examples.items()},
     "The file": """\
@@ -255,7 +255,7 @@ plan:
   point: w_T3
   target_offset_from_start: [0.05, 0.0, 0.1]                    # [m]
   duration: 1.0                              # [s]
-  parameter_run: runs/my_solve
+  parameter_run_folder: runs/my_solve
 """,
     "plan.limits": """\
 plan:

@@ -109,7 +109,7 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
 
 def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_path):
     folder = solved(tmp_path / "solved", 4.0, 0.25)
-    run = load_config(config, [f"plan.parameter_run={folder}"])
+    run = load_config(config, [f"plan.parameter_run_folder={folder}"])
     step = _compile_step_for_planning(run)
     theta, known, source = identified_parameters_with_covariance(run, step)
     assert theta[step.system.parameters.index("elbow.stiffness")] == 4.0
@@ -119,7 +119,7 @@ def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_p
     outcome = run_plan(run, tmp_path / "out")
     assert max(outcome.result["std"]) > 1e-4
     # what is not known is not counted, and said
-    run = load_config(config, [f"plan.parameter_run={solved(tmp_path / 'unsure', 4.0, np.inf)}"])
+    run = load_config(config, [f"plan.parameter_run_folder={solved(tmp_path / 'unsure', 4.0, np.inf)}"])
     _, known, source = identified_parameters_with_covariance(run, step)
     assert known.parameter_names == ()
     assert source["uncertainty_unknown"] == ["elbow.stiffness"]
@@ -136,7 +136,7 @@ def test_a_plan_that_fails_says_so(config, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.parameter_run=nowhere"], ("no finished run of `solve`", "plan.parameter_run")),
+        (["plan.parameter_run_folder=nowhere"], ("no finished run of `solve`", "plan.parameter_run_folder")),
         (["plan.goal=throw"], ("plan.goal", "place, path, box")),
         (["plan.limits.velocity_fraction=2"], ("plan.limits.velocity_fraction", "up to 1")),
         (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?", "pendulum.yaml")),
@@ -148,14 +148,14 @@ def test_wrong_input_leaves_nothing(config, refused, settings, words):
 
 def test_a_run_that_failed_and_one_of_another_command_are_refused(config, tmp_path, refused):
     failed, other = solved(tmp_path / "failed", 4.0, 0.1, status="failed"), diagnosed(tmp_path / "diagnosed", 4.0)
-    refused(config, [f"plan.parameter_run={failed}"], ("failed: made up",))
-    refused(config, [f"plan.parameter_run={other}"], ("run folder of another command (yid-diagnosis/2)",))
+    refused(config, [f"plan.parameter_run_folder={failed}"], ("failed: made up",))
+    refused(config, [f"plan.parameter_run_folder={other}"], ("run folder of another command (yid-diagnosis/2)",))
 
 
 def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
     more = {"point_mass@tip.mass": {"value": 0.1, "free": True}}
     folder = solved(tmp_path / "solved", 4.0, 0.1, **more)
-    chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run={folder}")
+    chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run_folder={folder}")
     assert main(list(chosen)) == 2
     told = capsys.readouterr().err
     assert "has the effect point_mass@tip, which this model does not have" in told
@@ -186,11 +186,11 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
     section = discrimination_plan_settings([[pair(label) for label in PAIR]], folder)
-    assert section == {"goal": "information", "discriminate": list(PAIR), "parameter_run": str(folder)}
+    assert section == {"goal": "information", "discriminate": list(PAIR), "parameter_run_folder": str(folder)}
     assert discrimination_plan_settings([], folder) is None
     command = _planning_command(section)
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
-    overrides = [f"plan.discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run={folder}"]
+    overrides = [f"plan.discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run_folder={folder}"]
     assert all(f"'{text}'" in command or text in command for text in overrides)
     outcome = run_plan(load_config(informing, [*overrides, "plan.max_iterations=3"]), tmp_path / "out")
     assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
@@ -207,7 +207,10 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
         (["plan.identify=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")),
         (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
         (["recordings.estimate=[]"], ("no recording to estimate on",)),
-        (["plan.parameter_run=nowhere"], ("no finished run of `solve` or `diagnose`", "plan.parameter_run")),
+        (
+            ["plan.parameter_run_folder=nowhere"],
+            ("no finished run of `solve` or `diagnose`", "plan.parameter_run_folder"),
+        ),
         (["plan.duration=0.1", "plan.hold_duration=0.1"], ("too short", "plan.duration")),
     ],
 )

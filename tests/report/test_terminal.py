@@ -253,7 +253,11 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)
-    section = {"goal": "information", "discriminate": ["density@T3", "point_mass@w_T3"], "parameter_run": "runs/mine"}
+    section = {
+        "goal": "information",
+        "discriminate": ["density@T3", "point_mass@w_T3"],
+        "parameter_run_folder": "runs/mine",
+    }
     command = next(line for line in told("yid-diagnosis/2", result | {"next_plan": section}) if "yid-ocp plan" in line)
     assert "'plan.discriminate=[density@T3, point_mass@w_T3]'" in command
 

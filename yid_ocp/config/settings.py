@@ -424,7 +424,7 @@ class _TrackSettings:
 class _PlanSettings(PlanOptions):
     """Goal of a planned motion and the run that supplies the parameters."""
 
-    parameter_run: Annotated[
+    parameter_run_folder: Annotated[
         _FilePath | None,
         OptionInfo("run folder of `solve` (or `diagnose`) with parameters and covariance; default: the initial values"),
     ] = None

@@ -210,7 +210,7 @@ def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) 
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
         what, where = "the uncertainty of the parameters is not known", "plan.minimize_parameter_sensitivity"
-        raise ConfigError(what, where=where, allowed="plan.parameter_run: FOLDER of `solve`")
+        raise ConfigError(what, where=where, allowed="plan.parameter_run_folder: FOLDER of `solve`")
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
     slope = _point_slopes(rows, rows.quasi_static_coefficients, known)

@@ -104,7 +104,7 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 
 
 def _planning_command(section: Mapping[str, Any]) -> str:
-    words = ["yid-ocp", "plan", str(Path(section["parameter_run"]) / "config.yaml")]
+    words = ["yid-ocp", "plan", str(Path(section["parameter_run_folder"]) / "config.yaml")]
     for key, value in section.items():
         text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
         words += ["--set", f"plan.{key}={text}"]

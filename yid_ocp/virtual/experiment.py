@@ -75,7 +75,7 @@ class ArmSensorNoise:
     point_std: float = 1e-3
     records_effort_std: bool = True
     position_resolution: float = 0.0  # step of the encoders, which count after the noise; none at zero [rad]
-    lost_fraction: float = 0.0  # fraction of the joints' samples that are lost, never the first or last two
+    lost_sample_fraction: float = 0.0  # fraction of the joints' samples that are lost, never the first or last two
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class VirtualArmOptions:
         Literal["none", "varied", "coulomb", "stribeck", "load", "load_stribeck"],
         OptionInfo("law of the joints' dry friction, which MuJoCo's solver simulates; varied: one law per experiment"),
     ] = "varied"
-    link_mass_deviation: Annotated[
+    max_relative_link_mass_error: Annotated[
         float,
         Ge(0),
         Le(0.2),
@@ -98,7 +98,9 @@ class VirtualArmOptions:
     period_jitter_std: Annotated[
         float, Ge(0), Le(2e-3), OptionInfo("standard deviation of the controller's and recorder's tick times", "s")
     ] = 5e-4
-    lost_fraction: Annotated[float, Ge(0), Le(0.2), OptionInfo("fraction of the joints' samples that are lost")] = 0.01
+    lost_sample_fraction: Annotated[
+        float, Ge(0), Le(0.2), OptionInfo("fraction of the joints' samples that are lost")
+    ] = 0.01
 
 
 @dataclass(frozen=True)
@@ -197,7 +199,7 @@ def _joints(
     velocity = _noisy(run.v[:, driven], noise.velocity_std, streams["velocity"])
     effort = _noisy(run.effort, 0.0 if system.servos else white, streams["effort"]) + offset
     kept = np.ones(len(run.t), bool)
-    kept[2:-2] = streams["clock"].random(len(run.t) - 4) >= noise.lost_fraction
+    kept[2:-2] = streams["clock"].random(len(run.t) - 4) >= noise.lost_sample_fraction
     joints = JointGroup(tuple(system.driven), run.t[kept], position[kept], velocity=velocity[kept])
     joints = replace(joints, position_std=noise.position_std, velocity_std=noise.velocity_std)
     if noise.position_resolution:
@@ -260,9 +262,9 @@ def _how_it_was_made(experiment: VirtualExperimentSettings, system: System, seen
     )
     if noise.position_resolution:
         made += f"; encoders count in steps of {noise.position_resolution:.3g} rad"
-    if simulation.period_jitter_std or noise.lost_fraction:
-        made += f"; periods vary by {1e3 * simulation.period_jitter_std:g} ms, {noise.lost_fraction:.1%} of the samples"
-        made += " of joints are lost"
+    if simulation.period_jitter_std or noise.lost_sample_fraction:
+        made += f"; periods vary by {1e3 * simulation.period_jitter_std:g} ms, {noise.lost_sample_fraction:.1%} of the"
+        made += " samples of joints are lost"
     if camera is None or not seen:
         return made + "; no camera."
     return made + f", camera {1e3 * camera.point_std:g} mm at about {camera.frame_rate:g} Hz."

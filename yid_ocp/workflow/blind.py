@@ -339,7 +339,10 @@ class _ExperimentVariation:
     def simulation_overrides(self, arm: VirtualArmOptions) -> tuple[str, ...]:
         # settings of the object and its sensors do not apply without it
         bare = ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
-        own = (f"model.arms.link_mass_std={arm.link_mass_deviation}", *(bare if self.is_without_object else ()))
+        own = (
+            f"model.arms.link_mass_std={arm.max_relative_link_mass_error}",
+            *(bare if self.is_without_object else ()),
+        )
         return own if arm.friction == "none" else (*own, "model.friction=null")
 
     def diagnosis_overrides(self, driven: Sequence[str], arm: VirtualArmOptions) -> list[str]:
@@ -397,7 +400,7 @@ class _BlindExperiment:
         arm, step = self._virtual_arm, DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor
         noise = ArmSensorNoise(
             position_resolution=2 * math.pi / arm.encoder_counts if arm.encoder_counts else 0.0,
-            lost_fraction=arm.lost_fraction,
+            lost_sample_fraction=arm.lost_sample_fraction,
         )
         if varied.has_torque_noise:
             noise = replace(noise, effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)

@@ -104,7 +104,7 @@ def identified_parameters_with_covariance(
     """Parameters, their covariance and their source: a run folder of `solve`, or the settings."""
     parameters = step.system.parameters
     theta = parameters.vector()
-    if run.plan.parameter_run is None:
+    if run.plan.parameter_run_folder is None:
         values = {name: parameters[name].value for name in free_parameter_names(run, parameters)}
         return theta, ParameterCovariance(), {"run": None, "parameters": values}
     result, folder = _read_parameter_run(run, ("solve",))
@@ -170,7 +170,7 @@ def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
 
 
 def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
-    folder, where = Path(str(run.plan.parameter_run)), ("plan", "parameter_run")
+    folder, where = Path(str(run.plan.parameter_run_folder)), ("plan", "parameter_run_folder")
     file = folder / "result.json"
     if not file.is_file() or not (folder / "trajectories.h5").is_file():
         what = f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}"
@@ -194,7 +194,7 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
     values = {name: float(problem.theta[known.index(name)]) for name in problem.free}
     sizes: dict[str, dict[str, float]] = {}
     origin = None
-    if run.plan.parameter_run is not None:
+    if run.plan.parameter_run_folder is not None:
         result, origin = _read_parameter_run(run, ("solve", "diagnose"))
         found, sizes = _parameter_and_effect_values(result)
         _require_same_effects(run, found, known.names)
@@ -207,9 +207,11 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
 def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collection[str]) -> None:
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
-        what = f"{run.plan.parameter_run} has the effect {', '.join(lacking)}, which this model does not have"
+        what = f"{run.plan.parameter_run_folder} has the effect {', '.join(lacking)}, which this model does not have"
         hint = "list the same effects under model.effects"
-        raise run.config_error(what, "plan", "parameter_run", allowed="a run of `solve` on the same model", hint=hint)
+        raise run.config_error(
+            what, "plan", "parameter_run_folder", allowed="a run of `solve` on the same model", hint=hint
+        )
 
 
 def _parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
@@ -246,4 +248,8 @@ def discrimination_plan_settings(
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]
-    return {"goal": "information", "discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS], "parameter_run": str(folder)}
+    return {
+        "goal": "information",
+        "discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS],
+        "parameter_run_folder": str(folder),
+    }
