@@ -240,7 +240,7 @@ def test_a_sealed_text_is_sorted_holds_all_and_opens_only_as_it_was():
     assert text.index('"case"') < text.index('"injected"') < text.index('"truth"')
     assert len(digest) == 64
     assert open_sealed_labels(text, digest)[0].injected == (KV,)
-    with pytest.raises(DataError, match="committed"):
+    with pytest.raises(DataError, match="commitment"):
         open_sealed_labels(text.replace("0.05", "0.06"), digest)
 
 
@@ -405,7 +405,7 @@ def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path,
         ({"code": "newer"}, "another ensemble"),
         ({"slice": "2/3"}, "another ensemble"),
         ({"slice": "1/2"}, "given twice"),
-        ({"labels_sha256": "0"}, "committed"),
+        ({"labels_sha256": "0"}, "commitment"),
     ],
 )
 def test_slices_count_together_only_with_one_hash(tmp_path, changes, words):
