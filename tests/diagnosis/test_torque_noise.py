@@ -16,6 +16,7 @@ from yid_ocp.diagnosis.diagnose import _held_out_null_test, fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
+from yid_ocp.effects import make_effect
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_unknown_forces
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
@@ -26,8 +27,9 @@ from yid_ocp.inference.whitening import (
     problem_with_whitening_at,
     problem_without_input_errors,
 )
-from yid_ocp.integrator.step import Step, compile_step, simulate
+from yid_ocp.integrator.step import Step, compile_step, moving_observable_state_mask, simulate
 from yid_ocp.model import System
+from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -148,6 +150,19 @@ def test_candidates_of_other_places_are_left_out_of_a_refit(step):
     assert names[0] == names[1]
     for every, single in zip(*values, strict=True):
         np.testing.assert_allclose(single, every, rtol=1e-6, atol=1e-6 * np.abs(every).max())
+
+
+def test_states_that_no_error_reaches_are_left_out_of_a_filter():
+    """A neutral mount's joints stand still, although equations of a step have them in every row."""
+    bare = System.build(objects=[(flexible_object([Segment("rod", 0.4, 0.1, 0.01, links=2)]), None, None)])
+    mounted = compile_step(bare.with_effects([make_effect("mount_compliance", "base", bare)]), TIME_STEP)
+    joints = np.array(["@" not in name for name in mounted.system.mechanism.joint_names])
+    own, theta = np.tile(joints, 2), mounted.system.parameters.vector()
+    swept = simulate(mounted, theta, np.where(own, 0.01, 0.0), 20)
+    assert moving_observable_state_mask(mounted, theta, swept).all()
+    found = moving_observable_state_mask(mounted, theta, swept, disturbed=own)
+    assert found.tolist() == own.tolist()
+    assert not own.all()
 
 
 def test_noise_that_drives_the_motion_is_no_gap(step):
