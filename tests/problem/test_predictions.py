@@ -139,7 +139,7 @@ def test_a_frame_has_every_parameter_and_its_interval(problem, monkeypatch):
             ends = [math.inf if end is None else abs(end) for end in entry.interval]
             assert [abs(row["lower"]), abs(row["upper"])] == ends
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
-    with pytest.raises(ConfigError, match="pandas is not installed") as caught:
+    with pytest.raises(ConfigError, match="needs the package pandas") as caught:
         solution.to_dataframe()
     assert "yid-ocp[pandas]" in caught.value.hint
 

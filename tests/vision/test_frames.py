@@ -175,7 +175,7 @@ def test_broken_files_fail_when_loaded(folder, capfd):
         sequence.load_cloud(1)
     assert "ply" not in capfd.readouterr().out.lower()
     shutil.rmtree(folder)
-    with pytest.raises(DataError, match="no such folder"):
+    with pytest.raises(DataError, match="no such file or folder"):
         read_frames(folder)
 
 
