@@ -114,9 +114,10 @@ def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Arr
     at = recorded_point_positions(recording, points)
     if not 1 <= given < len(at):
         raise DataError(
-            f"given = {given} frames of the recording",
-            where=f"recording '{recording.name}'",
+            f"given = {given} frames are not possible with the {len(at)} frames of recording '{recording.name}'",
+            where="argument `given`, the number of frames that the predictor may read",
             allowed=f"1 to {len(at) - 1}",
+            hint="give fewer frames, so that at least one is left to predict",
         )
     if not np.all(np.isfinite(at[given - 1])):
         hidden = points[int(np.argmin(np.isfinite(at[given - 1]).all(axis=1)))]

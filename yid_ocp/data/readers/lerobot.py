@@ -273,8 +273,9 @@ def _matrix(column: Any, name: str, folder: Path) -> Array:
         n_lengths = max(n_lengths, len(compute.unique(compute.list_value_length(column))))
         column = column.flatten()
     if n_lengths > 1 or len(column) < rows:
-        what, allowed = f"{name} has different counts of numbers in its frames", "equally many numbers in every frame"
-        raise DataError(what, where=str(folder), allowed=allowed, hint="convert the dataset again, or record it again")
+        what, allowed = f"the lists of column '{name}' differ in length", "as many numbers in every frame"
+        hint = "find the frames with other lengths and remove them, or convert the dataset again"
+        raise DataError(what, where=str(folder), allowed=allowed, hint=hint)
     return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
 
 
