@@ -334,6 +334,12 @@ def test_a_case_keeps_its_own_thresholds_as_far_as_there_still_are_such():
     assert judge_recorded_case(made, {})["verdict"] == "unknown"
 
 
+def test_a_case_of_an_earlier_version_is_refused():
+    made = diagnosis_evidence_to_dict(diagnosed()) | {"format": "yid-evidence/1"}
+    with pytest.raises(DataError, match="'yid-evidence/1'"):
+        judge_recorded_case(made, {})
+
+
 def test_a_case_without_a_place_of_its_gap_is_not_judged_where_thresholds_see_one():
     assert again(replace(diagnosed(), located_gap=None))[0] == "not_judged"
 

@@ -29,6 +29,7 @@ from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalModelGapEvid
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
+from yid_ocp.errors import DataError
 from yid_ocp.files import dataclass_from_plain_data, to_json_types, to_lossless_plain_data
 from yid_ocp.inference.null_test import NullTestResult
 from yid_ocp.inference.smoother import GapLocation, gap_locations_from_effect_closures
@@ -425,9 +426,7 @@ def _rounded(value: float, up: bool) -> float:
     return round(whole / 10.0**digits, max(digits, 0))
 
 
-# -- judged again -----------------------------------------------------------------------------------------------------
-
-_EVIDENCE_FORMAT = "yid-evidence/1"
+_EVIDENCE_FORMAT = "yid-evidence/2"  # 1 had standard deviations of amplitudes in place of p-values of effects
 _MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of two candidates is recorded
 
 
@@ -525,7 +524,15 @@ def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> 
 
     The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
     `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,
-    time step, other starts) are not repeated."""
+    time step, other starts) are not repeated. `DataError` if another version recorded the case."""
+    if data.get("format") != _EVIDENCE_FORMAT:
+        what = f"the evidence has the format '{data.get('format')}'"
+        raise DataError(
+            what,
+            where="evidence in the recorded answer of a case",
+            allowed=_EVIDENCE_FORMAT,
+            hint="record the cases again with this version",
+        )
     known = {entry.name for entry in fields(Thresholds)}
     kept = {name: value for name, value in data["thresholds"].items() if name in known}
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))

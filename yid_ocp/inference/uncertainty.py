@@ -220,7 +220,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
 
     If the cost at the end of the 95 % interval is lower than predicted, the standard deviation follows from a parabola
     through this point. It is infinite if the cost does not rise."""
-    spread = std_from_covariance(covariance, x)
+    spread = _std_from_covariance(covariance, x)
     lower, upper = problem.bounds
     scale = max(1.0, _chi2_per_dof(problem, evaluation))
     parameters = parameter_unknown_names(problem)
@@ -251,7 +251,7 @@ def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
     return tuple(name for name in problem.unknown_names if name.split("[")[0] in parameters)
 
 
-def std_from_covariance(covariance: Array, x: Array) -> Array:
+def _std_from_covariance(covariance: Array, x: Array) -> Array:
     """Standard deviations from a covariance, (nx,). They are infinite where the covariance is NaN."""
     if not len(covariance):
         return np.zeros(len(x))
@@ -379,7 +379,7 @@ def parameter_estimates(
 
     Local parameters are listed by recording. If `x` is not a fit, `fit` is None, and misfit and bounds are ignored."""
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
-    spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
+    spread = _cost_checked_std(problem, x, evaluation, covariance) if known else _std_from_covariance(covariance, x)
     sizes, theta = typical_parameter_magnitudes(problem, x), problem.theta_and_initial_state_deviation(x, 0)[0]
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}
