@@ -174,7 +174,7 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, said):
 
 
 def test_a_law_has_a_place_and_a_quantity_there(system):
-    with pytest.raises(ConfigError, match="no place 'nowhere'"):
+    with pytest.raises(ConfigError, match="no location 'nowhere'"):
         make_torque_law("nowhere", system, tables())
     with pytest.raises(ConfigError, match="cannot depend on 'command'"):
         make_torque_law("elbow", system, tables(quantities=("command",)))

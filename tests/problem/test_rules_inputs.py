@@ -230,7 +230,7 @@ def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
     made = clamped(origin, hidden)
     np.testing.assert_allclose(_smoothed_point_path(made, "d", grid, PLAIN), np.tile([0.0, 0.0, 1.0], (5, 1)))
     hidden[2] = math.nan
-    with pytest.raises(DataError, match="'d' is seen 3 times"):
+    with pytest.raises(DataError, match="'d' is seen in 3 frames"):
         path_of(clamped(origin, hidden), grid, "zero")
     with pytest.raises(DataError, match="'x' is not recorded"):
         _smoothed_point_path(made, "x", grid, PLAIN)

@@ -299,7 +299,7 @@ def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_lim
     with pytest.raises(ModelError, match="the servo of 'lift' has a dead band"):
         mujoco_xml(system, values | {"lift.servo_dead_band": 0.01})
     limited = system.with_effects([make_effect("current_limit", "pan", system, {"limit": 1.5})])
-    with pytest.raises(ModelError, match="cannot express: dead band and current limit"):
+    with pytest.raises(ModelError, match="cannot express what the effect changes: dead band and current limit"):
         mujoco_xml(limited, values)
 
 

@@ -101,7 +101,7 @@ def test_a_result_is_not_lost_because_its_name_was_taken(settings, tmp_path, cap
     assert taken.read_text() == "theirs"
     assert folder.path == tmp_path / "run-2"
     assert (tmp_path / "run-2" / "a.txt").read_text() == "mine"
-    assert "was taken" in caplog.text
+    assert "in the meantime" in caplog.text
 
 
 def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, tmp_path):
