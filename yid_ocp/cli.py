@@ -1,6 +1,7 @@
 """Command-line interface: commands, their arguments and shell completion.
 
-`workflow` implements the commands. A command's module is imported when it runs; `--help` loads no numerical library."""
+`workflow` implements the commands. A command's module is imported when it runs; `--help` loads no numerical library.
+"""
 
 from __future__ import annotations
 
@@ -469,7 +470,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0: done. 1: the solve failed; the run folder states why. 2: wrong input, or an error of the operating system.
         3: a bug. 128 plus the signal number (130 for an interruption) if a signal ended the command. With `--json` an
-        error is also printed as `yid-error/1`: kind, what, where, allowed, hint and exit_code."""
+        error is also printed as `yid-error/1`: kind, what, where, allowed, hint and exit_code.
+    """
     if "_ARGCOMPLETE" in os.environ:
         _print_shell_completions(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)

@@ -58,7 +58,8 @@ class Progress:
 
         `work` is the expected time of the stage, `ahead` the expected time of all later stages [s]. Without `ahead`,
         the remaining time is reduced by `work`. A stage whose duration does not predict later stages (such as
-        compilation) is included in `ahead`."""
+        compilation) is included in `ahead`.
+        """
 
     def report_iterate(self, entry: Any) -> None:
         """Report an accepted iterate of a search (`solvers.base.Iterate`)."""

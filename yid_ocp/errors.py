@@ -11,7 +11,8 @@ from typing import TypeVar
 class YidError(Exception):
     """An error that the user can correct. It states what is wrong, where, what is allowed and what to do next.
 
-    Its text has all four parts, at most 600 characters in total, with control characters escaped."""
+    Its text has all four parts, at most 600 characters in total, with control characters escaped.
+    """
 
     _usual_allowed = "what docs/reference and docs/howto describe"
     _usual_hint = "correct it and run the command again"
@@ -112,7 +113,8 @@ _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none i
 def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str = "") -> dict[str, str]:
     """Arguments `allowed` and `hint` for an error about an unknown name. Long lists of names are shortened.
 
-    The hint is the most similar known name; `otherwise` if no name is similar."""
+    The hint is the most similar known name; `otherwise` if no name is similar.
+    """
     names = [str(entry) for entry in known]
     otherwise = otherwise or ("use one of the allowed names" if names else "leave it out")
     return {"allowed": _listed(name, names) or "none", "hint": nearest_name_question(name, names) or otherwise}

@@ -32,7 +32,8 @@ _MEMORY_OF_READING = 7 << 28  # address space for a library that reads a file [b
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
     """Check an input file and return its path. Raises `DataError` unless it is a regular file of at most `max_bytes`.
 
-    Every file that this package did not write or ship is checked, so pipes and devices are refused before reading."""
+    Every file that this package did not write or ship is checked, so pipes and devices are refused before reading.
+    """
     allowed = "a file that can be read"
     try:
         info = path.stat()
@@ -61,7 +62,8 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 def limited_memory() -> Iterator[None]:
     """Limit this process to 1.75 GiB beyond its present memory use (context manager; effective on Linux only).
 
-    It protects against libraries that unpack input files: a larger request raises MemoryError."""
+    It protects against libraries that unpack input files: a larger request raises MemoryError.
+    """
     before = None
     with contextlib.suppress(ImportError, OSError):
         import resource
@@ -111,7 +113,8 @@ def read_input_json(path: Path) -> Any:
 def atomic_write(path: Path) -> Iterator[Path]:
     """Write a file atomically (context manager). The yielded temporary file replaces `path` on success.
 
-    Raises `OutputError` if the folder is missing or the file cannot be written."""
+    Raises `OutputError` if the folder is missing or the file cannot be written.
+    """
     if path.is_dir() or not path.parent.is_dir():
         what, allowed = "the folder to write to does not exist", "a file in an existing folder"
         hint = "make the folder first"

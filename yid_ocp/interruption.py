@@ -79,7 +79,8 @@ def raise_on_signals() -> Iterator[None]:
     The exception is raised again every `_RERAISE_INTERVAL` seconds, because it can be lost in garbage collection, in
     callbacks of libraries, or in a call that does not return. After `_FORCED_EXIT_DELAY` seconds the process is ended
     with the exit code that shells expect; only the folders of `remove_folder_on_forced_exit` are removed before.
-    Signals that the parent process ignores (`nohup`) stay ignored. Outside the main thread the block has no effect."""
+    Signals that the parent process ignores (`nohup`) stay ignored. Outside the main thread the block has no effect.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,6 +1,7 @@
 """Levenberg-Marquardt method for dense least-squares problems of some dozen coordinates, such as chain shapes.
 
-docs/design/solvers.md compares it with SciPy's method."""
+docs/design/solvers.md compares it with SciPy's method.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +65,8 @@ def levenberg_marquardt(
     """Minimise the sum of squares |r(x)|^2 by Gauss-Newton steps, with damping scaled by the Jacobian's column norms.
 
     The residual function returns r (m,) and its Jacobian (m, n). The projection maps a trial point to an admissible
-    point (Nocedal and Wright 2006, Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5)."""
+    point (Nocedal and Wright 2006, Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5).
+    """
 
     def model_at(x: Array) -> _SumOfSquares:
         return _SumOfSquares(*residual_function(x))
@@ -86,7 +88,8 @@ def minimize_by_damped_newton(
 
     The search converges if no component would move by more than `step_tolerance`, or if the cost decreases by less than
     the fraction `cost_tolerance`. `min_damping` keeps a search on a robust cost in its local minimum. The projection
-    maps a trial point to an admissible point."""
+    maps a trial point to an admissible point.
+    """
     x = np.array(initial_guess, float)
     model, damping = model_at(x), _FIRST_DAMPING
     for iteration in range(1, max_iterations + 1):

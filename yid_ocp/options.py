@@ -4,7 +4,8 @@ An option is a field of a frozen dataclass, annotated with its bounds and with `
 
     time_step: Annotated[float, Gt(0), Le(0.1), OptionInfo("time step", "s")] = 0.01
 
-Reader, `--set`, checks and JSON Schema are derived from the annotation. Fields without `OptionInfo` are for Python."""
+Reader, `--set`, checks and JSON Schema are derived from the annotation. Fields without `OptionInfo` are for Python.
+"""
 
 from __future__ import annotations
 

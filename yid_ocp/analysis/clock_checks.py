@@ -120,7 +120,8 @@ def robot_held_point_clock_issues(
 
     The measured positions `seen` (N, np, 3) [m] at the times `t` (N,) are compared with the positions that `path`
     computes from the joint angles at given times. `by_angle` (N, np, 3, k) is the derivative of these positions with
-    respect to the k angles. `std` is the noise of the points [m], zero if unknown."""
+    respect to the k angles. `std` is the noise of the points [m], zero if unknown.
+    """
     span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
     size = np.concatenate([np.full(by_angle.shape[3], _ENCODER_ZERO_STD), np.full(6, _FRAME_ERROR_STD)])
@@ -180,7 +181,8 @@ def search_clock_offset_and_drift(
 
     The search goes from coarse to fine steps. The path is known from the first to the last time in `knots` [s]. The
     points `seen` (N, np, 3) [m] were measured at the times `t` (N,). With `drifts`, a drift of up to `_MAX_DRIFT` is
-    searched too, otherwise it is zero."""
+    searched too, otherwise it is zero.
+    """
     middle, span = 0.5 * float(t[0] + t[-1]), float(t[-1] - t[0])
 
     def error(late: float, drift: float) -> float:
@@ -211,7 +213,8 @@ def drift_and_overstated_noise_issues(problem: EstimationProblem, x: Array, eval
     """Find drifting clocks and overstated noise in the residuals of a fit.
 
     Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has
-    the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`)."""
+    the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).
+    """
     if not evaluation.ok or evaluation.jacobian is None or problem.rms_noise_of_data_residuals != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}

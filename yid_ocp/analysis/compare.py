@@ -84,7 +84,8 @@ def compare_methods(
     minimise the problem's cost without process noise, which not every method supports. If the problem has process
     noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run that includes it.
     `truth` holds known parameter values. `callback` receives the method's name and every `Iterate`. `limits` are the
-    criteria by which a residual exceeds noise. Each method may use an equal part of the remaining `time_budget` [s]."""
+    criteria by which a residual exceeds noise. Each method may use an equal part of the remaining `time_budget` [s].
+    """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
     deadline = time.perf_counter() + time_budget
 
@@ -265,7 +266,8 @@ def explain_paper_differences(
     - slow: the published value is far from the truth, and lies between the start and the point where the published
       method stops without torque errors, or within 10 % of that point
     - torque error: constant torque errors lead the published method to such values
-    - unexplained: none of these"""
+    - unexplained: none of these
+    """
     judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}
     if any(entry.verdict == "not_trusted" for entry in judged.values()):
         return ()

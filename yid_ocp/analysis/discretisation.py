@@ -42,7 +42,8 @@ class _FinerDiscretisationProblem:
     """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns.
 
     A coarse parameter times its entry in `parameter_factors` (default 1) describes the same object in the finer model.
-    `subdivided_joints` maps each joint of a divided link to the fine joints that share its angle."""
+    `subdivided_joints` maps each joint of a divided link to the fine joints that share its angle.
+    """
 
     problem: EstimationProblem
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
@@ -99,7 +100,8 @@ def _gauss_newton_step_in_finer_model(
     Also returns the linearised residual after the step, or a message if the step fails. Data, bounds and priors are
     those of the coarse problem, with the evaluation `at_x`. With `model_difference_only`, for points other than an
     estimate, the coarse prediction replaces the data. With process noise, weights and Jacobian are the coarse ones, and
-    only the residual is the finer model's (Richardson extrapolation), which saves a filter."""
+    only the residual is the finer model's (Richardson extrapolation), which saves a filter.
+    """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
     weighted = any(own is not None for own in coarse.whitening_filters)
@@ -131,7 +133,8 @@ def refitted_residual_at_finer_step(
     """Predict the whitened residual of a fit with a shorter time step, or return None if the prediction fails.
 
     `fine` is the problem with the shorter time step. One Gauss-Newton step is made from the coarse fit `x` (nx,), where
-    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used."""
+    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used.
+    """
     made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
     return None if isinstance(made, str) else made[1]
 
@@ -141,7 +144,8 @@ def longest_accurate_time_step(problem: EstimationProblem) -> float:
 
     Starting at 20 ms, the step is halved, at most five times, until a further halving changes the predictions by at
     most 3 % of the larger of residual and noise (root mean squares of whitened values). A poor initial guess has a
-    larger residual and therefore allows a larger error."""
+    larger residual and therefore allows a larger error.
+    """
     x, problem = problem.initial_unknowns, problem.with_time_step(_MAX_TIME_STEP)
     for _ in range(_MAX_HALVINGS):
         fine = problem.with_time_step(problem.step.time_step / 2)
@@ -208,7 +212,8 @@ def measure_discretisation_shifts(
 
     `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. If `x`
     is not a minimum of the cost, set `model_difference_only`. Returns the shifts of every shared free parameter (empty
-    if nothing was tried), and notes on shifts that could not be computed."""
+    if nothing was tried), and notes on shifts that could not be computed.
+    """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
     for key in kinds:
@@ -259,7 +264,8 @@ def inflate_stds_by_discretisation(
     """Add the discretisation error to the standard deviations, intervals and verdicts of estimates.
 
     The error is taken from the shifts `found` at finer discretisations. A verdict can only get worse. `sizes` are
-    typical sizes, as in `inference.uncertainty.parameter_verdict`."""
+    typical sizes, as in `inference.uncertainty.parameter_verdict`.
+    """
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
         entry = counted[name]
@@ -288,7 +294,8 @@ class NaturalFrequencies:
     """Natural frequencies of a system about an equilibrium, with the robot fixed, as the integrator reproduces them.
 
     Unstable modes grow from step to step although damping is included: the equilibrium is unstable, or the time step is
-    too long for the tension of the object."""
+    too long for the tension of the object.
+    """
 
     frequencies_hz: Array  # undamped, ascending, shape (k,)
     n_unstable_modes: int = 0
@@ -309,7 +316,8 @@ def step_map_natural_frequencies(
     The frequencies follow from the eigenvalues of the linearised step without damping. The driven and prescribed
     coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts at `guess` (n,).
     `force_split` and `constraint_force` are as in `compile_step`: the midpoint rule lowers a frequency f to atan(pi f
-    h)/(pi h), with the time step h, and the force split affects only the growth of modes."""
+    h)/(pi h), with the time step h, and the force split affects only the growth of modes.
+    """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: with these held still nothing can swing"
@@ -341,7 +349,8 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
-    `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths."""
+    `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths.
+    """
     if not system.grasps:
         return {}
     q, inner = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*system.effect_internal_coordinate_symbols.values())
@@ -391,7 +400,8 @@ class AlternatingErrorGrowth:
 
     A mode of the linearised step alternates if its eigenvalue has a negative real part. Such a mode is a numerical
     artefact, because physical motion keeps its direction for several steps. If the eigenvalue's magnitude exceeds one,
-    the integration is unstable, even if Newton's method converges."""
+    the integration is unstable, even if Newton's method converges.
+    """
 
     recording_name: str
     growth_decades: float  # powers of ten, over the stretch on which it grows most

@@ -3,7 +3,8 @@
 The mean of estimates x_i of the same n parameters with covariances C_i is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. If the
 parameters are constant over k runs, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. If chi2 is
 larger, the standard deviations of the mean are multiplied by sqrt(chi2/dof), Birge's ratio (Birge 1932, Physical Review
-40:207, doi:10.1103/PhysRev.40.207)."""
+40:207, doi:10.1103/PhysRev.40.207).
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ _MIN_CORRELATION_EIGENVALUE = 1e-12  # smaller eigenvalues result from rounding
 class RunEstimates(ReprMixin):
     """Estimates (n,) of n parameters from one run, with their covariance (n, n), in the parameters' `units`.
 
-    If `is_fit_adequate` is False (the model does not explain the recordings), the covariance includes the misfit."""
+    If `is_fit_adequate` is False (the model does not explain the recordings), the covariance includes the misfit.
+    """
 
     run_name: str
     parameter_names: tuple[str, ...]
@@ -107,7 +109,8 @@ def pool_estimates_and_chi2(runs: Sequence[RunEstimates]) -> tuple[RunEstimates,
 
     Returns the mean, chi2 of the differences between runs, and the degrees of freedom of chi2. Parameters that only
     some runs contain are included. If the runs differ by more than their standard deviations explain, the standard
-    deviations of the mean are multiplied by Birge's ratio, sqrt(chi2 / degrees of freedom)."""
+    deviations of the mean are multiplied by Birge's ratio, sqrt(chi2 / degrees of freedom).
+    """
     names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
     information, sums = np.zeros((len(names), len(names))), np.zeros(len(names))
     # scaled by the first known standard deviations, to avoid rounding errors
@@ -138,7 +141,8 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
     A run is an outlier if it disagrees with the other runs and the other runs are consistent, or clearly more
     consistent without it than without any other run. With two runs no outlier is reported. A parameter is tested with
     its marginal variances, a run with its whole covariance. The significance `level` is divided by the number of
-    parameters or of runs."""
+    parameters or of runs.
+    """
     mean, chi2, degrees = pool_estimates_and_chi2(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))

@@ -56,7 +56,8 @@ def solve(
     initial_unknowns : sequence of float, optional
         Default: the initial unknowns of the problem.
     callback : callable, optional
-        Receives every `Iterate`."""
+        Receives every `Iterate`.
+    """
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
@@ -196,7 +197,8 @@ def choose_cable_memory_fit(
 
     The load of a cable that moves at the start of a recording is unknown, and this motion can be mistaken for memory.
     Leave-one-out prediction decides: each such recording is predicted from all others, with and without memory (by one
-    Gauss-Newton step from the fit of all). The memory is kept if it has the smaller total error."""
+    Gauss-Newton step from the fit of all). The memory is kept if it has the smaller total error.
+    """
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
         return ChosenCableMemoryFit(problem, solution)

@@ -179,7 +179,8 @@ class CandidateExperimentSensitivities:
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
     with respect to the nx unknowns and to the episode's q torque-error unknowns (see
-    `point_sensitivities_and_joint_sensor_fisher_information`)."""
+    `point_sensitivities_and_joint_sensor_fisher_information`).
+    """
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
     x: Array

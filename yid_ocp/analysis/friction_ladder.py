@@ -30,7 +30,8 @@ class FrictionLawFit:
 
     `left_out_errors` holds the root mean square prediction error of each recording by a fit without the recordings of
     its kind of motion (NaN if the fit failed). The errors are in the channels' unit, or in standard deviations if units
-    differ."""
+    differ.
+    """
 
     law: str
     parameters: Mapping[str, ParameterEstimate]  # estimates of the fit to all recordings
@@ -91,7 +92,8 @@ def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping
 
     Returns the first of `fits` whose mean error over the `kinds` of motion is within one standard error of the smallest
     error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
-    doi:10.1007/978-0-387-84858-7)."""
+    doi:10.1007/978-0-387-84858-7).
+    """
     sizes = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds) for fit in fits]
     least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))
     return next((fit for fit, (mean, _) in zip(fits, sizes, strict=True) if mean <= least + error), fits[0])
@@ -115,7 +117,8 @@ def measured_and_predicted_friction_torques(
 
     The measured friction torque is the residual of the discrete equations of motion without friction, along the
     smoothed measured angles. The predicted torque is the change of this residual by the fitted law. The result is empty
-    unless every coordinate is driven, without constraints and internal coordinates."""
+    unless every coordinate is driven, without constraints and internal coordinates.
+    """
     step, system = problem.step, problem.system
     driven = system.driven
     if not driven or step.sizes["m"] or step.sizes["nz"] or len(driven) != system.n_coordinates:

@@ -72,7 +72,8 @@ class ParameterIdentifiability:
 
     The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). `interval` is
     the 95 % profile-likelihood interval, in which all other unknowns are refitted, or None if not requested. The
-    verdict agrees with it."""
+    verdict agrees with it.
+    """
 
     value: float
     unit: str
@@ -88,7 +89,8 @@ class _ParameterDirection:
     """A direction of relative parameter changes and its uncertainty, judged like a parameter.
 
     The singular value is that of the whitened sensitivity to relative changes after elimination of nuisances: standard
-    deviations of the data per unit change."""
+    deviations of the data per unit change.
+    """
 
     singular_value: float
     std_relative: float  # reciprocal of the singular value
@@ -102,7 +104,8 @@ class IdentifiabilityResult(ReprMixin):
     """Identifiability of p free parameters, with correlations, Fisher information and uncertain directions.
 
     Values and standard deviations in `parameters` are in each parameter's `unit`. Relative standard deviations,
-    correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless."""
+    correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless.
+    """
 
     parameters: Mapping[str, ParameterIdentifiability]
     parameter_names: tuple[str, ...]  # in the order of the matrices
@@ -158,7 +161,8 @@ def identifiability(
     intervals : iterable of str, or "all"
         Parameters for which a profile-likelihood interval is computed.
     limits : ExcessResidualCriteria, optional
-        Criteria by which a residual at a solution exceeds noise."""
+        Criteria by which a residual at a solution exceeds noise.
+    """
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in (own for own in wanted if own not in names):
@@ -225,7 +229,8 @@ def system_with_grasp_offset_effects(system: System) -> System:
 def unknowns_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
     """Return a problem's unknown vector from a solution, an array or (default) its initial values.
 
-    Raises `SolverError` for a wrong shape or a value that is not finite."""
+    Raises `SolverError` for a wrong shape or a value that is not finite.
+    """
     if solution is None:
         return problem.initial_unknowns
     if isinstance(solution, Solution):

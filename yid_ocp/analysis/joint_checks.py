@@ -43,7 +43,8 @@ _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as s
 class RecordedJointsModel:
     """Numeric kinematics and inverse dynamics of the joints whose angles are recorded.
 
-    Driven joints come first, then prescribed joints. Unknown coordinates, such as a beam's bending, are zero."""
+    Driven joints come first, then prescribed joints. Unknown coordinates, such as a beam's bending, are zero.
+    """
 
     system: System
     theta: Array
@@ -84,7 +85,8 @@ class RecordedJointsModel:
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
         """Positions (N, nf, 3) [m] of nf frames, and their Jacobian (N, nf, 3, k) with respect to k angles.
 
-        `q` (N, k) holds recorded angles. Every frame must satisfy `is_frame_determined_by_angles`."""
+        `q` (N, k) holds recorded angles. Every frame must satisfy `is_frame_determined_by_angles`.
+        """
         place, slope = (np.array(ca.densify(x)) for x in self._places(frames).map(len(q)).call([q.T]))
         count, width = len(frames), len(self.joint_names)
         by_angle = slope.reshape(3 * count, len(q), width).transpose(1, 0, 2)
@@ -216,7 +218,8 @@ def inertial_effort_excitation_issues(
 
     Static configurations determine only weight and stiffness. The efforts due to speed and acceleration must exceed the
     noise of measured efforts; they are estimated by inverse dynamics and friction of a typical size. `effort` holds the
-    options of the effort sensor. All angles of `arm` must be recorded."""
+    options of the effort sensor. All angles of `arm` must be recorded.
+    """
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or effort.use is False:
@@ -255,7 +258,8 @@ def joint_excitation_issues(
 ) -> Iterator[Issue]:
     """Yield an issue for each joint that hardly moves in any recording, although some of its parameters are free.
 
-    `asked` lists these parameters by joint. `position` holds the options of the position sensor."""
+    `asked` lists these parameters by joint. `position` holds the options of the position sensor.
+    """
     for joint, parameters in asked.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:

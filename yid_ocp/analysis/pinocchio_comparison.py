@@ -60,7 +60,8 @@ class _PinocchioComparison:
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
     """Check a system with parameters `theta` against Pinocchio's model of the same joints and bodies.
 
-    The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations."""
+    The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations.
+    """
     built = system_with_numeric_parameters(system, theta)
     gravity = np.array(ca.DM(built.gravity)).ravel()
     inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))
@@ -79,7 +80,8 @@ def compare_urdf_with_pinocchio(
 
     `mechanism` is the result of `read_urdf` for this file and the same `joints` (movable joints, default all), `locked`
     (positions of the other joints [rad or m]) and `exclude_links` (links removed with their subtrees). `gravity` (3,)
-    is in m/s^2. Raises ValueError if Pinocchio cannot read the file."""
+    is in m/s^2. Raises ValueError if Pinocchio cannot read the file.
+    """
     model, locked = pin.buildModelFromXML(_without(path, exclude_links)), locked or {}
     if joints is not None:
         at = pin.neutral(model)

@@ -79,7 +79,8 @@ def compute_profile_likelihood_interval(
     logarithm (Venzon and Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496).
 
     `index` selects the unknown, `x` (nx,) is the best fit, and `evaluation` the evaluation at `x` with Jacobian. `std`,
-    the standard deviation of the unknown, sets the first step and may be infinite."""
+    the standard deviation of the unknown, sets the first step and may be infinite.
+    """
     walk = _Walk(problem, x, index, evaluation)
     size = min(std / abs(x[index]), 0.5) if walk.logarithmic else min(std, 10 * float(problem.unknown_scales[index]))
     lower, upper = walk.end(-1, size), walk.end(1, size)
@@ -98,7 +99,8 @@ def solution_with_profile_intervals(
 
     The cost of such a parameter is not quadratic, so that a standard deviation does not describe it. The same holds for
     a stiffness that is small compared with its typical size (`mark_unidentifiable_near_zero_estimate`). The solution is
-    returned unchanged if the problem is too large for profiles."""
+    returned unchanged if the problem is too large for profiles.
+    """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
         return solution
@@ -152,7 +154,8 @@ def mark_unidentifiable_near_zero_estimate(
 
     An unobserved twist of a branch can move, and thus fit the noise, only if its stiffness is near zero. The cost
     therefore has a narrow, spurious minimum there. `x` (nx,) is the best fit, `evaluation` its evaluation, `index`
-    selects the unknown, and `size` is its entry of `typical_parameter_magnitudes`."""
+    selects the unknown, and `size` is its entry of `typical_parameter_magnitudes`.
+    """
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry
     rise = _Walk(problem, x, index, evaluation).rise(size)

@@ -51,7 +51,8 @@ def checked_step_linearisation(
 ) -> CheckedStepLinearisation:
     """Linearise a step at a state (nx,), and check its Jacobians A_k and B_k by central finite differences.
 
-    The torque (nu,) is in N m. `path` (nc,) are the prescribed coordinates before and after the step."""
+    The torque (nu,) is in N m. `path` (nc,) are the prescribed coordinates before and after the step.
+    """
     n, pair = step.sizes["n"], (path, path) if len(path) else None
     a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
 
@@ -146,7 +147,8 @@ def parameter_influences(
     For the response, one unit is added to one equation of a step that starts at `state`. The later steps are linear, x'
     = (A - B_u K) x, where K is the first gain of the tracking filter. The equation is observed to first order if a
     reading changes within `_RESPONSE_STEPS` steps. `symbols` are the named equations and `stages` their linearisation
-    at `state`. `episode` provides the sensors and the tracking filter; without it only equations are listed."""
+    at `state`. `episode` provides the sensors and the tracking filter; without it only equations are listed.
+    """
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
     for row, column in zip(*symbols.full_jacobian_sparsity_pattern.get_triplet(), strict=True):
@@ -298,7 +300,8 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
 
     `dR_dy` is the Jacobian of the step's residual with respect to its unknowns. `dR_dtheta` is the Jacobian of all rows
     with respect to the parameters. `A` (state), `B_u` (input) and `B_theta` (parameters) are the Jacobians of the next
-    state."""
+    state.
+    """
     whole = _mask(symbols.full_jacobian_sparsity_pattern)
     system = symbols.equations.system
     free = list(system.unprescribed_coordinate_indices)
@@ -402,7 +405,8 @@ def nlp_stage_sparsity(
     The order of rows and columns is as in `solvers.symbolic_transcription`. The parameters `free` are unknowns.
     `sensors` are evaluated at nodes. `followed` are the state indices that the tracking filter feeds back to the
     torques. `loose` are the indices of the initial state that are estimated with a prior; the other unprescribed states
-    are fixed."""
+    are fixed.
+    """
     e, system = symbols.equations, symbols.equations.system
     kept = list(system.unprescribed_coordinate_indices)
     rows = ca.vertcat(e.residual, e.p1)
@@ -442,7 +446,8 @@ def full_nlp_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
 
     `jacobian_nonzeros` counts entries of the constraint Jacobian. `hessian_nonzeros` counts both triangles of the exact
     Hessian of the step constraints times their multipliers, without entries of measurements. The initial state is
-    linear in the parameters, as in multiple shooting."""
+    linear in the parameters, as in multiple shooting.
+    """
     (f, nx, m, height), begun = stage.sizes, len(stage.fixed_start_rows)
     # every step after the first adds the same entries
     one, two = (int(np.count_nonzero(_nlp_sparsity_masks(stage, k)[1])) for k in (1, 2))

@@ -170,7 +170,8 @@ class SymbolBlock:
     """A named block of equations or variables of one kind, as a symbolic column (k, 1).
 
     `labels` has one entry per row: the name of a joint, grasp equation, internal coordinate or parameter. In the LaTeX
-    template, `#` is replaced by the label."""
+    template, `#` is replaced by the label.
+    """
 
     name: str
     labels: tuple[str, ...]
@@ -224,7 +225,8 @@ class NamedStepEquations(ReprMixin):
 
     The row blocks are `del` (discrete Euler-Lagrange equations; at a prescribed coordinate the residual is -h times its
     effort, with the time step h), `internal`, `constraint`, and `p1`, the momentum after the step. The column blocks
-    are `q0`, `p0`, `z0`, `u`, `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`."""
+    are `q0`, `p0`, `z0`, `u`, `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`.
+    """
 
     equations: DiscreteEquations
     row_blocks: tuple[SymbolBlock, ...]
@@ -308,7 +310,8 @@ class NamedStepEquations(ReprMixin):
         """Return an equation by name or, for `ROW, COLUMN`, its derivative with respect to a variable.
 
         Examples of `text`: `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]`, `constraint[left.x], T2.length`. Raises
-        `ConfigError` if there are not one or two names, or if a name does not exist."""
+        `ConfigError` if there are not one or two names, or if a name does not exist.
+        """
         said = [part.strip() for part in text.split(",")]
         if len(said) > 2 or not all(said):
             allowed = "the name of a row, or of a row and a column with a comma between them"

@@ -4,7 +4,8 @@ Torques have an error in every recorded sample and a constant one; angles that a
 in every step. A recording has some thousands of these unknowns, but sensors only observe smooth motions. The matrix G
 maps them to all readings, in units of the smallest noise. Its left singular vectors with large singular values
 represent it; they are computed from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2,
-doi:10.1137/090771806). The neglected rest adds less than `_NEGLIGIBLE_STD` squared to the variance of any reading."""
+doi:10.1137/090771806). The neglected rest adds less than `_NEGLIGIBLE_STD` squared to the variance of any reading.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +48,8 @@ def point_sensitivities_and_joint_sensor_fisher_information(
     slopes : dict of (group, frame) to ndarray, shape (N + 1, 3, nx + q)
         Derivatives with respect to the unknowns, then to the q errors.
     information : ndarray, shape (nx + q, nx + q)
-        Information of joint measurements, and of the prior of the errors."""
+        Information of joint measurements, and of the prior of the errors.
+    """
     assert evaluation.jacobian is not None
     episode, result = problem.episodes[i], evaluation.episode_predictions[i]
     driving = episode if encoders is None else encoders.episodes[i]

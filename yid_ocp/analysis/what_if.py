@@ -40,7 +40,8 @@ _MAX_CHANGE_SET_SIZE = 3
 class ExperimentChange:
     """One change of an experiment, such as a mechanical change, another measured frame or a camera rate.
 
-    Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`."""
+    Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
+    """
 
     name: str
     description: str
@@ -55,7 +56,8 @@ class ChangedExperimentResult:
     """Predicted identifiability of an experiment with some changes. `verdicts` is empty if the prediction failed.
 
     `gain` [nat] is the information gain 1/2 log det(1 + 16 I), where I is the Fisher information of relative changes
-    and the prior standard deviation of each parameter is 400 %."""
+    and the prior standard deviation of each parameter is 400 %.
+    """
 
     changes: tuple[str, ...]
     description: str
@@ -76,7 +78,8 @@ class ExperimentRanking(ReprMixin):
 
     `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
     last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make every parameter
-    identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly."""
+    identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly.
+    """
 
     unchanged_experiment: ChangedExperimentResult
     single_changes: tuple[ChangedExperimentResult, ...]
@@ -124,7 +127,8 @@ def what_if(
     considered_changes : collection of str, optional
         Names of changes to consider; default: all.
     evaluate_changes : callable, optional
-        Replacement for `evaluate_experiment_change_sets`, for example in other processes."""
+        Replacement for `evaluate_experiment_change_sets`, for example in other processes.
+    """
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)

@@ -45,7 +45,8 @@ def load_config(
     override is merged key by key with the section of the file, unless the override selects another kind or method, or
     is empty. Raises `ConfigError` if the file is missing or is not YAML, a key is unknown or missing, or a value has
     the wrong type or is outside its range. The error states file, line and key, what is allowed and the nearest known
-    key."""
+    key.
+    """
     embedded = Path(str(resources.files("yid_ocp.data").joinpath("defaults", default)))
     file, origin = (embedded, "embedded default") if path is None else (Path(path), str(path))
     data, places = _parse(_read(file), origin)

@@ -89,7 +89,8 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
     """Yield completions of a partly typed settings key, up to the next dot or, before a value, to `=`.
 
     `prefix` is the typed key. `hint` is the type of the value at the key `at`, which ends with a dot. `raw` is the
-    file's value at `at`; it supplies names that users choose."""
+    file's value at `at`; it supplies names that users choose.
+    """
     sections, values = section_variants_from_annotation(hint), options.mapping_value_type(hint)
     named = section_variants_from_annotation(values)
     below: dict[str, Any] = {}

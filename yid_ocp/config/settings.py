@@ -1,7 +1,8 @@
 """Settings of one run: a frozen dataclass for each section of a configuration file, filled by `reader`.
 
 Options of solvers, problem, sensors, cables, tracking and diagnosis are defined in their own modules (see
-`yid_ocp.options`). The sections here contain these classes."""
+`yid_ocp.options`). The sections here contain these classes.
+"""
 
 from __future__ import annotations
 

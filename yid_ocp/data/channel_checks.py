@@ -166,7 +166,8 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
     Channels of equal stated noise are judged together. Noise stated in the settings (`choice`) is not checked, because
     it may represent model error. The noise is estimated from all samples, every second sample, and so on up to a period
     of `_MAX_SAMPLE_PERIOD`, because it need not be white; the largest estimate counts, but at least the quantisation
-    noise. Computed channels without noise, such as commands, are skipped."""
+    noise. Computed channels without noise, such as commands, are skipped.
+    """
     found: dict[str, list[tuple[str, float, float]]] = {}
     commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
@@ -232,7 +233,8 @@ def typical_point_pair_distances(
     """Typical distance [m] between the two points of each of `edges`: mean over frames, then median over recordings.
 
     If `frames` is given, only the first `frames` frames of each recording count. Raises `DataError` without a
-    recording, or if an edge is never seen."""
+    recording, or if an edge is never seen.
+    """
     result: dict[tuple[str, str], float] = {}
     for edge in edges:
         seen = []

@@ -1,7 +1,8 @@
 """Checks of a recording without a model: clocks, gaps, motion, channels and duplicated data.
 
 Limits come from physics or statistics. Checks against a model are in `analysis` (`clock_checks`, `joint_checks`,
-`point_checks`)."""
+`point_checks`).
+"""
 
 from __future__ import annotations
 
@@ -49,7 +50,8 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
     """Split a recording at gaps of its joint samples or, without joints, of the samples of the `driving` points.
 
     The first part is kept, and each later part that starts at standstill. If `anywhere` is True, parts that start in
-    motion are kept too, because the problem can estimate their initial state. Very short parts are dropped."""
+    motion are kept too, because the problem can estimate their initial state. Very short parts are dropped.
+    """
     t = _times(recording, driving)
     steps = np.diff(t)
     allowed = max(_MAX_SAMPLE_GAP, _MAX_MISSING_PERIODS * median_sample_period(t))
@@ -112,7 +114,8 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
     """Find data quality issues of one recording by all checks that need no model.
 
     `choice` returns the sensor options of a group, such as its stated noise. `driving` states whether joints drive the
-    model, so that gaps between their samples matter."""
+    model, so that gaps between their samples matter.
+    """
     recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(

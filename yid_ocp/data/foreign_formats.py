@@ -46,7 +46,8 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS
 def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
     """Find the meaning of every column of `header` from its name (None if unclear), and the units in the names.
 
-    `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`."""
+    `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
+    """
     split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
     meanings: list[_Meaning] = []
@@ -254,7 +255,8 @@ ESTIMATED_WRENCH_GROUP_NAME = "wrist_estimated"
 def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
     """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are omitted.
 
-    If the driver estimates an external wrench, `wrench` has its frame and its `values` by quantity."""
+    If the driver estimates an external wrench, `wrench` has its frame and its `values` by quantity.
+    """
     if kind == JOINT_MESSAGE_TYPES[0]:
         return _franka_state(content)
     if kind == JOINT_MESSAGE_TYPES[1]:
@@ -273,7 +275,8 @@ def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
 def joint_values_at_field_paths(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
     """Read joint values from the decoded message `content`. `paths` maps each channel to the path of an array.
 
-    Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or a path is missing or not numeric."""
+    Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or a path is missing or not numeric.
+    """
     found: dict[str, Any] = {}
     for channel, path in paths.items():
         if channel not in JOINT_CHANNEL_UNITS:

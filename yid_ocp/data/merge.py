@@ -38,7 +38,8 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     joint angles explain the points best. Joints of several recordings are interpolated to the fastest clock. Points and
     other sensors keep their clocks. `clock_offsets` [s] are added to the times of the recordings that they name, which
     are then not aligned. Raises `DataError` if two recordings have a joint in common, if clocks cannot be aligned, or
-    if an offset names no recording. Notes report clocks, offsets and interpolation."""
+    if an offset names no recording. Notes report clocks, offsets and interpolation.
+    """
     offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
     where = ", ".join(names)
     for name in offsets:

@@ -69,7 +69,8 @@ class JointGroup(ReprMixin):
     effort_kind : {'sample', 'mean', 'command'} or None
         Meaning of `effort[k]`: value at t_k, mean from t_k to t_{k+1}, or value held from t_k to t_{k+1}.
     clock : {'recorded', 'nominal'}
-        Whether `t` was measured or is a sample index times a nominal period."""
+        Whether `t` was measured or is a sample index times a nominal period.
+    """
 
     name: ClassVar[str] = "joints"
 
@@ -137,7 +138,8 @@ class PointGroup(ReprMixin):
     pose : ndarray, shape (4, 4), or None
         For a camera: the transform from camera to world coordinates [m].
     clock : {'recorded', 'nominal'}
-        As in `JointGroup`."""
+        As in `JointGroup`.
+    """
 
     name: str
     names: tuple[str, ...]
@@ -184,7 +186,8 @@ class SensorChannelGroup(ReprMixin):
     noise_and_bias_stds_by_attribute : mapping of str to float or ndarray, shape (k,)
         Standard deviations by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), in the channel's unit.
     clock : {'recorded', 'nominal'}
-        As in `JointGroup`."""
+        As in `JointGroup`.
+    """
 
     name: str
     names: tuple[str, ...]
@@ -230,7 +233,8 @@ class Recording(ReprMixin):
     marker_reference_pose : ndarray, shape (np, 3), or None
         Positions of the points of the first group while the object was held straight, in that group's frame [m].
     notes : tuple of str
-        Sentences on content that an import omitted or changed."""
+        Sentences on content that an import omitted or changed.
+    """
 
     joints: JointGroup | None = None
     points: tuple[PointGroup, ...] = ()
@@ -304,7 +308,8 @@ class Recording(ReprMixin):
     def time_slice(self, start: float, stop: float) -> Recording:
         """Return a copy with the samples from `start` to `stop` [s]. Groups without such samples are omitted.
 
-        Raises `DataError` if there are no samples in this interval, or if `start` is not before `stop`."""
+        Raises `DataError` if there are no samples in this interval, or if `start` is not before `stop`.
+        """
         masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.all_groups]
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
@@ -331,7 +336,8 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
         strictly increasing. A joint channel is not finite, or a point is infinite or partly seen. A standard deviation
         is negative. The kind of effort is unknown. A pose is not a rigid transform. Joint positions exceed 50 rad or
         points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any machine.
-        `marker_reference_pose` does not match the first group of points."""
+        `marker_reference_pose` does not match the first group of points.
+    """
     origin = where or f"recording '{recording.name}'"
     allowed, hint = "joints, points, points_<name>", "add joints or points"
     require_data(recording.all_groups, "the recording has no group", origin, allowed, hint)

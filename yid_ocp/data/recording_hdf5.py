@@ -1,7 +1,8 @@
 """Read and write recordings as HDF5 files (format `yid-recording/1`), with safe access to any HDF5 file.
 
 The HDF5 library follows links into other files, and ends the process if the disk is full or a file is damaged in
-certain ways. Such errors cannot be caught. Files are therefore written atomically and first read by another process."""
+certain ways. Such errors cannot be caught. Files are therefore written atomically and first read by another process.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     """Read and check a `yid-recording/1` file. With `allow_nan_effort`, efforts may contain NaN.
 
     Raises `DataError` if the file is missing, not HDF5, damaged or of another format, if a group, dataset, attribute or
-    unit is unknown or missing, or if `validated_recording` refuses the recording."""
+    unit is unknown or missing, or if `validated_recording` refuses the recording.
+    """
     path = Path(path)
     digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
@@ -66,7 +68,8 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Check a recording and write a `yid-recording/1` file atomically. Efforts may contain NaN.
 
-    Raises `OutputError` if writing fails (an older file is then kept), and `DataError` as in `validated_recording`."""
+    Raises `OutputError` if writing fails (an older file is then kept), and `DataError` as in `validated_recording`.
+    """
     validated_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:
         file.attrs.update(format=_RECORDING_FORMAT, description=recording.description, source=recording.source)
@@ -219,7 +222,8 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
 
     `complaint` reads the file in the fork and returns a description of the error, empty on success. Raises `DataError`
     with this description, or if the file (of the format `noun`) is not a regular file, or if the fork crashes. A fork
-    is used because a new process takes a second, and pool processes may have no children."""
+    is used because a new process takes a second, and pool processes may have no children.
+    """
     files.check_input_file(path)
     if not hasattr(os, "fork"):
         return

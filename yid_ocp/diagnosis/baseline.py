@@ -3,7 +3,8 @@
 In a linear model with the prior N(m, C0), an estimate x with covariance C shifts by x - m. If nothing changed, the
 shift has the covariance C0 - C. A misfit that multiplies the data's noise variance by k adds (k - 1) C (1 - C/C0). An
 effect is understood if removing it predicts recordings made without it, and adding it predicts recordings made with
-it."""
+it.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +78,8 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
     """Return the problem with a baseline's estimates as a joint prior, in which the baseline's parameters are free.
 
     Raises `ConfigError` if the model lacks a parameter or effect of the baseline, or if a parameter differs between
-    recordings."""
+    recordings.
+    """
     names, parameters = baseline.parameter_names, problem.system.parameters
     for name in names:
         if name not in parameters:
@@ -159,7 +161,8 @@ class EarlierRunsBaseline:
 
         Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
         there are no earlier runs, the parameters without the effects are estimated on the reference recordings. Returns
-        None without effects or reference recordings."""
+        None without effects or reference recordings.
+        """
         without, known = self.reference_recordings, self.combined_estimates
         if not last.effects or not without:
             return None

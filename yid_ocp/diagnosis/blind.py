@@ -73,7 +73,8 @@ def plan_blind_cases(
 
     `weights` holds the share of cases of each experiment. An experiment with less than `_MIN_CASES_PER_EXPERIMENT`
     cases gets none; if all have less, the largest gets all. Objects of the experiments in `chains` can be simulated
-    with finer links. `purpose` selects the random stream. Raises `ConfigError` if `count` is below 1."""
+    with finer links. `purpose` selects the random stream. Raises `ConfigError` if `count` is below 1.
+    """
     if count < 1:
         raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
     total = sum(weights.values())
@@ -210,7 +211,8 @@ class BlindCaseGenerator:
     finer : callable, optional
         Function that returns the system with a given multiple of its links.
     simulated_system : System, optional
-        The simulated system, if not the problem's: the same system with driven arms."""
+        The simulated system, if not the problem's: the same system with driven arms.
+    """
 
     def __init__(
         self,

@@ -1,7 +1,8 @@
 """Score blind diagnoses against their labels, and calibrate thresholds from an ensemble.
 
 Given n values of a statistic on cases of one kind, a further case lies at or below their k-th smallest with a
-probability of at least k/(n + 1) (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715)."""
+probability of at least k/(n + 1) (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715).
+"""
 
 from __future__ import annotations
 
@@ -170,7 +171,8 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """Rates over an ensemble, such as false alarms, detections and correct answers. A rate without cases is None.
 
-    Cases that are not judged are excluded from all rates and counted as `not_judged`."""
+    Cases that are not judged are excluded from all rates and counted as `not_judged`.
+    """
 
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
@@ -524,7 +526,8 @@ def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> 
 
     The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
     `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,
-    time step, other starts) are not repeated. `DataError` if another version recorded the case."""
+    time step, other starts) are not repeated. `DataError` if another version recorded the case.
+    """
     if data.get("format") != _EVIDENCE_FORMAT:
         what = f"the evidence has the format '{data.get('format')}'"
         raise DataError(

@@ -37,6 +37,7 @@ from yid_ocp.diagnosis.hypotheses import (
 )
 from yid_ocp.diagnosis.law import GapLaw, find_gap_law
 from yid_ocp.diagnosis.refit import (
+    FinerStepRefitStore,
     NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
@@ -282,22 +283,6 @@ def _law(
     return find_gap_law(seen.search, problem, final, places, seen.events)
 
 
-@dataclass(frozen=True)
-class _FinerStepRefitStore:
-    """Refits of another store made at a finer time step [s] than stated, under separate names."""
-
-    store: RefitStore
-    time_step: float
-
-    def get(self, name: str) -> StoredFit | None:
-        """The refit stored under a name at this time step, or None."""
-        return self.store.get(f"{name} at {self.time_step:g} s")
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit under a name and this time step."""
-        self.store.put(f"{name} at {self.time_step:g} s", refitted)
-
-
 def _finer_step_that_explains_gap(
     search: RefitContext, fit: RefittedModel, events: EventSet, ranked: Sequence[CandidateScore]
 ) -> RefitContext | None:
@@ -313,7 +298,7 @@ def _finer_step_that_explains_gap(
     if excess - rest <= max((score.predicted_chi2_decrease for score in ranked), default=excess) / 2:
         return None
     search.progress.begin_stage(f"half the time step lowers chi2 by {excess - rest:.3g}: going on at {h:g} s")
-    store = None if search.store is None else _FinerStepRefitStore(search.store, h)
+    store = None if search.store is None else FinerStepRefitStore(search.store, h)
     return replace(search, problem=finer, store=store)
 
 

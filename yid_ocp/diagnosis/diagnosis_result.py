@@ -72,7 +72,8 @@ class DiagnosisResult(NominalModelGapEvidence, Judgement, ReprMixin):
     nominal_changes : tuple of NominalParameterChange
         Nominal parameters without and with the accepted effects, in `unit`.
     stage_seconds, search_seconds : mapping of str to float, float
-        Durations [s]."""
+        Durations [s].
+    """
 
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
     smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None if there is no gap to locate
@@ -222,7 +223,8 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     - `explained`: fraction of the smoother's decrease of r'r that the effects explain
     - `assumptions`: number of assumptions
     - `carried`: largest difference between estimation and held-out estimates [standard deviations]
-    - `behind`: per single-effect refit, held-out chi2/n (`left`) and BIC difference to the first (`squares`)"""
+    - `behind`: per single-effect refit, held-out chi2/n (`left`) and BIC difference to the first (`squares`)
+    """
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     added, seen, before = finding.selected_effects, finding.smoother_result, finding.nominal_model
     differences = (entry.estimate_difference_and_std for entry in finding.transfer_checks)

@@ -4,7 +4,8 @@ At prescribed joints with compared efforts, the unknown force is measured minus 
 Elsewhere it is the smoother's linear model of the force at one coordinate, with all other unknowns at their estimates.
 `detect_force_pulses` searches both for pulses on a background that depends on load. One to three outlying samples of a
 sensor are an event of that sensor. Events are removed before anything else is judged: their torques are added to the
-recorded ones, and samples in their windows are excluded."""
+recorded ones, and samples in their windows are excluded.
+"""
 
 from __future__ import annotations
 
@@ -140,7 +141,8 @@ def find_force_and_fault_events(
 
     The rate refers to all time windows together. `problem` is whitened by sensor noise and has all samples. `x` (nx,)
     is its fit, and `evaluation` its evaluation, with a Jacobian if `smoothed` is given. Forces that move the model are
-    searched only where the smoother found unknown forces."""
+    searched only where the smoother found unknown forces.
+    """
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
     told = [(e, result, problem.theta_and_initial_state_deviation(x, i)[0]) for i, (e, result) in enumerate(fitted)]
     shared = problem.theta_and_initial_state_deviation(x, 0)[0]
@@ -413,7 +415,8 @@ def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -
 
     Forces at joints driven by recorded torques are added to these torques; forces on an object and at servos are not
     compensated. Wrong samples are excluded, and effort samples of prescribed joints during an event, and everything
-    after an overspeed."""
+    after an overspeed.
+    """
     system, cutoff = problem.system, problem.options.path_cutoff
 
     def cleaned(episode: Episode) -> Episode:

@@ -46,7 +46,8 @@ def make_candidate_effects(
 
     `choice` is "all", or a list of `kind@location` or `kind` (at all locations that a diagnosis tries). Raises
     `ConfigError` if the list is empty, or if a kind does not exist, has no location here or is part of the nominal
-    model. Raises `ModelError` if a location does not exist."""
+    model. Raises `ModelError` if a location does not exist.
+    """
     where, sensors = "diagnosis.candidates", recorded_signal_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
@@ -76,7 +77,8 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
     """Return the candidates except those that `names` lists as `kind` or `kind@location`.
 
     Excluded candidates stay in the compiled step at their neutral values, so nothing is recompiled. Raises
-    `ConfigError` if a name is not a candidate, or if no candidate is left."""
+    `ConfigError` if a name is not a candidate, or if no candidate is left.
+    """
     where = "diagnosis.exclude"
     known = {name for effect in effects for name in (effect.kind, effect.label)}
     for name in names:
@@ -190,7 +192,8 @@ class AllCandidatesProblem:
         """Truncate held-out recordings where the nominal model's rollout fails. Also returns these recordings.
 
         `margin` is the fraction kept of the duration that the model follows. If too little of every recording remains,
-        estimation recordings are split in blocks instead. Residuals are whitened by sensor noise; see `whitened_at`."""
+        estimation recordings are split in blocks instead. Residuals are whitened by sensor noise; see `whitened_at`.
+        """
         problem, x = self.problem, self.problem.vector(values)
         kept, cuts = [], []
         for episode in problem.held_out:
@@ -212,7 +215,8 @@ class AllCandidatesProblem:
         """Return a cheaper problem whose step contains only the candidates at the location of `effects`.
 
         A step of all candidates costs three times as much. The problem is unchanged without process noise, if `effects`
-        have no or several locations, or if the filters contain states of other candidates."""
+        have no or several locations, or if the filters contain states of other candidates.
+        """
         places = {effect.location for effect in effects}
         if self.functions_of_place is None or len(places) != 1 or not self.problem.has_process_noise:
             return self
@@ -230,7 +234,8 @@ class AllCandidatesProblem:
     ) -> EstimationProblem:
         """Estimation problem with free `effects`, its filters relinearised about the torque offsets at the values `at`.
 
-        Filters of held-out recordings are unchanged: see `with_relinearized_held_out_filters`."""
+        Filters of held-out recordings are unchanged: see `with_relinearized_held_out_filters`.
+        """
         own = self.with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 

@@ -1,7 +1,8 @@
 """Estimate a law for a gap that no named effect explains: a torque as a smooth function of known quantities.
 
 Functions compete with each other, and with a function of time, by the evidence of a linearised fit. The best few are
-refitted with the nominal parameters and judged on held-out recordings like any effect."""
+refitted with the nominal parameters and judged on held-out recordings like any effect.
+"""
 
 from __future__ import annotations
 
@@ -124,7 +125,8 @@ def find_gap_law(
     """Estimate the remaining gap as a torque law, or return None if no location allows a law or no law closes enough.
 
     `problem` is the problem of the nominal model, without candidates. `last` is the model with the accepted effects, or
-    the nominal model. `places` are the locations of the gap, the most likely first."""
+    the nominal model. `places` are the locations of the gap, the most likely first.
+    """
     places = [p for p in dict.fromkeys(places) if allowed_torque_law_quantity_names(problem.system, p)][:_MAX_PLACES]
     if not places or search.record_skip_if_past_deadline("a law"):
         return None

@@ -8,7 +8,8 @@ background with the covariance
 where m is the assumed model error for these torques and h the torque that friction can hold. c >= 1, w and s maximise
 the evidence, with and without a pulse, so that a dominant model error causes no events. Pulses are added one by one,
 largest rise of the evidence first. This is the search for shocks by auxiliary residuals (de Jong and Penzer 1998,
-doi:10.1080/01621459.1998.10473717), with pulses in place of impulses."""
+doi:10.1080/01621459.1998.10473717), with pulses in place of impulses.
+"""
 
 from __future__ import annotations
 
@@ -309,7 +310,8 @@ def detect_force_pulses(
     """Detect force pulses in one force estimate, largest evidence first. Also returns the number of windows searched.
 
     The p-value of a pulse refers to a single window, so it must be corrected for the number of windows. This number
-    counts disjoint windows, of lengths a factor of two apart."""
+    counts disjoint windows, of lengths a factor of two apart.
+    """
     windows, tries, profiles = _looked_at(history.t.tobytes(), history.filter_cutoff, limits.max_event_duration)
     if not len(windows.begin):
         return [], 0.0

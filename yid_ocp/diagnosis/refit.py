@@ -1,7 +1,8 @@
 """Refit the nominal parameters together with effects, and judge the fits on held-out recordings.
 
 A loss is the mean square of whitened residuals in blocks of held-out time. All models use the same blocks, so that
-differences between models are paired. G = max(0, chi2/n - 1) is the gap."""
+differences between models are paired. G = max(0, chi2/n - 1) is the gap.
+"""
 
 from __future__ import annotations
 
@@ -123,6 +124,22 @@ class RefitStore(Protocol):
 
 
 @dataclass(frozen=True)
+class FinerStepRefitStore:
+    """Refits of another store made at a finer time step [s] than stated, under separate names."""
+
+    store: RefitStore
+    time_step: float
+
+    def get(self, name: str) -> StoredFit | None:
+        """The refit stored under a name at this time step, or None."""
+        return self.store.get(f"{name} at {self.time_step:g} s")
+
+    def put(self, name: str, refitted: StoredFit) -> None:
+        """Store a refit under a name and this time step."""
+        self.store.put(f"{name} at {self.time_step:g} s", refitted)
+
+
+@dataclass(frozen=True)
 class NominalSolutionAndRefitStore:
     """Solution of the nominal problem and refits of an interrupted run, known before a diagnosis."""
 
@@ -150,7 +167,8 @@ class RefitContext:
     """Problem, thresholds, progress, store and deadline of one diagnosis. It makes the refits that rules request.
 
     With `is_finished`, results come from the record alone, without using the problem; a missing result raises
-    `UnrecordedRefitError`."""
+    `UnrecordedRefitError`.
+    """
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
@@ -243,7 +261,8 @@ def refit_with_effects(
     """Fit nominal and effect parameters, and predict held-out recordings. Returns None if no rollout succeeds.
 
     `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` is
-    the name in the store of refits; the default, the labels of the effects, suffices if no other start is tried."""
+    the name in the store of refits; the default, the labels of the effects, suffices if no other start is tried.
+    """
     problem = problem.restricted_to_effect_location(effects)
     known = load_stored_refit(problem, effects, store, name)
     if known is not None:
@@ -402,7 +421,8 @@ def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Arr
     """Wald test of each effect: all amplitudes together, at fixed shapes, because weak effects have any shape.
 
     A well-known load can be divided among amplitudes in any way, so that no single one differs from neutral. `factor` F
-    gives the covariance F F'. Davies 1987, doi:10.1093/biomet/74.1.33."""
+    gives the covariance F F'. Davies 1987, doi:10.1093/biomet/74.1.33.
+    """
     found = {}
     for effect in effects:
         shapes, sized = (
@@ -434,7 +454,8 @@ def refit_with_each_effect(
 
     Each entry of `tried` holds the added effects and their initial parameters; `values` are the initial values of all
     other unknowns. `where` labels these initial values in the store of refits, so that refits of the same effects from
-    other values remain distinct."""
+    other values remain distinct.
+    """
     if not tried:
         return []
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""

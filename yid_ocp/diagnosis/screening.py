@@ -10,7 +10,8 @@ E_j = J_j' P e for draws e of what it does to the residual. For autocorrelated n
 autocovariances after the candidate's step (Bartlett weights, Newey and West 1987, doi:10.2307/1913610). The linear
 model predicts a decrease of r'r by s_j' G_j^-1 s_j, or less if an amplitude would leave its bounds. Shape parameters
 are tried on a grid, and the best p-value is corrected for that many trials (Davies 1987, doi:10.1093/biomet/74.1.33,
-bounded by Bonferroni)."""
+bounded by Bonferroni).
+"""
 
 from __future__ import annotations
 
@@ -91,7 +92,8 @@ def linearize_candidates(
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
     The model contains the effects in `base`, with all their parameters free. `values` are the fitted unknowns of this
-    model. `grid` is the number of values per shape parameter. Raises `SolverError` if the rollout at `values` fails."""
+    model. `grid` is the number of values per shape parameter. Raises `SolverError` if the rollout at `values` fails.
+    """
     labels = {effect.label for effect in base}
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
     own = [name for effect in base for name in effect.parameters.names]
@@ -294,7 +296,8 @@ class AllCandidatesScoreModel:
     def ranked_candidate_pairs(self, among: Sequence[str]) -> Iterator[ScoredCandidatePair]:
         """Yield all pairs of the candidates `among`, largest penalised decrease of r'r first (r: whitened residual).
 
-        Two effects together can explain a residual that neither explains alone, because each masks the other."""
+        Two effects together can explain a residual that neither explains alone, because each masks the other.
+        """
         bounds = [_room(effect) for effect in self.effects]
         lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
         columns, wanted = self._columns, [i for i, effect in enumerate(self.effects) if effect.label in set(among)]

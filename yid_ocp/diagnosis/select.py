@@ -1,7 +1,8 @@
 """Select effects one after the other by how much of the held-out gap they close.
 
 The closure is 1 - G_after/G_before of the held-out losses. Its interval comes from resampling blocks (Kuensch 1989,
-doi:10.1214/aos/1176347265)."""
+doi:10.1214/aos/1176347265).
+"""
 
 from __future__ import annotations
 
@@ -90,7 +91,8 @@ def penalized_chi2_excess_over(fit: RefitStatistics, other: RefitStatistics) -> 
 
     The BIC is r'r over estimation and held-out recordings (r: whitened residual) plus log(n) per effect parameter, with
     n residuals (Schwarz 1978, doi:10.1214/aos/1176344136). Half the difference is the log odds of `other` against
-    `fit`."""
+    `fit`.
+    """
     held = fit.held_out_loss.total_chi2 - other.held_out_loss.total_chi2
     more = fit.effect_parameter_count - other.effect_parameter_count
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
@@ -105,7 +107,8 @@ def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> li
 
     If the best model leaves only noise, all recordings form one likelihood, and models with odds against them are
     dropped. Otherwise the held-out prediction error counts, relative to the residual; of equally good models the
-    simplest is best."""
+    simplest is best.
+    """
     best = min(fits, key=_chi2)
     if _is_noise(best.held_out_loss, limits):
         best = min(fits, key=lambda fit: penalized_chi2_excess_over(fit, best))
@@ -121,7 +124,8 @@ def _is_predicting_as_well(fit: RefitStatistics, other: RefitStatistics) -> bool
     """Whether a loss, and the mean logarithm of its blocks, is within a standard error over blocks of the best.
 
     The sum alone is not enough, because a few large blocks dominate its error. If model error dominates, fewer
-    parameters outweigh a larger loss as in BIC, with blocks as samples."""
+    parameters outweigh a larger loss as in BIC, with blocks as samples.
+    """
     loss, best = fit.held_out_loss, other.held_out_loss
     (lost, error), count = held_out_improvement(loss, best), len(best.block_chi2)
     ratios = np.log(np.maximum(loss.block_chi2, 1.0) / np.maximum(best.block_chi2, 1.0))
@@ -225,7 +229,8 @@ def select_effects(
     `places` are the smoother's locations of the gap. If `moved` (the nominal fit has left the estimates of an earlier
     run), candidates are also tried from those estimates. Returns the fits of single effects in the first round and the
     selected effects. The fit of the chosen effect comes first (its last fit if no other effect is selected), then all
-    other fits by held-out loss."""
+    other fits by held-out loss.
+    """
     limits, alone, chosen, before = search.thresholds, screened, _Choice(nominal), nominal
     first: list[RefitStatistics] = []
     while len(chosen.fit.effects) < limits.max_effects:

@@ -20,7 +20,8 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 class Thresholds(SmootherThresholds):
     """Thresholds of every step of a diagnosis, from the null test to the events.
 
-    Each field has a description, repeated in the section `diagnosis` of the settings reference."""
+    Each field has a description, repeated in the section `diagnosis` of the settings reference.
+    """
 
     # is there a gap
     significance_level: Annotated[

@@ -1,7 +1,8 @@
 """Decide whether there is a gap, whether effects transfer to held-out recordings, and the verdict.
 
 Two or three effects together can imitate almost any gap on the recordings used to fit them. True effects have the same
-parameters on all recordings. The held-out recordings are therefore fitted too, and the estimates are compared."""
+parameters on all recordings. The held-out recordings are therefore fitted too, and the estimates are compared.
+"""
 
 from __future__ import annotations
 
@@ -140,7 +141,8 @@ class Judgement:
         """Fraction of the smoother's explanation that the effects are required to explain.
 
         For k assumptions it is 1 - (1 - `min_explained_fraction`)^k: each assumption must explain that part of the
-        remainder."""
+        remainder.
+        """
         return 1.0 - (1.0 - limits.min_explained_fraction) ** self.assumption_count
 
 
@@ -185,7 +187,8 @@ def judge(
     """Decide the verdict from the evidence for a gap and from the results of a search for effects.
 
     Refits, screenings and the smoother (`locate`) are requested by name and can come from a record, so the verdict
-    depends on numbers alone. `finished` is called with the name of each stage."""
+    depends on numbers alone. `finished` is called with the name of each stage.
+    """
     limits, nominal = search.thresholds, seen.nominal_model
     has_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
     # a gap closed by shifted parameters counts only if an effect explains it
@@ -222,7 +225,8 @@ def _effects_with_transfer_checks(
     """The selected effects, with standard deviations increased by disagreement, and their transfer checks.
 
     Effects at one location divide a torque between them arbitrarily. If they do not transfer, one of them is removed,
-    the last one first, if the others transfer without it."""
+    the last one first, if the others transfer without it.
+    """
     if not added:
         return added, ()
     checks = _check_effect_amplitude_transfer(search, added[-1].refitted_model)
@@ -245,7 +249,8 @@ def _check_effect_amplitude_transfer(
 ) -> tuple[EffectAmplitudeTransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
 
-    Empty if one recording is split, or if the refit fails; neither is evidence against an effect."""
+    Empty if one recording is split, or if the refit fails; neither is evidence against an effect.
+    """
     again = search.refit_on_held_out(fit) if fit.effects else None
     if again is None:
         return ()

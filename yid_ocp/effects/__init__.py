@@ -1,6 +1,7 @@
 """The library of unmodelled effects and their possible locations. A new kind is one file.
 
-The class of a kind states its equation, quantities, units, bounds and ranges. `docs/howto/extending.md` adds a kind."""
+The class of a kind states its equation, quantities, units, bounds and ranges. `docs/howto/extending.md` adds a kind.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
     Its parameters are named `kind@location.parameter`. `values` holds non-neutral values by parameter; a compliance may
     be given as its `stiffness`. Raises `ConfigError` for an unknown kind or parameter, or a value outside its bounds.
-    Raises `ModelError` if the kind cannot act at this location of the system."""
+    Raises `ModelError` if the kind cannot act at this location of the system.
+    """
     places = EFFECTS[kind].possible_locations(system)
     # a payload or point mass may be at any frame, including frames of the arm that are not in `system.point_frames`
     if location not in places and not (EFFECTS[kind].is_at_point_groups and location.partition("_")[0] == "points"):
@@ -51,7 +53,8 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
     `system` does not contain the candidate effects. `recorded_sensors` lists the recorded signals: names in
     `signal_kinds_required_by_any_effect`, sensors on a frame such as `wrist:FRAME`, and `points:GROUP` for points with
     a separate clock. Effects on prescribed joints are omitted if no effort was recorded, because they would change no
-    measurement. Raises `ModelError` for another signal."""
+    measurement. Raises `ModelError` for another signal.
+    """
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
     for name in sorted(name for name in present - known if ":" not in name):
         said = unknown_name_error_arguments(name, sorted(known))

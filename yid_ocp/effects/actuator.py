@@ -2,7 +2,8 @@
 
 For inputs of the model (torques and angles of driven joints, angles of prescribed joints) an effect acts through
 `corrected_reading`. For the effort of a prescribed joint, which is compared with the record, it acts through
-`distorted_reading`."""
+`distorted_reading`.
+"""
 
 from __future__ import annotations
 
@@ -117,7 +118,8 @@ class Backlash(_DistortedReading):
 
     A position servo controls the measured angle, so its torque depends on the play z between motor and joint. For a
     joint with a servo, z is an internal coordinate that solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every
-    step and has no memory."""
+    step and has no memory.
+    """
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
     required_excitation = "how hard it pulls at its ends"
@@ -232,7 +234,8 @@ class _EffortDelay(_LateTorque):
     """Delay of a joint's torque: the torque that acts at time t was recorded at t - delay.
 
     At a prescribed arm, the effort recorded at t belongs to the motion at t + delay. A negative delay means that the
-    effort is recorded late."""
+    effort is recorded late.
+    """
 
     equation = "the torque that acts at t was recorded at t - delay"
     possible_locations = _effort_arms
@@ -251,7 +254,8 @@ class _EffortLag(_LateTorque):
     At a driven joint, the recorded torque is the command and the applied torque lags behind it. At a prescribed joint,
     the torque that the motion requires lags behind the recorded torque. A negative time constant, allowed only at
     prescribed joints, reverses the roles: the recorded torque lags, as with a filtered sensor. Before the start of a
-    recording, both torques are constant at their initial values."""
+    recording, both torques are constant at their initial values.
+    """
 
     equation = "time_constant dz/dt = command - z"
     possible_locations = _effort_joints
@@ -332,7 +336,8 @@ class _CurrentLimit(_ServoChange):
     """Current limit of a DC motor, where current = motor torque / published torque constant kt.
 
     Unlike the duty limit, it also limits braking torque. The internal parameter is limit^-16, so that its neutral value
-    zero means that there is no limit."""
+    zero means that there is no limit.
+    """
 
     equation = "torque = kt clip(torque/kt, limit)"
     possible_locations = _published_motor_joints
@@ -365,7 +370,8 @@ class _ServoSaturation(_ServoChange):
     """Additional smooth torque limit of a servo, with torque = demand / (1 + |demand/limit|^16)^(1/16).
 
     The internal parameter is limit^-16. Its neutral value zero means that there is no additional limit, and its
-    derivative is nonzero at zero. It is added to the model's own limit^-16."""
+    derivative is nonzero at zero. It is added to the model's own limit^-16.
+    """
 
     equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"
 

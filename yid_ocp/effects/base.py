@@ -155,7 +155,8 @@ class EffectBase(Effect):
         """Convert the parameters to their reported form. For example, a compliance is reported as a stiffness.
 
         Missing `values` are nominal, missing `stds` are NaN. A reported power of C, C^(-1/p), has the standard
-        deviation C^(-1/p) std(C)/(p C)."""
+        deviation C^(-1/p) std(C)/(p C).
+        """
         result = {}
         for definition, entry in zip(self.definitions, self.parameters, strict=True):
             value = float((values or {}).get(entry.name, entry.value))
@@ -303,7 +304,8 @@ def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
 def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     """Choose one frame for every arm link with mass: that of a grasp, else of a gripper, else the link's first frame.
 
-    A finger (a prismatic joint without child joints) counts as part of the link that carries it."""
+    A finger (a prismatic joint without child joints) counts as part of the link that carries it.
+    """
     tree = system.mechanism
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
     parents = {joint.parent_index for joint in tree.joints}

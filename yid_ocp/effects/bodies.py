@@ -153,7 +153,8 @@ class Payload(EffectBase):
       at least 1 kg: s = m (1 + (|m|/L)^8)^(-1/8). s is also the reported moment.
     - Near mass zero, and beyond `_POINT_INERTIA_DISTANCE`, w goes smoothly to zero, because 1/mass diverges.
     - For a removed mass h = (1 + a^4)^(-1/4), with a = c e' Sigma^-1 e. The second moment of the link about its new
-      centre, Sigma + c h e e', thus stays positive. h is almost 1 if the mass was part of the link."""
+      centre, Sigma + c h e e', thus stays positive. h is almost 1 if the mass was part of the link.
+    """
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
     required_excitation = "its orientation to gravity"
@@ -288,7 +289,8 @@ class _AerodynamicDrag(EffectBase):
     """Quadratic air drag on a segment's links, F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
     v_n is the velocity of a link's centre (with Jacobian J_c) normal to the link; |v_n| is smoothed below
-    `_ABS_SMOOTHING_SPEED`. cd is the drag coefficient, r the link's radius and l its length."""
+    `_ABS_SMOOTHING_SPEED`. cd is the drag coefficient, r the link's radius and l its length.
+    """
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
     required_excitation = "how fast it moves"
@@ -378,7 +380,8 @@ def _on_bodies(
     `slopes` (6, 6) are their symmetric derivatives by the spatial velocity. W_j and K_j are the sums of both over all
     bodies that joint j moves. S_j is its screw, D_j = V_parent(j) x S_j and F_j = S_j . W_j. The columns of
     `ForceWithDerivativeFactors` are A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because a rotation of joint i rotates
-    body and wrench together, except for the velocity D_i that it adds."""
+    body and wrench together, except for the velocity D_i that it adds.
+    """
     tree = kinematics.mechanism
     n, screws = len(tree.joints), kinematics.joint_screws
     zero = ca.SX(ca.DM.zeros(6))

@@ -110,7 +110,8 @@ class _JointLoadFriction(_JointFriction):
 
     The external torque is that of weights and grasps beyond the joint. The sign of the speed is smoothed below
     `_LOAD_SIGN_SMOOTHING_SPEED`, the magnitude of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al. (2024),
-    Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650."""
+    Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
+    """
 
     equation = "F = -share |tau_motor - tau_outside| tanh(v/v_s)"
     candidate_locations = base.servo_joint_names  # recorded torques leave no room for what a gear takes of them
@@ -148,7 +149,8 @@ class _JointPresliding(EffectBase):
     longer than the yield angle. |d| in the terms with s_k is smoothed below `_ABS_SMOOTHING_ANGLE`. A loaded joint
     creeps slightly instead of resting if its arm vibrates on the friction's stiffness tau_c/yield_angle faster than the
     steps resolve, like any vibrated Dahl friction; shorter steps prevent it. The initial s of every recording is
-    unknown and estimated. From Dahl (1968), A solid friction model, Aerospace Corporation TOR-158(3107-18)."""
+    unknown and estimated. From Dahl (1968), A solid friction model, Aerospace Corporation TOR-158(3107-18).
+    """
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
     required_excitation = "how fast it moves"

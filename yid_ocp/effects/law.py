@@ -46,7 +46,8 @@ _SPACING_RTOL = 1e-3  # relative tolerance on equal spacing of knots in a file
 class TorqueLawTable:
     """Torque as a function of one quantity: values and standard deviations at equally spaced knots (k,).
 
-    A natural cubic spline interpolates the values. Beyond the knots the torque is constant."""
+    A natural cubic spline interpolates the values. Beyond the knots the torque is constant.
+    """
 
     quantity: str  # one of `TORQUE_LAW_QUANTITY_UNITS`
     knots: Array
@@ -67,7 +68,8 @@ class TorqueLaw(EffectBase):
     coordinate s with ds/dt = 1). f is a natural cubic spline whose parameters are its values at equally spaced knots,
     and constant beyond the knots; for two quantities it is a sum of two splines. The command is the torque that the
     servo requests, after saturation; for a DC motor it is the torque of the duty cycle without back-EMF. A law of the
-    command is zero while the motor is off. At a segment, the load of a joint is the torque of its spring."""
+    command is zero while the motor is off. At a segment, the load of a joint is the torque of its spring.
+    """
 
     knots: Mapping[str, Array] | None = None  # knots of every quantity
 
@@ -164,7 +166,8 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
 def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
     """Quantities on which a law at a location may depend, empty if no law is possible.
 
-    `load` needs a driven joint, `command` a servo."""
+    `load` needs a driven joint, `command` a servo.
+    """
     if location in segment_names(system):
         return ("angle", "speed", "time")
     if location not in arm_joint_names(system):
@@ -179,7 +182,8 @@ def torque_law_quantity_values_along_rollout(
     """Values (N, joints) of `quantity`, such as speed or load, at the midpoints of the N steps of a rollout.
 
     Columns are the joints of `location`. A command is NaN while the motor is off. `nodes` holds `state` (N + 1, nx),
-    `torque` (N, nu), the constraint `multipliers` (N, m) and the `time_step` [s] as an array."""
+    `torque` (N, nu), the constraint `multipliers` (N, m) and the `time_step` [s] as an array.
+    """
     n, h = system.n_coordinates, float(nodes["time_step"])
     if quantity == "time":
         return np.asarray((np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h, float)
@@ -224,7 +228,8 @@ def make_torque_law(
 ) -> TorqueLaw:
     """Make a law at a joint or segment from its tables. `torque_scale` is the expected size of its torque [N m].
 
-    Raises `ConfigError` if the location allows no law, or no law of these quantities."""
+    Raises `ConfigError` if the location allows no law, or no law of these quantities.
+    """
     label, possible = f"law@{location}", allowed_torque_law_quantity_names(system, location)
     if not possible:
         places = (*segment_names(system), *arm_joint_names(system))
@@ -249,7 +254,8 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
     """Read a law's tables from a CSV file in the format of `torque_law_tables_csv`.
 
     Raises `DataError` if the file is malformed, its knots are not evenly spaced and increasing, or its quantities
-    differ from `depends_on`."""
+    differ from `depends_on`.
+    """
     allowed = f"a header {','.join(_TABLE_COLUMNS)}, then rows of a quantity, its unit and three numbers"
     hint = "write it like the file law.csv of `diagnose`"
     lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]

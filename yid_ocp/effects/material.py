@@ -81,7 +81,8 @@ class _KelvinVoigt(_SegmentEffect):
 class _StandardLinearSolid(_SegmentMemory):
     """Standard linear solid of a segment. A spring and a damper in series are parallel to every bend and twist spring.
 
-    V += 1/2 ratio kappa (q - z)^2, where the massless coordinate z follows q: (q - z) = relaxation_time dz/dt."""
+    V += 1/2 ratio kappa (q - z)^2, where the massless coordinate z follows q: (q - z) = relaxation_time dz/dt.
+    """
 
     equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
     declared_parameters = (
@@ -107,7 +108,8 @@ class _Hysteresis(_SegmentMemory):
     """Hysteresis of a segment. A Dahl friction element is parallel to every bend and twist spring.
 
     F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| smoothed below `_ABS_SMOOTHING_SPEED`. The unknown
-    history is ignored: z = 0 at the start of a recording. From Dahl (1968), as in `joint_presliding`."""
+    history is ignored: z = 0 at the start of a recording. From Dahl (1968), as in `joint_presliding`.
+    """
 
     equation = "F = -stiffness z, dz/dt = v - |v| z / yield_angle"
     declared_parameters = (
@@ -142,7 +144,8 @@ class _CubicStiffness(_SegmentEffect):
     """Springs of a segment that stiffen or soften with the angle, by the sign of k3. Each joint adds V += 1/4 k3 q^4.
 
     The prior range of k3 is -0.5 to 1 times stiffness / (largest angle)^2. The largest angle is `_REFERENCE_ANGLE`
-    until `with_prior_ranges_scaled_to_angles` sets the one of the data."""
+    until `with_prior_ranges_scaled_to_angles` sets the one of the data.
+    """
 
     equation = "V += 1/4 k3 q^4"
     required_excitation = "how far it bends"

@@ -91,7 +91,8 @@ class _JunctionCompliance(_JointInsertion):
     """Massless two-axis rotational spring between a segment and the branches that leave it at a junction.
 
     At `w_PARENT` all branches rotate together about x and y of the parent's last link. At `junction_BRANCH` one branch
-    rotates about its own axes."""
+    rotates about its own axes.
+    """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the branches"
     possible_locations = _branch_joints_by_junction
@@ -135,7 +136,8 @@ class _GraspCompliance(_GraspChange):
 
     A step solves phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, which is the rigid grasp at C = 0.
     phi is evaluated at the end of the step, which numerically damps fast motions. Every row of the grasp has the same
-    C; in rows of orientation its unit is rad/(N m)."""
+    C; in rows of orientation its unit is rad/(N m).
+    """
 
     equation = "phi + C damping dphi/dt = C force"
     declared_parameters = (
@@ -154,7 +156,8 @@ class _GraspSlip(_GraspChange):
     """Slip of a grasp along a tube. The grasped point creeps in the direction in which the gripper pulls.
 
     d(offset)/dt = slip_per_load x axial load, both along the object's z axis (`Grasp.axial_slip` has the opposite
-    sign). The offset is zero at the start of a recording."""
+    sign). The offset is zero at the start of a recording.
+    """
 
     equation = "d(offset)/dt = slip_per_load x axial load"
     required_excitation = "how long it is held"

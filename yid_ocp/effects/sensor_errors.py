@@ -1,7 +1,8 @@
 """Errors of cameras, clocks, wrist sensors and inertial units.
 
 A group of points belongs to a camera if its sensor has a pose. Recorded points are in the world frame, and so are the
-offsets and rotations here. Of the camera's pose, only position and viewing direction matter."""
+offsets and rotations here. Of the camera's pose, only position and viewing direction matter.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +101,8 @@ class _SurfaceOffset(_CameraEffect):
 class _CameraLatency(_CameraEffect):
     """Latency of seen points, seen(t) = true(t - delay), of all cameras or of one group of points (by name).
 
-    A negative delay of a group means that the joints' clock is late."""
+    A negative delay of a group means that the joints' clock is late.
+    """
 
     equation = "seen point(t) = true point(t - delay)"
     required_excitation = "when it is read"

@@ -54,7 +54,8 @@ def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, 
 
     `rows` (del, internal, constraint, p1), `rows_by_theta` and, if not too large, `rows_by_unknowns` (q1, z1, lam) take
     `_ARGUMENT_NAMES`. `points` maps (q, theta) to positions of the sensors' points [m]. `mechanics` maps (q, v, theta)
-    to mass matrix, dL/dq and dL/dv of the bodies. The last two set internal coordinates to zero."""
+    to mass matrix, dL/dq and dL/dv of the bodies. The last two set internal coordinates to zero.
+    """
     e, system = symbols.equations, symbols.equations.system
     names, blocks = zip(*((block.name, block.expressions) for block in symbols.row_blocks), strict=True)
     by_rows, by_p1, _ = parameter_jacobian_function(e, system.parameters.names)(*e.arguments)
@@ -84,7 +85,8 @@ def export_step_functions(
     """Write a step's CasADi functions as `NAME.casadi` files and as `equations.c`, and return the written files.
 
     `names.json` contains the parameters' names and values `theta`, and the time step [s]. `folder` is created if
-    absent. Raises `OutputError` if the folder or a file cannot be written."""
+    absent. Raises `OutputError` if the folder or a file cannot be written.
+    """
     folder, functions, written = make_folder(folder), _exported_step_functions(symbols), []
     for function in functions:
         written.append(folder / f"{function.name()}.casadi")
@@ -111,7 +113,8 @@ def write_equation_sheet(
     """Write a step's equations as a LaTeX document. Raises `OutputError` if the file cannot be written.
 
     Parameters in `free` stay symbols, and a table lists their values. All other parameters are replaced by their values
-    in `theta`."""
+    in `theta`.
+    """
     system = symbols.equations.system
     values = dict(zip(system.parameters.names, map(float, theta), strict=True))
     lines = [rf"\section*{{One step of {escape_latex(system.mechanism.name)}}}", *_rules(symbols, time_step)]

@@ -35,7 +35,8 @@ _MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
 def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
     """Convert a system to URDF text with damping, friction and inertias. Springs and grasps are omitted.
 
-    A `mujoco` element sets the minimum masses that MuJoCo requires. Other readers ignore it."""
+    A `mujoco` element sets the minimum masses that MuJoCo requires. Other readers ignore it.
+    """
     tree, terms = _tree(system, values)
     root = ElementTree.fromstring(mechanism_to_urdf(tree))
     sizes = {"boundmass": _MIN_LINK_MASS, "boundinertia": _MIN_LINK_INERTIA}

@@ -33,7 +33,8 @@ class RosTopicTimeSeries:
     """Time series of one ROS topic at times t (M,) [s]. A time without any finite value gets no message.
 
     `values` holds `position`, `velocity` and `effort` of joints, each (M, len(names)), or, for any other kind, `xyz`
-    (M, 3), which are the forces of a wrench."""
+    (M, 3), which are the forces of a wrench.
+    """
 
     topic: str
     kind: _SignalKind
@@ -132,7 +133,8 @@ def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[s
     """Write each group as a table `<group>.csv`, with all digits and the column names that `read_csv` reads.
 
     The tables omit standard deviations, the kind of effort, sensor, frame, pose and clock. The cells of an unseen point
-    are empty. Returns the files, joints first. Raises `OutputError` if the folder or a file cannot be written."""
+    are empty. Returns the files, joints first. Raises `OutputError` if the folder or a file cannot be written.
+    """
     folder = make_folder(folder)
     written = []
     for group in recording.joint_and_point_groups:
@@ -157,7 +159,8 @@ def joint_trajectory_message(
     """Build a ROS trajectory_msgs/JointTrajectory message of nj joints as a dict.
 
     Times t (N,) [s] count from the start; the other arrays are (N, nj). See
-    https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html"""
+    https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html
+    """
     points = []
     for i, time in enumerate(t):
         second = math.floor(time)

@@ -3,7 +3,8 @@
 References
 ----------
 Bryson and Frazier (1963), Smoothing for linear and nonlinear dynamic systems, Aeronautical Systems Division report
-TDR-63-119. Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5."""
+TDR-63-119. Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ class KalmanStepMatrices:
     The state x = (s, p) consists of dynamic states s and parameters p. It is measured by y = H x + e, where the noise e
     has unit covariance, and becomes x' = (M x, f p) + process noise, with the transition M and the decay f. P is the
     covariance before the measurement, and S = I + H P H'. The normalized innovations S^(-1/2) (y - H mean) of all steps
-    are independent and have unit variance."""
+    are independent and have unit variance.
+    """
 
     observation: Array  # H, shape (r, nx)
     whitening: Array  # S^(-1/2), shape (r, r)
@@ -74,7 +76,8 @@ class KalmanStepMatrices:
         """Step backwards through one filter step: smoothed measurement noise (r, c) and the costate before it (nx, c).
 
         `white` are the normalized innovations and `costate` is the costate after the step. The smoothed state is the
-        filter's prediction + P costate, with the covariance P."""
+        filter's prediction + P costate, with the covariance P.
+        """
         pulled = self.transition._propagate_costate_back(costate)
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
         return noise, pulled + self.observation.T @ noise
@@ -119,7 +122,8 @@ def _library() -> ctypes.CDLL | None:
 class KalmanSteps:
     """Successive steps of a linear Kalman filter with fixed gains, in compiled code if possible.
 
-    The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`."""
+    The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`.
+    """
 
     row_start: Sequence[int]
     moves: Array  # state rows of k steps' transitions and, beside them, noise of the states, (k, ns, ns + m + noises)
@@ -154,7 +158,8 @@ class KalmanSteps:
 
         `mean` is the mean before all steps, `measured` (r, c) the measurements. `push` (k, m, c) is added to the
         parameters during a step's transition. `shift` (k, nx - ns) is added to the parameters of the first column after
-        the step."""
+        the step.
+        """
         if (library := _library()) is not None:
             return self._compiled_columns(library, measured, mean, shift, push)
         white, seen, ns = np.empty_like(measured), np.empty((len(self.moves), *mean.shape)), self.moves.shape[1]
@@ -169,7 +174,8 @@ class KalmanSteps:
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
         """Smooth all steps: measurement noise (r, c), first costates (nx, c), and costates after each step (k, nx, c).
 
-        `white` are the normalized innovations, `costate` is the costate after the last step."""
+        `white` are the normalized innovations, `costate` is the costate after the last step.
+        """
         if (library := _library()) is not None:
             return self._compiled_columns(library, white, costate, None, None)
         noise, seen = np.empty_like(white), np.empty((len(self.moves), *costate.shape))
@@ -210,7 +216,8 @@ def prepare_kalman_steps(
     """Prepare successive filter steps. Returns them and the state covariance (nx, nx) after the last step.
 
     The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states.
-    `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`."""
+    `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`.
+    """
     count, library, covariance = np.diff(row_start), _library(), covariance.copy()
     white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)
     moves, decay, variance, observation = map(np.ascontiguousarray, (moves, decay, variance, observation))

@@ -27,7 +27,8 @@ class NominalTrajectory:
 
     Measurements are shifted by their delays to the times at which they were true. `initial_state_by_angles` and
     `initial_state_by_torque` (nx, nu) are derivatives of the initial state with respect to the driven joints' first
-    angles and torques. They are zero if the initial state does not depend on these."""
+    angles and torques. They are zero if the initial state does not depend on these.
+    """
 
     model_functions: ModelFunctions
     theta: Array
@@ -58,7 +59,8 @@ def nominal_trajectory_from_prediction(
 class ResidualDerivativesAtNodes:
     """Derivatives of r residuals with respect to states and efforts at the nodes around each sample.
 
-    Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights."""
+    Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
+    """
 
     node: IntArray  # first of each row's nodes, shape (r,)
     by_state: Array  # derivatives by the states of this and the next nodes, shape (2 or 4, r, nx)
@@ -71,7 +73,8 @@ class ResidualDerivativesAtNodes:
         """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
 
         `with_neighbours` is required for a sensor of velocities, accelerations or constraint forces, which depends on
-        four nodes (the first one is before the sample's node). Raises `DataError` without it."""
+        four nodes (the first one is before the sample's node). Raises `DataError` without it.
+        """
         step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
         found: list[IntArray] = []
@@ -134,7 +137,8 @@ class ResidualDerivativesAtNodes:
         """Residual derivatives (r, d) along d directions, from the derivatives of states and efforts at K nodes.
 
         `by_node` (K, nx, d) holds the derivatives of the states, `effort` (K, nc, d) the derivatives of the efforts.
-        The K nodes begin with node `first`. A residual beyond them uses the last node."""
+        The K nodes begin with node `first`. A residual beyond them uses the last node.
+        """
         found = np.zeros((len(self.node), by_node.shape[2]))
         for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
             used = np.flatnonzero(by_state.any(axis=1) | by_effort.any(axis=1))

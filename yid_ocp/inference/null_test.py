@@ -3,7 +3,8 @@
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
 (white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2). A chi-squared variable
 with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each fitted parameter removes one degree of
-freedom."""
+freedom.
+"""
 
 from __future__ import annotations
 
@@ -117,7 +118,8 @@ def residual_chi2_null_test(
     """Test whether a whitened residual (nr,) is noise alone after a fit of `parameters` parameters.
 
     Rows that belong to no series (priors) are ignored. `level` is the false-discovery rate over time windows of length
-    `window` [s]."""
+    `window` [s].
+    """
     count = sum(len(s.residual_indices) for s in series)
     degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)
     effective = max(degrees - parameters, 1.0)
@@ -135,7 +137,8 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     """Whiten a residual r (nr,), given in noise units, against further independent errors: (I + F F')^(-1/2) r.
 
     Column j of F (nr, k), the argument `spread`, is the change of the residual for one standard deviation of error j.
-    Columns that are not finite are ignored."""
+    Columns that are not finite are ignored.
+    """
     spread = spread[:, np.isfinite(spread).all(axis=0)]
     columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
@@ -148,7 +151,8 @@ def path_noise_spread(
 
     F F' is the covariance that this noise adds. A lightly damped object rings with it, which is neither white nor an
     error of the model. `predicted` returns the residual of a problem with redrawn episodes, None where it fails; by
-    default that at the unknowns `x`. K is 0 where no prescribed joints move an object."""
+    default that at the unknowns `x`. K is 0 where no prescribed joints move an object.
+    """
 
     def evaluated(own: EstimationProblem) -> Array | None:
         found = own.evaluate(x, False)
@@ -229,7 +233,8 @@ def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: floa
     """Mark the p-values that are significant at the false-discovery rate `level` among `tries` tests.
 
     `p_values` may omit tests with large p-values. Benjamini and Hochberg (1995),
-    doi:10.1111/j.2517-6161.1995.tb02031.x."""
+    doi:10.1111/j.2517-6161.1995.tb02031.x.
+    """
     order = np.argsort(p_values)
     passed = np.flatnonzero(np.sort(p_values) <= level * np.arange(1, len(order) + 1) / max(tries, 1.0))
     real = np.zeros(len(order), bool)

@@ -10,7 +10,8 @@ smoother make the cost linear in the number of intervals (de Jong 1989, doi:10.2
 regression effects of the filter: the unknowns only explain what the parameters cannot. Groups of unknowns (forces of a
 segment or a joint, biases of a camera, ...) are added one after another, the one that raises the evidence most first.
 Their standard deviations s maximise the evidence (MacKay 1992, doi:10.1162/neco.1992.4.3.415). The result is the
-smallest set of locations that explains the residual."""
+smallest set of locations that explains the residual.
+"""
 
 from __future__ import annotations
 
@@ -365,7 +366,8 @@ def force_log_likelihood_coefficients(
 
     `unknown` is the index of the unknown; f is in units of the unknown's reference standard deviation. Free parameters,
     states and all other unknowns are integrated out; `variance` gives the variances of their groups [squared
-    reference]."""
+    reference].
+    """
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))
     intervals = []
@@ -458,7 +460,8 @@ def gap_locations_by_smoother_evidence(
     """Rank all locations by their share of the log evidence. At equal shares, observable locations come first.
 
     The time windows of a location are those in which one of its unknowns is over `location_z` standard deviations from
-    zero."""
+    zero.
+    """
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
         groups.setdefault(source.location, []).append(source)
@@ -514,7 +517,8 @@ def gap_locations_from_effect_closures(
 
     `before` holds the locations found for the nominal model, `rest` those for the model with the effects. `closed` is
     the part of the gap that the effects at each location close. `windows` are the time windows of locations at which
-    the smoother has no unknown (`world`, `clock`)."""
+    the smoother has no unknown (`world`, `clock`).
+    """
     known = {place.location: place for place in before}
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
     for place in rest:
@@ -540,7 +544,8 @@ def z_scores_of_smoothed_unknowns(
     """Return the z scores (J, nd) of nd smoothed unknowns in J intervals: posterior mean over standard deviation.
 
     The result is the interval edges (J + 1,) [s], the names of the unknowns, and the scores. A score is NaN if the data
-    reduced the variance of the unknown by a fraction of `informed_fraction` or less."""
+    reduced the variance of the unknown by a fraction of `informed_fraction` or less.
+    """
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
     with np.errstate(divide="ignore", invalid="ignore"):

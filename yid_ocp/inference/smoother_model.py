@@ -7,7 +7,8 @@ at one of its points that acts on all joints between this point and the ground. 
     x_{k+1} = A_k x_k + E_k d_j,   y_k = C_k x_k + b_j + noise,
 
 where the unknowns d and b are constant over an interval j. States inside an interval are eliminated, so that the cost
-of later steps is linear in the number of intervals."""
+of later steps is linear in the number of intervals.
+"""
 
 from __future__ import annotations
 
@@ -269,7 +270,8 @@ def residual_models_with_unknown_forces(
     """Linearize every recording's residual with respect to unknown forces, offsets and biases.
 
     `evaluation` is the evaluation at the unknowns `x`, with a Jacobian. The unknown forces, offsets and biases are
-    constant over intervals of at least `interval` [s]."""
+    constant over intervals of at least `interval` [s].
+    """
     assert evaluation.jacobian is not None
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])
     found = []

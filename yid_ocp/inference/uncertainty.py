@@ -58,7 +58,8 @@ class ParameterEstimate:
     """Estimate of one parameter: value, standard deviation, bounds and verdict.
 
     The 95 % `interval` is given if the standard deviation does not describe the uncertainty: at a bound, where it is
-    one-sided, and for a cost that is not quadratic, where it is a profile-likelihood interval. None is an open end."""
+    one-sided, and for a cost that is not quadratic, where it is a profile-likelihood interval. None is an open end.
+    """
 
     value: float
     std: float  # infinite without information on the parameter
@@ -112,7 +113,8 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
     """Covariance of the unknowns (nx, nx) from data and stated priors, and chi2 per degree of freedom.
 
     Directions without information in the data get the variance (1e8 x scale)^2 instead of an infinite variance. The
-    standard deviation of a prior is never scaled below its stated value, even if other stated values are too large."""
+    standard deviation of a prior is never scaled below its stated value, even if other stated values are too large.
+    """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
     spread, chi2 = unknowns_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
@@ -146,7 +148,8 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     The sandwich is A^-1 S A^-1 (White 1982, doi:10.2307/1912526). S is the covariance of the scores J' r, summed over
     clusters of rows (Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136): time blocks of one recording with all
     channels, because a misfit is correlated in time and across channels; single channels of recordings, if there are
-    enough, for constant errors such as a sensor offset; and whole recordings. The largest result counts."""
+    enough, for constant errors such as a sensor offset; and whole recordings. The largest result counts.
+    """
     if evaluation.jacobian is None or not len(covariance):
         return covariance
     residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
@@ -169,7 +172,8 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
 
     A fit follows a cluster that alone informs a direction, so its residual is too small. The sums are therefore divided
     by (1 - h)^(1/2), where h is the cluster's part of the information (Bell, McCaffrey 2002). For few clusters,
-    Student's t also widens the intervals."""
+    Student's t also widens the intervals.
+    """
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     back = root @ inverse
@@ -219,7 +223,8 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
     """Standard deviation of each unknown, (nx,). Those of poorly determined parameters are checked against the cost.
 
     If the cost at the end of the 95 % interval is lower than predicted, the standard deviation follows from a parabola
-    through this point. It is infinite if the cost does not rise."""
+    through this point. It is infinite if the cost does not rise.
+    """
     spread = _std_from_covariance(covariance, x)
     lower, upper = problem.bounds
     scale = max(1.0, _chi2_per_dof(problem, evaluation))
@@ -262,7 +267,8 @@ def _std_from_covariance(covariance: Array, x: Array) -> Array:
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
     """Convert correlations `matrix` (n, n) and standard deviations `std` to the covariance data of result.json.
 
-    Parameters whose standard deviation is not finite and positive are left out."""
+    Parameters whose standard deviation is not finite and positive are left out.
+    """
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
     factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
     kept = matrix[np.ix_(at, at)] * np.outer(factor, factor)
@@ -288,7 +294,8 @@ def parameter_verdict(
     - weak: all other cases
 
     A value near zero is also judged by `scale`, the parameter's plausible size (zero if unknown). It is identifiable if
-    |value| + 2 std is at most a tenth of `scale`, and weak if it is at most `scale`."""
+    |value| + 2 std is at most a tenth of `scale`, and weak if it is at most `scale`.
+    """
     found = verdict_by_relative_std(value, std, scale)
     if found == "not_identifiable":
         return found
@@ -314,7 +321,8 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
     An open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
     `parameter_verdict`). With two open ends the verdict is not_identifiable. With one open end it is at best weak, and
     std is infinite. Without open ends, half the wider side acts as the standard deviation: it decides the verdict, and
-    replaces std if std is less than half of it."""
+    replaces std if std is less than half of it.
+    """
     low, high = interval
     if low is None and entry.value - entry.lower <= scale:
         low = entry.lower
@@ -343,7 +351,8 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     """Typical magnitude of each free parameter from priors, bounds, similar parameters or initial values.
 
     It is the first of these that is available: the prior's standard deviation, half the distance of finite bounds, the
-    median of parameters of the same kind (such as `bend`) or unit, the scale of the unknown."""
+    median of parameters of the same kind (such as `bend`) or unit, the scale of the unknown.
+    """
 
     def kind(name: str) -> str:
         return name.rpartition(".")[2]
@@ -377,7 +386,8 @@ def parameter_estimates(
 ) -> dict[str, ParameterEstimate]:
     """Make the estimates of all parameters from the unknowns `x`, their covariance (nx, nx) and the evaluation at `x`.
 
-    Local parameters are listed by recording. If `x` is not a fit, `fit` is None, and misfit and bounds are ignored."""
+    Local parameters are listed by recording. If `x` is not a fit, `fit` is None, and misfit and bounds are ignored.
+    """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else _std_from_covariance(covariance, x)
     sizes, theta = typical_parameter_magnitudes(problem, x), problem.theta_and_initial_state_deviation(x, 0)[0]

@@ -25,7 +25,8 @@ References
 ----------
 Golub and Pereyra (1973), SIAM J. Numerical Analysis 10:2, doi:10.1137/0710036. Bryson and Frazier (1963), Smoothing
 for linear and nonlinear dynamic systems, Aeronautical Systems Division report TDR-63-119.
-Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), System Identification, section 7.4."""
+Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), System Identification, section 7.4.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +99,8 @@ class WhiteningFilter:
         """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.
 
         The first column of `rows` is a residual in units of sensor noise, all other columns are its derivatives. `push`
-        (N, nu, c) is the tracking filter's correction of the torque and the derivatives of this correction [N m]."""
+        (N, nu, c) is the tracking filter's correction of the torque and the derivatives of this correction [N m].
+        """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
             result[part.rows], mean, _ = self._updated(part, mean, rows[part.rows], push)
@@ -251,7 +253,8 @@ def _whitened_episode(
     """Episode with estimated input errors, and the filter that whitens its residual at (theta, offset).
 
     The filter is None without process noise or if the rollout fails. It is linearised about the motion smoothed by
-    `before`, if given. With `keep_weights` it keeps the weights of `before`."""
+    `before`, if given. With `keep_weights` it keeps the weights of `before`.
+    """
     if episode.input_errors is None:
         return episode, None
     result = predictor.predict_episode(episode, *at, False, guess)
@@ -314,7 +317,8 @@ def problem_with_whitening_at(
     The problem itself is returned if it has no process noise, or if the rollout fails at `x`. If it is already
     whitened, the new filter is linearized about the motion and torques that the old filter smooths. `rounds` is the
     number of linearizations (2 at a fit). `equilibrium_guesses` are configurations from which the search for equilibria
-    starts."""
+    starts.
+    """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
 
@@ -340,7 +344,8 @@ def problem_with_whitened_held_out(
     Each held-out recording gets a Kalman filter that is linearised at the unknowns `x`, about the motion that the
     recording's previous filter smooths. A recording without a filter first gets one that is linearised about its
     rollout. With `keep_weights`, the gains of this first filter are kept, which suffices for torque offsets. A
-    recording whose rollout fails is weighted by sensor noise only."""
+    recording whose rollout fails is weighted by sensor noise only.
+    """
     x, episodes, made = np.asarray(x, float), [], []
     known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
     for held, (before, (own, theta, offset)) in zip(problem.held_out, known, strict=True):

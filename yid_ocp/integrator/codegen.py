@@ -1,6 +1,7 @@
 """Generate CasADi functions, index tables and C code from symbolic step equations.
 
-Batched kernels, and functions of very many instructions, are written with the SIMD arithmetic of `simd.c`."""
+Batched kernels, and functions of very many instructions, are written with the SIMD arithmetic of `simd.c`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ class StepFunctions:
     """CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
 
     Each is built when it is first used, because a cached kernel needs none of them. With constraint forces at the node,
-    the outputs for the midpoint and the end of the step are empty."""
+    the outputs for the midpoint and the end of the step are empty.
+    """
 
     def __init__(
         self,
@@ -45,7 +47,8 @@ class StepFunctions:
 
         Its outputs are the vectors per joint, then the nonzeros of the remaining entries of the residual, of p1 and of
         the constraints, and the curvature. The curvature is the derivative of the midpoint's constraint force with
-        respect to q_k, which equals the one with respect to q_{k+1}."""
+        respect to q_k, which equals the one with respect to q_{k+1}.
+        """
         return self._function("linear")
 
     @property
@@ -121,7 +124,8 @@ def _pairs(e: DiscreteEquations) -> ca.SX:
 
 def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Sparse derivatives without the bodies' part: residual and p1 by (unknowns, old, input), constraints by the
-    unknowns."""
+    unknowns.
+    """
     unknown, old = ca.vertcat(e.q1, e.z1, e.lam), ca.vertcat(e.q0, e.z0)
     inputs = ca.vertcat(unknown, old, e.u)
     m, n = e.lam.numel(), e.q0.numel()
@@ -155,7 +159,8 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
     """Build a CasADi function of the sparse derivatives of a step with respect to the parameters `names`.
 
-    Its outputs are the derivatives of the residual, of p1 and of the prescribed effort."""
+    Its outputs are the derivatives of the residual, of p1 and of the prescribed effort.
+    """
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     prescribed = list(e.system.prescribed_coordinate_indices)
@@ -243,7 +248,8 @@ def kernel_cache_key_text(functions: StepFunctions, tables: StepSparsityTables) 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
     """Generate the C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables and `kernel.c`.
 
-    With `batched`, the kernel integrates `yid_simd_width` rollouts at once; None if a function has no SIMD form."""
+    With `batched`, the kernel integrates `yid_simd_width` rollouts at once; None if a function has no SIMD form.
+    """
     made = _simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
     if made is None:
         return None

@@ -146,7 +146,8 @@ def compile_and_load_library(
 
     The cache key is the hash of `source`, the flags, the compiler, the processor and CasADi's version. With `make`,
     `source` is only part of the key, and `make` returns the C text (or None) if the library is not in the cache.
-    `level` replaces the default optimisation flag."""
+    `level` replaces the default optimisation flag.
+    """
     target = _library_file(source, level or _optimization_flag(), make)
     if target is None:
         return None
@@ -160,7 +161,8 @@ def compile_and_load_library(
 def compiled_casadi_function(function: ca.Function) -> ca.Function:
     """Compile a CasADi function to C, without optimisation. Returns the function unchanged if no compiler works.
 
-    This suits large functions whose calls take seconds in all. The compiled function cannot be differentiated."""
+    This suits large functions whose calls take seconds in all. The compiled function cannot be differentiated.
+    """
     target = _library_file(casadi_c_source(function.name(), (function,)), _NO_OPTIMIZATION_FLAG)
     if target is None:
         return function
@@ -253,7 +255,8 @@ def _is_ours(built: Path) -> bool:
 class MappedFunction:
     """A CasADi function of dense columns, evaluated at many points in one call, compiled if possible.
 
-    `shared_inputs` are the indices of inputs that have one value for all points."""
+    `shared_inputs` are the indices of inputs that have one value for all points.
+    """
 
     def __init__(self, function: ca.Function, shared_inputs: Sequence[int] = (), use_compiler: bool = True) -> None:
         self.function = function

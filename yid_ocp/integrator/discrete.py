@@ -16,7 +16,8 @@ lam_{k-1}) and a term of order h^2, so both have order two.
 
 The first equation holds for free coordinates. At a prescribed coordinate its left side is -h times the effort that the
 motion requires at node k. Both equations of a compliant coordinate are multiplied by its compliance, and so is its
-momentum p [rad s]. The spring force (1/compliance) thus stays finite, and the order stays two."""
+momentum p [rad s]. The spring force (1/compliance) thus stays finite, and the order stays two.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +47,8 @@ class _ConstraintImpulses:
     """Dphi (m, n) and d(Dphi(q)' lam)/dq (n, n) at q_k, q_m and q_{k+1}, with one sparsity pattern.
 
     The balance loses (start Dphi(q_k) + share Dphi(q_m))' lam with start + share = 1. p1 loses share (Dphi(q_m) -
-    Dphi(q_{k+1}))' lam."""
+    Dphi(q_{k+1}))' lam.
+    """
 
     start_share: float
     midpoint_share: float
@@ -73,7 +75,8 @@ class DiscreteEquations:
     """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system, from node 0 to node 1.
 
     q (n, 1) are coordinates, z (nz, 1) internal coordinates and p (n, 1) momenta [N m s]; the digit 0 or 1 in a name
-    denotes the node. The system has m constraints, nu inputs and ntheta parameters."""
+    denotes the node. The system has m constraints, nu inputs and ntheta parameters.
+    """
 
     system: System
     force_split: ForceSplit
@@ -149,7 +152,8 @@ def discrete_equations(
     References
     ----------
     Marsden and West (2001), Acta Numerica 10:357, section 3, doi:10.1017/S096249290100006X.
-    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955."""
+    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+    """
     rules = (("force_split", force_split, ForceSplit), ("constraint_force", constraint_force, ConstraintForcePlacement))
     for name, said, known in rules:
         if said not in get_args(known):
@@ -311,7 +315,8 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
     """Dphi(q) and d(Dphi(q)' lam)/dq in closed form.
 
     For joint i before joint j in the chain: d2x/dq_i dq_j = w_i x dx/dq_j for a point x, d2v/dq_i dq_j = w_i x (w_j x
-    v) for a direction v."""
+    v) for a direction v.
+    """
     n, turning = system.n_coordinates, [joint.kind != "prismatic" for joint in system.mechanism.joints]
     blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
 
@@ -415,7 +420,8 @@ class NlpStepConstraints:
     """Symbolic equality constraints of one step in a nonlinear program (NLP), with their Jacobians.
 
     `residual_jacobians` and `effort_jacobians` are the sparse derivatives of `residual` (nr, 1) and `prescribed_effort`
-    (nc, 1) with respect to `x0`, `x1`, `lam` and `u`."""
+    (nc, 1) with respect to `x0`, `x1`, `lam` and `u`.
+    """
 
     equations: DiscreteEquations
     time_step: float  # [s]
@@ -446,7 +452,8 @@ def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpS
 
     The rows do not depend on recordings: torques, prescribed coordinates and parameters may be data or unknowns. The
     bodies' second derivatives have a closed form (`MultibodyLagrangianDerivatives`) with a quarter of the operations of
-    automatic differentiation. All other derivatives come from automatic differentiation."""
+    automatic differentiation. All other derivatives come from automatic differentiation.
+    """
     e, h, system = equations, time_step, equations.system
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
     p1 = ca.SX.sym("p1", e.p0.numel())
@@ -477,7 +484,8 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
     """Derivatives of `momentum_balance` and of `p1` with respect to the step's symbols. The key `none` holds zeros.
 
     With L the bodies' Lagrangian at the midpoint and a = -1 in the balance, +1 in p1, the term h/2 L_q + a L_v has the
-    derivative h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv) with respect to q_k (b = -1) and q_{k+1} (b = 1)."""
+    derivative h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv) with respect to q_k (b = -1) and q_{k+1} (b = 1).
+    """
     n, h, scale, pulls = e.q0.numel(), e.h, e.row_scale, e.constraint_impulses
     rigid = e.rigid_body_terms
     L_qq, L_qv, L_vv = lagrangian_second_derivatives(rigid, e.system.mechanism)

@@ -1,6 +1,7 @@
 """The stepping kernel for machines without a C compiler, in CasADi and NumPy with a plain Newton method.
 
-It shares only the `DiscreteEquations` with `kernel.c`, so that each kernel is a check of the other."""
+It shares only the `DiscreteEquations` with `kernel.c`, so that each kernel is a check of the other.
+"""
 
 from __future__ import annotations
 
@@ -233,7 +234,8 @@ class InterpretedKernel:
     ) -> RolloutCostGradient:
         """Compute the gradient of a cost J along a rollout by the adjoint method. `by` holds J's partial derivatives.
 
-        costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k."""
+        costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
+        """
         by_state, by_multipliers, by_effort = by
         sizes, at, steps = self._model.sizes, self._at, len(rollout.torque)
         slopes, n = self._evaluators()[-1], sizes["n"]
@@ -285,7 +287,8 @@ class InterpretedKernel:
 def dense_function_evaluator(function: Any) -> Callable[[Array], list[Array]]:
     """Make an evaluator of a CasADi function of one column with dense outputs, for one thread.
 
-    Without CasADi's conversions between its matrices and arrays it takes a third of the time."""
+    Without CasADi's conversions between its matrices and arrays it takes a third of the time.
+    """
     buffer, run = function.buffer()
     point = np.zeros(function.numel_in(0))
     results = [np.zeros(function.size_out(i)[::-1]) for i in range(function.n_out())]

@@ -58,7 +58,8 @@ class EquilibriumSolver:
     """Newton solver for the static equilibrium of a system whose driven and prescribed joints have given positions.
 
     `known_coordinates` are the indices of these coordinates (driven, then prescribed), `free_coordinates` the indices
-    of the unknown coordinates."""
+    of the unknown coordinates.
+    """
 
     def __init__(self, step: Step) -> None:
         self.step = step
@@ -100,7 +101,8 @@ class EquilibriumSolver:
         guess : array_like, shape (n,), optional
             Configuration to start from; default: the undeformed object.
         names : sequence of str
-            Parameters with respect to which the equilibrium is differentiated."""
+            Parameters with respect to which the equilibrium is differentiated.
+        """
         step, system = self.step, self.step.system
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
         theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))

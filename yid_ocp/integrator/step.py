@@ -106,7 +106,8 @@ class Step(ReprMixin):
         prescribed : pair of array_like, shape (nc,), optional
             Prescribed coordinates at both nodes; required if the system has any.
         internal : array_like, shape (nz,), optional
-            Internal coordinates z_k; default: zero."""
+            Internal coordinates z_k; default: zero.
+        """
         rollout, n = self._single(q0, p0, u, theta, prescribed, internal, None), self.sizes["n"]
         return rollout.state[1, :n], rollout.state[1, n : 2 * n], rollout.multipliers[0], rollout.status
 
@@ -123,7 +124,8 @@ class Step(ReprMixin):
         """Jacobians of the next state with respect to the state, the input and the parameters `names` (default: all).
 
         Returns A (nx, nx), B_u (nx, nu) and B_theta (nx, len(names)), computed by the implicit function theorem. The
-        other arguments are as in `__call__`."""
+        other arguments are as in `__call__`.
+        """
         sizes = self.sizes
         chosen = tuple(self.system.parameters.names if names is None else names)
         nx, nu, nt = sizes["nx"], sizes["nu"], len(chosen)
@@ -189,7 +191,8 @@ def compile_step(
     use_compiler : bool
         If False, or if the machine has no compiler (with one log message), the step is interpreted.
     tolerance : float, optional
-        Correction of the coordinates at which Newton's method stops [rad or m]; default: from the time step."""
+        Correction of the coordinates at which Newton's method stops [rad or m]; default: from the time step.
+    """
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
     library = None
     if use_compiler:
@@ -255,7 +258,8 @@ def simulate(
     path : array_like, shape (N + 1, nc), optional
         Prescribed coordinates at every node [rad or m]; default: their initial values.
     feedback : TrackingFeedback, optional
-        Correction of the torque by the state."""
+        Correction of the torque by the state.
+    """
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return simulate_rollouts(step, [inputs])[0]
 
@@ -341,7 +345,8 @@ def moving_observable_state_mask(
     Internal states of a neutral effect are thus excluded. Only the first and the last step of the rollout are examined.
     `loads` are extra excitations as in `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend
     on directly. `disturbed` (nx,) marks states with an initial error; if given, states are also excluded that neither
-    these errors nor torque errors reach."""
+    these errors nor torque errors reach.
+    """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))
     ends = [
@@ -380,7 +385,8 @@ def step_derivatives_along_rollout(
     prescribed coordinates and of the constraint forces, (k, nc + m, d). The d = nx + c + e columns are the state
     (including the feedback, if given), the c torque directions `inputs` (N, nu, c) and e loads. `loads` are additions
     to the nt = n + nz + m step equations, (nt, e), and to the next momentum, (n, e), the same in all steps. `chosen` is
-    a range of consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular."""
+    a range of consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular.
+    """
     if loads is None:
         rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
         loads = np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0))

@@ -32,7 +32,8 @@ class StepModel:
 
     `sizes` holds the numbers of coordinates (n), internal coordinates (nz), constraints (m), inputs (nu), prescribed
     coordinates (nc), states (nx = 2 n + nz) and parameters (ntheta). `time_step` is in s. Newton's method stops at a
-    correction below `tolerance` [rad or m]."""
+    correction below `tolerance` [rad or m].
+    """
 
     system: System
     equations: DiscreteEquations
@@ -99,7 +100,8 @@ class RolloutStatus:
     """Convergence of a rollout: status code, last correction of Newton's method [rad or m] and totals over all steps.
 
     `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
-    the values after the last step."""
+    the values after the last step.
+    """
 
     code: NewtonStatusCode
     completed_steps: int
@@ -131,7 +133,8 @@ class SensitivityDirections:
     """The d directions along which a rollout is differentiated. The first directions are the named parameters.
 
     The tangents are the derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path
-    (N + 1, nc, d) along these directions."""
+    (N + 1, nc, d) along these directions.
+    """
 
     parameter_names: tuple[str, ...]
     initial_state_tangents: Array
@@ -154,7 +157,8 @@ class TrackingFeedback:
     """Feedback that keeps driven arms near their measured motion, u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     `state_indices` (nb,) selects entries of the state (q, p, z). `gain` (N, nu, nb) holds K_k [N m/rad for a
-    coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries."""
+    coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries.
+    """
 
     state_indices: NDArray[np.int32]
     gain: Array
@@ -166,7 +170,8 @@ class RolloutInputs:
     """Inputs of one rollout: parameters, initial state, torques, prescribed path, feedback, sensitivity directions.
 
     Shapes: `theta` (ntheta,), initial state (q, p, z) (nx,), nominal motor torque of every step (N, nu) [N m], and
-    prescribed coordinates at every node (N + 1, nc) [rad or m]."""
+    prescribed coordinates at every node (N + 1, nc) [rad or m].
+    """
 
     theta: Array
     initial_state: Array
@@ -184,7 +189,8 @@ class Rollout:
     s. `effort` (N, nc) is the effort of prescribed coordinates at nodes 0..N-1 [N m], `torque` (N, nu) the applied
     torque [N m]. The effort at node 0 is correct if p_0 contains the impulse of a previous step, as the initial
     momentum of an `Equilibrium` does. If p_0 is computed from the velocity v (p_0 = dL/dv), it contains only half a
-    step's impulse, and the effort at node 0 is only half."""
+    step's impulse, and the effort at node 0 is only half.
+    """
 
     state: Array
     multipliers: Array
@@ -206,7 +212,8 @@ class RolloutCostGradient:
 
     It has the derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu)
     and the prescribed coordinates at every node (N + 1, nc). The derivatives at node 0 are also part of
-    `by_initial_state`."""
+    `by_initial_state`.
+    """
 
     by_theta: Array
     by_initial_state: Array
@@ -221,7 +228,8 @@ class StepEquationLinearizations:
     Each step has nt = n + nz + m equations: momentum balance (n), internal (nz) and constraint (m). `p1` is the
     momentum p_{k+1} (n) that follows from the other values. The Jacobians are with respect to the new values (q_{k+1},
     z_{k+1}, lam_k), the old values (q_k, z_k), the torque and the chosen parameters. The Jacobian of the balance with
-    respect to p_k is the identity."""
+    respect to p_k is the identity.
+    """
 
     residual: Array
     p1: Array

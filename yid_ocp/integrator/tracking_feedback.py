@@ -1,7 +1,8 @@
 """Tracking filter of driven arms: a feedback about the measured motion with LQR gains.
 
 The discrete momentum contains half the impulse of the previous step. An effect, or a torque other than the recorded
-one, therefore changes the momentum that belongs to a given motion."""
+one, therefore changes the momentum that belongs to a given motion.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ def lqr_tracking_feedback(
     about the measured motion. The reference momentum follows from the measured angles (N + 1, nu) [rad] and torques (N,
     nu) [N m] by the arms' DEL equations, and is therefore comparable with the model's momentum. The angles must be
     smooth enough for numerical differentiation. `arms` is the result of `compile_driven_arms_only_step`, compiled if
-    absent."""
+    absent.
+    """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arm_step = compile_driven_arms_only_step(step) if arms is None else arms
@@ -142,7 +144,8 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 class JointMotionWithSensitivities:
     """Angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
 
-    The first of the d directions are parameters. A derivative is None if the quantity depends on no direction."""
+    The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
+    """
 
     angles: Array  # at every node, (N + 1, nu) [rad]
     torque: Array  # held over every step, (N, nu) [N m]
@@ -163,7 +166,8 @@ class RecordedMomentumCorrection:
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
     effect such as an armature, a fitted mass or damping of the arm, or a torque other than the recorded torque, changes
     the momentum of the motion. Without this shift the feedback would oppose it: at a wrist, whose momentum gain times
-    h/2 is near one, by half. `parameter_names` are those on which the momentum depends if the torques are known."""
+    h/2 is near one, by half. `parameter_names` are those on which the momentum depends if the torques are known.
+    """
 
     def __init__(self, step: Step) -> None:
         e, system = step.equations, step.system
@@ -227,7 +231,8 @@ class RecordedMomentumCorrection:
         """Momentum (N, nu) that effects add to the recorded motion at nodes 0..N-1, and its derivatives (N, nu, d).
 
         `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
-        The first of the d directions are the parameters `names`."""
+        The first of the d directions are the parameters `names`.
+        """
         steps, plain_theta = len(true.torque), self.theta_without_effects(theta)
         still = np.zeros((steps, len(self._kept)))
         plain, *_ = self._maps(False)(
@@ -285,7 +290,8 @@ def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> 
 
     The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
     is assumed to be the same in this step and the previous step. `gain` (..., nu, nb) is the feedback gain of the step.
-    `by_torque` (nu, nu) is `RecordedMomentumCorrection.momentum_derivative_by_previous_torque`."""
+    `by_torque` (nu, nu) is `RecordedMomentumCorrection.momentum_derivative_by_previous_torque`.
+    """
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
 

@@ -103,7 +103,8 @@ class FlexibleObject(ReprMixin):
     """A flexible object as a model of rigid links with elastic joints.
 
     Its frames are `object_root`, the segment tips `w_SEGMENT`, the link tips `SEGMENT_i_tip`, and points by arc length
-    such as `SEGMENT:40%`, which do not depend on the number of links."""
+    such as `SEGMENT:40%`, which do not depend on the number of links.
+    """
 
     mechanism: Mechanism
     elastic_joints: tuple[ElasticJoint, ...]
@@ -135,7 +136,8 @@ def flexible_object(
     root_placement : array_like, shape (4, 4), optional
         Pose of the root; default: identity.
     gravity_fraction : float
-        Factor on the object's weight, not on its inertia; below one if something else supports it."""
+        Factor on the object's weight, not on its inertia; below one if something else supports it.
+    """
     root = Placement.identity() if root_placement is None else Placement.from_matrix(root_placement)
     parts = _Parts(frames={"object_root": Frame(-1, root)})
     fraction = None if gravity_fraction == 1 else ca.SX(gravity_fraction)
@@ -210,7 +212,8 @@ def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLi
 
     The rotations serve as `Segment.rest_rotation` and `Segment.link_rest_rotations`. `vertices` (k, 3) are the
     undeformed centre line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line;
-    default: the world frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong."""
+    default: the world frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong.
+    """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
         what, hint = f"the vertices have the shape {points.shape}", "give x, y and z of two or more vertices"

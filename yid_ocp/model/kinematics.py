@@ -2,7 +2,8 @@
 
 A spatial velocity consists of the angular velocity and the linear velocity of the body point at the world origin. A
 wrench consists of the moment about the world origin and the force. With both in one fixed frame, the derivatives of the
-Lagrangian have the closed forms of `MultibodyLagrangianDerivatives`, which make the compiled step cheap."""
+Lagrangian have the closed forms of `MultibodyLagrangianDerivatives`, which make the compiled step cheap.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ class MultibodyLagrangianDerivatives:
     changes with the posture, and w_i the angular part of S_i:
 
         L_vv[i, j] = S_i . F_j              L_qv[j, i] = S_i . B_j   (row: q_j, column: v_i)
-        L_qq[i, j] = D_i . B_j + w_i . G_j  L_qv[i, j] = D_i . F_j"""
+        L_qq[i, j] = D_i . B_j + w_i . G_j  L_qv[i, j] = D_i . F_j
+    """
 
     lagrangian_by_q: ca.SX  # shape (n, 1)
     lagrangian_by_v: ca.SX  # shape (n, 1)

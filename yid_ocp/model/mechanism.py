@@ -48,7 +48,8 @@ class Placement:
 class Inertia:
     """Mass [kg], centre of mass [m] and inertia tensor about it [kg m^2] of a rigid body, in its joint's frame.
 
-    `gravity_fraction` multiplies the weight of the body, not its inertia; None means 1."""
+    `gravity_fraction` multiplies the weight of the body, not its inertia; None means 1.
+    """
 
     mass: ca.SX
     center_of_mass: ca.SX
@@ -98,7 +99,8 @@ class Frame:
 
     `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and further joints) belong to the same link.
     They stay with the joint if the mechanism is cut at this frame. All other bodies and frames of the link are beyond
-    the cut."""
+    the cut.
+    """
 
     joint_index: int
     placement: Placement
@@ -129,7 +131,8 @@ class Mechanism(ReprMixin):
     """A kinematic tree of joints with bodies, named frames and parameters. Parents precede children.
 
     Placements and inertias depend on `parameters`. For a chain NAME of `link_chains`, the frame `NAME:40%` is the point
-    at 40 % of its arc length."""
+    at 40 % of its arc length.
+    """
 
     name: str
     joints: tuple[Joint, ...]
@@ -169,7 +172,8 @@ class Mechanism(ReprMixin):
         """Return a frame by name. `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length.
 
         Such a point is fixed to the straight link that contains it. Raises `ModelError` if there is no such frame (with
-        the nearest name), or if the percentage is not from 0 to 100."""
+        the nearest name), or if the percentage is not from 0 to 100.
+        """
         if name in self.frames:
             return self.frames[name]
         line, _, said = name.partition(":")
@@ -246,7 +250,8 @@ class Mechanism(ReprMixin):
         """Return a copy with a chain of joints inserted at `index`. Other joints and frames stay attached as before.
 
         The first joint's parent must precede `index`. The parent of each further joint is the previous joint of the
-        chain."""
+        chain.
+        """
         count = len(chain)
 
         def moved(joint: int) -> int:

@@ -30,7 +30,8 @@ def parsed_mjcf(file: Path) -> SimpleNamespace:
     element, computed by MuJoCo from the geoms. Coordinates are as in MuJoCo, including `ref`. A joint that a linear
     equality constraint couples to another joint is treated like a URDF `mimic` joint. A free body that a weld attaches
     to another body is fixed to that body. Raises `ModelError` if `mujoco` is not installed, if it cannot compile the
-    file, or if the file has a free or ball joint."""
+    file, or if the file has a free or ball joint.
+    """
     model = _compiled_file(file)
     links = [SimpleNamespace(name=_WORLD, inertial=None)]
     joints: list[SimpleNamespace] = []
@@ -52,7 +53,8 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     """Nonzero constants of an MJCF file's joints, by joint and name. For other files the result is empty.
 
     Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
-    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `parsed_mjcf`."""
+    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `parsed_mjcf`.
+    """
     if file.suffix.lower() != ".xml" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}
     model = _compiled_file(file)

@@ -51,7 +51,8 @@ class _DcMotorData:
     """Published data of a geared DC servo, used as initial values.
 
     From Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators,
-    arXiv:2410.08650, and the data published with it (Rhoban/bam, Apache-2.0)."""
+    arXiv:2410.08650, and the data published with it (Rhoban/bam, Apache-2.0).
+    """
 
     supply_voltage: float  # [V]
     duty_per_gain: float  # duty per unit of the firmware's proportional gain and per error of the angle [1/rad]
@@ -170,7 +171,8 @@ class PositionServo:
     with the error e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p), p =
     `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, the sum over all limits. For a DC motor the duty cycle is
     limited, and the damping is the back-EMF (torque = kt/R (duty V - kt dq/dt), with torque constant kt, resistance R
-    and voltage V). `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero."""
+    and voltage V). `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero.
+    """
 
     gain: ca.SX  # includes the firmware's gain if known [N m/rad or N/m]
     damping: ca.SX  # [N m s/rad or N s/m]
@@ -227,7 +229,8 @@ def build_joint_servos(
     """Build a servo for every named joint. Returns the servos and their parameters, such as `JOINT.servo_gain`.
 
     With the initial gain, an error of `_DEFAULT_FULL_TORQUE_ERROR` gives the joint's effort limit. For a DC motor
-    `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor (the gain set in the firmware)."""
+    `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor (the gain set in the firmware).
+    """
     servos, entries = {}, []
     for joint in joints:
         at = tree.joints[tree.joint_index(joint)]

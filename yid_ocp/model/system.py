@@ -94,7 +94,8 @@ class Grasp:
 class MidpointState:
     """Symbols at the midpoint of one step, on which energies and forces may depend.
 
-    The coordinates q and internal coordinates z are means of both nodes; v and z_rate are differences divided by h."""
+    The coordinates q and internal coordinates z are means of both nodes; v and z_rate are differences divided by h.
+    """
 
     system: System
     kinematics: Kinematics  # at q
@@ -115,7 +116,8 @@ class NodeState:
     `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; the
     acceleration `a` is their difference over h, with an error of order h^2. At the first and last node, `v` is the
     velocity of the adjacent step, and `a` is the acceleration at the neighbouring node (error of order h). `load` and
-    `lam` belong to the step after the node (at the last node, to the last step)."""
+    `lam` belong to the step after the node (at the last node, to the last step).
+    """
 
     system: System
     kinematics: Kinematics  # at q
@@ -137,7 +139,8 @@ class ForceWithDerivativeFactors:
     S_j and D_j are as in `MultibodyLagrangianDerivatives`. A_j and T_j are the columns of A and T (6, n). For i an
     ancestor of joint j or j itself:
 
-        dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j"""
+        dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
+    """
 
     force: ca.SX
     A: ca.SX
@@ -165,7 +168,8 @@ class Effect:
 
     With neutral parameters a subclass leaves the nominal model unchanged. `distorted_reading` computes a reading from
     the true value. Its inverse `corrected_reading` computes the true value of recorded inputs (torques that drive the
-    model, angles that are prescribed or followed)."""
+    model, angles that are prescribed or followed).
+    """
 
     kind: str  # name under which its class is registered
     location: str  # name of the location where it acts
@@ -200,7 +204,8 @@ class Effect:
         """Time constant [s] of a channel's first-order lag.
 
         For `torque.JOINT`, the applied torque lags behind the recorded torque. For `joints.effort.JOINT`, the recorded
-        effort lags behind the true effort."""
+        effort lags behind the true effort.
+        """
         return ca.SX(0)
 
 
@@ -286,7 +291,8 @@ class System(ReprMixin):
     ) -> System:
         """Build a system from a robot, effects and `SystemBuildArguments`. Without a robot, it has the object alone.
 
-        Raises `ModelError` for an unknown or repeated name, no joints, or a joint both driven and prescribed."""
+        Raises `ModelError` for an unknown or repeated name, no joints, or a joint both driven and prescribed.
+        """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
             raise ModelError(f"gravity = {gravity}", where="gravity", allowed="three finite numbers [m/s^2]")

@@ -82,7 +82,8 @@ def resolve_urdf_path(robot: str | Path) -> Path:
     """Return the URDF path for a robot's name in the settings. The file need not exist.
 
     The name is a path, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
-    that ships with this package. Raises `ModelError` if there is no such robot."""
+    that ships with this package. Raises `ModelError` if there is no such robot.
+    """
     scheme, _, name = str(robot).partition(":")
     if scheme == "package":
         return _example_robot_urdf(name)
@@ -128,7 +129,8 @@ def read_urdf(
     locked : mapping of str to float, optional
         Positions of locked joints [rad or m]; default: zero or the nearest limit.
     exclude_links : sequence of str
-        Links to remove together with their subtrees, such as a tool that is not mounted."""
+        Links to remove together with their subtrees, such as a tool that is not mounted.
+    """
     file, locked = resolve_urdf_path(path), dict(locked or {})
     if not is_file(file):
         hint = "give a path, or package:NAME for example-robot-data"
@@ -446,7 +448,8 @@ def _unit_axis(joint: Any) -> Array:
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
     """Write a mechanism as URDF text. Each joint's bodies become one link, each frame a link on a fixed joint.
 
-    `read_urdf` reads the same numbers back to 1e-12."""
+    `read_urdf` reads the same numbers back to 1e-12.
+    """
     mechanism = mechanism.with_numeric_values(values)
     robot = ElementTree.Element("robot", name=mechanism.name)
 

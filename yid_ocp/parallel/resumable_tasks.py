@@ -4,7 +4,8 @@ A task is a call of a module-level function with plain data and paths. Its resul
 writes in one operation. The file name is the hash of the function's name, the sources that it depends on, and the
 arguments. A path enters the hash by file name and content, not by folder. A finished task is therefore never run again,
 whatever happened to the run. Any `concurrent.futures.Executor` is suitable if its workers share the file system. A task
-that runs twice, because its first worker was considered lost, gives the same file."""
+that runs twice, because its first worker was considered lost, gives the same file.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +111,8 @@ def run_tasks(
         Local processes stop at once if the run is interrupted. If a process crashes, only its own task is lost. Workers
         of a scheduler finish their current task.
     code : str, optional
-        Hash of the sources that results depend on; default: the whole package. See `version.folder_source_hash`."""
+        Hash of the sources that results depend on; default: the whole package. See `version.folder_source_hash`.
+    """
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
     # paths are absolute, because a worker may run in another folder
     anywhere = [replace(task, arguments=_mapped(task.arguments, Path.absolute)) for task in tasks]

@@ -1,6 +1,7 @@
 """Threads and processes on this machine: parallel maps, merged calls, shared caches and process pools.
 
-Merged calls: items run in parallel until all of them wait for a function, which is then called once for all."""
+Merged calls: items run in parallel until all of them wait for a function, which is then called once for all.
+"""
 
 from __future__ import annotations
 
@@ -170,7 +171,8 @@ def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[
     """Apply a function to items concurrently, so that simulations of different items run together as one batch.
 
     The calls of `call_merged_with_other_threads` are merged. At most as many items run as there are threads. Which
-    calls are merged depends only on the items. An item must not hold a lock during such a call."""
+    calls are merged depends only on the items. An item must not hold a lock during such a call.
+    """
     entries = list(items)
     if len(entries) < 2 or getattr(_THREAD_SHARE, "march", None) is not None:
         return [function(entry) for entry in entries]
@@ -230,7 +232,8 @@ class InlineExecutor(Executor):
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
     """Make a pool of processes that ignore interrupt signals, by default one per processor.
 
-    All processes together use at most the threads of this process."""
+    All processes together use at most the threads of this process.
+    """
     count = workers or available_processor_count()
     context = multiprocessing.get_context("spawn")  # a fork copies the locks of threads that it does not copy
     each = max(1, _max_threads() // count)

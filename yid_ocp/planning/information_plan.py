@@ -81,7 +81,8 @@ def plan_informative_motion(
     values : mapping of str to float, optional
         Parameter values at which the motion is optimised. Default: the values of the problem.
     effects : mapping of label to mapping of quantity to value, optional
-        Known sizes of the effects to discriminate. Default: typical sizes."""
+        Known sizes of the effects to discriminate. Default: typical sizes.
+    """
     check_option_bounds(options, "plan")
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
     progress.begin_stage("building the experiment")

@@ -114,7 +114,8 @@ class PlanOptions:
 class FramePositionEvaluator:
     """World positions of named frames, and their Jacobian with respect to the configuration.
 
-    Raises `ConfigError` if a frame does not exist."""
+    Raises `ConfigError` if a frame does not exist.
+    """
 
     def __init__(self, system: System, names: Sequence[str]) -> None:
         for name in names:
@@ -145,7 +146,8 @@ class RestToRestSplineBasis:
 
     The coefficients w_k are the control points. The spline has degree 5 and clamped ends. The path and its derivatives
     lie within the convex hulls of their control points, so limits on control points hold at all times, not only at
-    nodes."""
+    nodes.
+    """
 
     duration: float  # [s]
     n_coefficients: int  # number K of coefficients per joint; the last one is the final displacement
@@ -340,7 +342,8 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
 def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, guess: Array | None = None) -> Equilibrium:
     """Solve for the equilibrium at which a motion begins, near the configuration `guess` if given.
 
-    Raises `ModelError` if there is no equilibrium, for example because a grasp cannot be closed."""
+    Raises `ModelError` if there is no equilibrium, for example because a grasp cannot be closed.
+    """
     rest = EquilibriumSolver(step).solve(configuration, theta, guess=guess)
     if not rest.is_converged:
         allowed, where = "joint positions at which every grasp holds the object at rest", "plan.start_joint_positions"
@@ -371,7 +374,8 @@ def solve_equilibrium_at_point_target(
 ) -> Equilibrium:
     """Find an equilibrium within joint limits at which a point is at its target. `start` is the initial guess.
 
-    Raises `ConfigError` if no joint moves the point, or if no equilibrium has the point at the target."""
+    Raises `ConfigError` if no joint moves the point, or if no equilibrium has the point at the target.
+    """
     statics, system = EquilibriumSolver(step), step.system
     n, first = system.n_coordinates, start.state[list(system.prescribed_coordinate_indices)]
 

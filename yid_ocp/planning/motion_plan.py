@@ -46,7 +46,8 @@ class ParameterCovariance:
 class TargetMotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
-    The motion can be simulated with a shorter time step than the time step of the given step."""
+    The motion can be simulated with a shorter time step than the time step of the given step.
+    """
 
     target_point: str
     target_position: Array  # (3,) [m]
@@ -73,7 +74,8 @@ def plan_motion_to_target(
     `theta` holds the parameter values; default: those of the system. `known` is the covariance of uncertain parameters.
     If no motion keeps the limits, the result is still a plan, whose `message` names the violated limit and the excess.
     Raises `ConfigError` or `ModelError` if the target is out of reach, a name does not exist, or there is no
-    equilibrium."""
+    equilibrium.
+    """
     check_option_bounds(options, "plan")
     system = step.system
     if system.driven or not system.prescribed:

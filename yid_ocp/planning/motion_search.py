@@ -7,7 +7,8 @@ are satisfied.
 To maximise information, each round linearises the sensitivities J(w) and the limits, and SLSQP (Kraft 1988, DFVLR-FB
 88-28) maximises the criterion of the linear J within a trust region (Burke and Ferris 1995, doi:10.1007/BF01585997).
 All iterates satisfy the limits. Each parameter has a prior standard deviation of `MAX_WEAK_RELATIVE_STD` of its value;
-it keeps the criterion finite if no measurement informs the parameter."""
+it keeps the criterion finite if no measurement informs the parameter.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +111,8 @@ class PlanResidualAndLimitFunctions:
         """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
         Also returns their Jacobian (rows, K nc) with respect to the spline coefficients, K for each of nc prescribed
-        joints, or None if `rollout` has no sensitivities."""
+        joints, or None if `rollout` has no sensitivities.
+        """
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
@@ -224,7 +226,8 @@ class TargetMotionSearch:
 
         The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
         bounds `lower` and `upper` of the coefficients are enforced by an interior trust-region method (Branch, Coleman
-        and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations."""
+        and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations.
+        """
         low, high = lower.ravel(), upper.ravel()
         x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
         pull = np.zeros((2, len(self._unit)))
@@ -278,7 +281,8 @@ class DOptimalityCriterion:
     """Criterion of how well a motion determines chosen parameters: -1/2 log det of their covariance.
 
     All other unknowns are eliminated. This is D-optimality, or D_s-optimality if only some parameters are chosen
-    (Atkinson, Donev and Tobias 2007, Optimum Experimental Designs, with SAS, sections 10.2 and 10.3)."""
+    (Atkinson, Donev and Tobias 2007, Optimum Experimental Designs, with SAS, sections 10.2 and 10.3).
+    """
 
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
@@ -302,7 +306,8 @@ class EffectDiscriminationCriterion:
     """Criterion of how well the measurements separate effects: -1/2 log sum_ij 1 / (1 + d_ij^2).
 
     d_ij^2 = min_b |J_i a - J_j b|^2 is the distance of effect i (amplitudes a, sensitivities J_i) from the best
-    imitation by effect j and the nuisance unknowns (b, J_j). The smallest distances dominate the sum."""
+    imitation by effect j and the nuisance unknowns (b, J_j). The smallest distances dominate the sum.
+    """
 
     amplitude_columns: tuple[tuple[int, ...], ...]  # columns of the amplitudes of every effect
     # amplitudes in units of the columns, (amplitudes, cases): one case if they are known, else one per amplitude

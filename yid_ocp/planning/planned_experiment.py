@@ -3,7 +3,8 @@
 During the search, the arm motion is prescribed and the required torques are measured, each with a constant error. The
 effect of errors of a driven arm's motion on all readings is computed once, at standstill, and eliminated (Golub and
 Pereyra 1973, doi:10.1137/0710036). The motion found is judged with the configured estimation problem, which is driven
-by these torques. The information of a camera is its mean rate over the recording, constant along the motion."""
+by these torques. The information of a camera is its mean rate over the recording, constant along the motion.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +62,8 @@ class SplineMotionExperiment:
         """Make a planned experiment from a plan's options, at parameter `values` and with the free parameters `names`.
 
         Raises `ConfigError` if there is no joint whose motion can be planned, or if the arms have servos. Raises
-        `ModelError` if no equilibrium is found."""
+        `ModelError` if no equilibrium is found.
+        """
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_definitions_from_points or not (system.driven or system.prescribed):
             said, allowed = "the model has no joint whose motion could be planned", "a robot whose arms move"

@@ -114,7 +114,8 @@ class EpisodePredictor:
         """Initial state of an episode's rollout, with derivatives with respect to the parameters `wanted` and `offset`.
 
         `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `guess`
-        (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy)."""
+        (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy).
+        """
         nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0
@@ -164,7 +165,8 @@ class EpisodePredictor:
         """Corrected inputs of an episode, with the momentum that effects add to the tracking filter's reference.
 
         `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative with respect to `wanted` and the
-        offset."""
+        offset.
+        """
         inputs = self.corrected_inputs(episode, theta, wanted)
         if not self._follows_momenta:
             return inputs
@@ -305,7 +307,8 @@ class EpisodePredictor:
     ) -> tuple[Array, Array]:
         """Predict readings (M, k) and their derivatives (M, k, d) along a trajectory `state` (N + 1, nx).
 
-        `by_state` (N + 1, nx, d) is the derivative of the trajectory; its first columns are the free parameters."""
+        `by_state` (N + 1, nx, d) is the derivative of the trajectory; its first columns are the free parameters.
+        """
         read = _Trajectory(TimeGridStateValues.from_trajectory(self.integrator_step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameter_names)
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
@@ -406,7 +409,8 @@ class EpisodePredictor:
     ) -> Array:
         """Gradient of a cost of one episode's predictions, with respect to its (shared, local, initial state) unknowns.
 
-        `result` holds the predictions, `pulls` (M, k) the derivatives of the cost with respect to each prediction."""
+        `result` holds the predictions, `pulls` (M, k) the derivatives of the cost with respect to each prediction.
+        """
         wanted, rollout = self.unknowns.free_parameter_names, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
         pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}

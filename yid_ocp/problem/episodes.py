@@ -222,7 +222,8 @@ def prepare_episode(
     """Prepare a recording for prediction: place its inputs and measurements on the nodes of a rollout's time grid.
 
     The nominal parameters `theta` are used to convert encoder noise to effort and to compute the tracking filter's
-    gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level."""
+    gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level.
+    """
     step, system = functions.step, functions.step.system
     recording = recording.with_effort_sampling_kind(
         options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_sampling_kind

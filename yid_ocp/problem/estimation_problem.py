@@ -83,7 +83,8 @@ class EstimationProblem(ReprMixin):
     unknowns, residual_rows : UnknownVectorLayout, ResidualVectorLayout
         Layouts of the unknown vector and of the residual.
     whitening_filters, held_out_whitening_filters : tuple of ProcessNoiseWhitener or None
-        Filter that whitens each recording's residual, or None if sensor noise is the only noise."""
+        Filter that whitens each recording's residual, or None if sensor noise is the only noise.
+    """
 
     def __init__(
         self,
@@ -233,7 +234,8 @@ class EstimationProblem(ReprMixin):
         """Evaluate residual and cost at the unknown vector `x`, and the Jacobian if `derivatives` is True.
 
         If an equilibrium or a rollout fails, `ok` is False and `message` holds the reason. `equilibrium_guesses` from
-        the evaluation at a nearby point shorten the search for the equilibrium of least energy."""
+        the evaluation at a nearby point shorten the search for the equilibrium of least energy.
+        """
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
         asked = [(e, *self.theta_and_initial_state_deviation(x, i), guess) for i, (e, guess) in enumerate(pairs)]
@@ -267,7 +269,8 @@ class EstimationProblem(ReprMixin):
         """Compute cost, gradient (adjoint method; with process noise, sensitivities) and evaluation.
 
         A known `evaluation` at `x` saves the rollout, which is most of the work. The returned evaluation has no
-        Jacobian."""
+        Jacobian.
+        """
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
         weighted |= any(episode.has_uncertain_sensor_biases for episode in self.episodes)
@@ -304,7 +307,8 @@ class EstimationProblem(ReprMixin):
     ) -> InitialStateWithSensitivity:
         """Initial state of an episode, with derivatives with respect to the free parameters and the equilibrium offset.
 
-        `guess` (n,) is a configuration near the equilibrium."""
+        `guess` (n,) is a configuration near the equilibrium.
+        """
         own = self.predictor.theta_with_episode_values(episode, theta)
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
         return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameter_names, guess)
@@ -316,7 +320,8 @@ class EstimationProblem(ReprMixin):
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
         prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free
-        parameters (at a fixed initial state) and to an offset of the initial state."""
+        parameters (at a fixed initial state) and to an offset of the initial state.
+        """
         predict = self.predictor.predict_episode
         return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
@@ -356,7 +361,8 @@ class EstimationProblem(ReprMixin):
         recording : int
             Index of the recording that defines initial state, motion or torques, and sample times.
         seed : int, optional
-            Random seed of noise with the sensors' standard deviations. Default: no noise."""
+            Random seed of noise with the sensors' standard deviations. Default: no noise.
+        """
         theta = self.with_parameter_values(values or {}).theta
         return synthesize_recording(self.predictor, self.episodes[recording], theta, seed)
 
@@ -406,7 +412,8 @@ class EstimationProblem(ReprMixin):
     def with_time_step(self, time_step: float) -> EstimationProblem:
         """Problem with another time step [s], without whitening filters and held-out recordings.
 
-        Initial states, guesses of equilibria and gear loads are copied from this problem."""
+        Initial states, guesses of equilibria and gear loads are copied from this problem.
+        """
         functions = self.model_functions.with_time_step(time_step)
 
         def placed(episode: Episode) -> Episode:

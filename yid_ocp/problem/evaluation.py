@@ -42,7 +42,8 @@ class ProcessNoiseWhitener(Protocol):
         """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
 
         The first column of `rows` (r, c) is the residual in units of sensor noise, all other columns are its
-        derivatives. `push` (N, nu, c) is the tracking filter's torque correction and its derivative [N m]."""
+        derivatives. `push` (N, nu, c) is the tracking filter's torque correction and its derivative [N m].
+        """
         ...
 
 
@@ -121,7 +122,8 @@ def whitened_episode_residual(
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
-    Constant sensor errors count as noise (`whiten_against_sensor_biases`). `threshold` is the Huber threshold."""
+    Constant sensor errors count as noise (`whiten_against_sensor_biases`). `threshold` is the Huber threshold.
+    """
     by_constants = whitened_measurement_sensitivities_to_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
@@ -202,7 +204,8 @@ def stated_prior_stds(
     """Standard deviation of each unknown's stated Gaussian prior, (nx,). It is infinite for unknowns without prior.
 
     `inertia` returns the mass matrix diagonal, which converts an initial velocity to a momentum. An effect's internal
-    coordinate has a uniform prior within its limits, of which the standard deviation is returned."""
+    coordinate has a uniform prior within its limits, of which the standard deviation is returned.
+    """
     limits = _unobserved_state_limits(system)
     stds = []
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
@@ -240,7 +243,8 @@ def estimated_initial_state_names(
     """Names of the estimated components of initial states, such as `q.JOINT`, `p.JOINT` and `z.NAME`.
 
     With the option "estimated", q and p are estimated of coordinates that are not driven by torques, not prescribed and
-    not compliant. Unobserved internal coordinates z of effects that are free or not neutral are always estimated."""
+    not compliant. Unobserved internal coordinates z of effects that are free or not neutral are always estimated.
+    """
     found: list[str] = []
     if options.initial_state == "estimated":
         known = {*(() if system.servos else system.driven_coordinate_indices), *system.prescribed_coordinate_indices}

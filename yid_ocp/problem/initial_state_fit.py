@@ -66,7 +66,8 @@ class InitialStateFitter:
         |(w(q) - wbar)/std|^2 + sum kappa_i/kappa_mean (q_i - q_rest,i)^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2.
 
     The energy determines angles that no point shows, such as the roll of a clamp. The last frame of the window is
-    fitted with a prior of small velocity from the first. The momentum follows from this velocity."""
+    fitted with a prior of small velocity from the first. The momentum follows from this velocity.
+    """
 
     def __init__(self, step: Step, fitted_parameters: Sequence[str] = ()) -> None:
         self.step = step
@@ -116,7 +117,8 @@ class InitialStateFitter:
 
         `configuration` (nk,) holds the driven, then the prescribed coordinates at node 0. Only points of `samples` are
         used, in the first `window` [s]. `path` (N + 1, nc) holds the prescribed coordinates at all nodes. `roughly`
-        stops the fit at a coarse shape. Raises `DataError` if no point is measured within the window."""
+        stops the fit at a coarse shape. Raises `DataError` if no point is measured within the window.
+        """
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
         frames: dict[int, list[tuple[SensorMeasurements, int]]] = {}
@@ -172,7 +174,8 @@ class InitialStateFitter:
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
         """Angle of each joint with a preset, and the torque of its spring there if the object is in equilibrium.
 
-        The clamps' unknown reactions f have least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa."""
+        The clamps' unknown reactions f have least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa.
+        """
         if not self._presets:
             return {}
         none = (np.zeros(self.step.sizes[key]) for key in ("n", "nz", "nz", "m", "nu"))

@@ -48,7 +48,8 @@ def recording_time_grid(recording: Recording, time_step: float, duration: float 
     """Make a time grid over the time span of the joint samples or, in a recording without joints, of the first group.
 
     Raises `DataError` if the span is shorter than two steps, or has more than `_MAX_STEPS` steps or too many steps per
-    sample."""
+    sample.
+    """
     t = recording.all_groups[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
@@ -135,7 +136,8 @@ class SensorMeasurements:
         """Matrix R^(-1/2) (nr, nr) that decorrelates the nr normalised residuals. None if outputs are independent.
 
         R is the correlation matrix of the noise; only outputs of one sample are correlated. The whitening is zero-phase
-        (ZCA; Kessy, Lewin and Strimmer 2018, doi:10.1080/00031305.2016.1277159)."""
+        (ZCA; Kessy, Lewin and Strimmer 2018, doi:10.1080/00031305.2016.1277159).
+        """
         if self.noise_correlation is None:
             return None
         seen = self.positive_weight_mask
@@ -189,7 +191,8 @@ class SensorMeasurements:
         """Rate of change of a prediction at delayed samples, per time step, (M, k).
 
         At a node it is the mean of adjacent steps. `at_nodes` (len(nodes), k) is the prediction. `unmoved` are the
-        measurements before the delay of `steps` (k,)."""
+        measurements before the delay of `steps` (k,).
+        """
         nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short part may hold no sample of a slow sensor
             return np.zeros((0, at_nodes.shape[1]))
@@ -249,7 +252,8 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
 def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
     """Weight measurements at nearest nodes as in Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
 
-    The cost is sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points wbar_k [m]."""
+    The cost is sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points wbar_k [m].
+    """
     nearest_node = samples.node + (samples.fraction >= 0.5)
     weight = np.where(np.isfinite(samples.value), 1.0, 0.0)
     weight[nearest_node == 0] = 0.0
@@ -262,7 +266,8 @@ def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid)
 def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
     """Huber loss sum rho(r) of whitened residuals, and the least-squares factors sqrt(rho'(r)/r).
 
-    Beyond `scale` [standard deviations] the loss is linear. An infinite `scale` gives plain least squares."""
+    Beyond `scale` [standard deviations] the loss is linear. An infinite `scale` gives plain least squares.
+    """
     size = np.abs(residual)
     inside = size <= scale
     with np.errstate(invalid="ignore"):
@@ -275,7 +280,8 @@ def whiten_against_sensor_biases(slopes: Array, columns: Array) -> Array:
     """Whiten a residual and its derivatives, already in units of noise, against constant sensor errors as well.
 
     The first column of `columns` (r, c) is the residual, all other columns are its derivatives. `slopes` (r, m) are the
-    derivatives of whitened measurements with respect to m constant errors, each in units of its standard deviation."""
+    derivatives of whitened measurements with respect to m constant errors, each in units of its standard deviation.
+    """
     left, size, _ = np.linalg.svd(slopes, full_matrices=False)
     return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
 
@@ -289,7 +295,8 @@ def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
 def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasurements]) -> Array:
     """Derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
 
-    Derivatives of the residual, prediction minus measurement, have the opposite sign."""
+    Derivatives of the residual, prediction minus measurement, have the opposite sign.
+    """
     parts = [s.weight[:, :, None] * s.output_changes_per_error_std for s in samples]
     count, before = sum(part.shape[2] for part in parts), 0
     found = np.zeros((sum(s.n_residuals for s in samples), count))

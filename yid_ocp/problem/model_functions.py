@@ -77,7 +77,8 @@ class CorrectedInputs:
         """Add the momentum that effects cause to the reference of the tracking filter, in every step.
 
         The angles in `recorded` are smoothed, the angles `measured` (N + 1, nu) are not. `by_internal` (nz, d) is the
-        derivative of the initial internal coordinates."""
+        derivative of the initial internal coordinates.
+        """
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
         if read and not any(np.any(x) for x in slopes) and not shift.is_active(theta, wanted):
@@ -114,7 +115,8 @@ class CorrectedInputs:
 class InputCorrectionFunctions:
     """Compiled maps from recorded to true inputs and times, defined by the system's effects on recordings.
 
-    `names` are the parameters for which derivatives are available. A method's `wanted` is a subset of `names`."""
+    `names` are the parameters for which derivatives are available. A method's `wanted` is a subset of `names`.
+    """
 
     def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:
         self.system = system
@@ -178,7 +180,8 @@ class InputCorrectionFunctions:
         """Compute true angles and efforts (K, nj) of `joint_names` from recorded values, with derivatives.
 
         Returns angles, efforts, their derivatives (K, nj, d) with respect to the d parameters `wanted`, and the
-        derivative of the true effort with respect to the recorded effort."""
+        derivative of the true effort with respect to the recorded effort.
+        """
         a, e, e_reading, *slopes = self._maps(bool(wanted))(angle, effort, theta)
         at = [self._names.index(name) for name in wanted]
         a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
@@ -190,7 +193,8 @@ class InputCorrectionFunctions:
         """Delays or lag time constants (nj,) [s] of driven joints' torques or of prescribed joints' efforts.
 
         Also returns their derivatives (nj, d) with respect to the parameters `wanted`. None if no effect has a delay or
-        lag."""
+        lag.
+        """
         return self._evaluate(self._times[kind], theta, wanted)
 
     def sensor_delays_with_derivatives(
@@ -309,7 +313,8 @@ class ModelFunctions:
     """Compiled functions of a system: sensor readings, equilibrium, initial state fit and input corrections.
 
     `names` are the parameters for which derivatives are available. `start_parameters` are fitted with initial
-    states."""
+    states.
+    """
 
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:
         self.step = step

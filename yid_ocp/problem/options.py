@@ -26,7 +26,8 @@ DiscretisationName = Literal["links", "time_step"]
 class MultivariateGaussianPrior:
     """Multivariate Gaussian prior of shared parameters about their initial values, such as an earlier estimate.
 
-    The covariance (n, n) is positive definite, in the parameters' units."""
+    The covariance (n, n) is positive definite, in the parameters' units.
+    """
 
     parameter_names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
@@ -47,7 +48,8 @@ class ExcessResidualCriteria:
     """Criteria by which a residual exceeds its noise: a significance level and a smallest excess of chi2.
 
     A residual exceeds its noise if it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`. The fraction
-    `noise_fraction_of_std` of stated standard deviations is noise; the rest represents model error."""
+    `noise_fraction_of_std` of stated standard deviations is noise; the rest represents model error.
+    """
 
     significance_level: float = 0.01
     min_excess_chi2_per_dof: float = 0.1
@@ -92,7 +94,8 @@ class ProblemOptions:
     divided_links_model : DividedLinksModel, optional
         Model with divided links, required to check `links`.
     cable_topology : CableTopology, optional
-        Topology of a cable held by clamps, for its baselines."""
+        Topology of a cable held by clamps, for its baselines.
+    """
 
     initial_state: Annotated[
         _InitialStateKind,

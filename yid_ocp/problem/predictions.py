@@ -44,7 +44,8 @@ def constant_position_baseline_prediction(recording: Recording, points: Sequence
     """Predict, as a baseline without a model, that every point stays at its position in the last given frame.
 
     Returns positions (M, len(points), 3) [m]; the first `given` frames are as measured. Raises `DataError` if a point
-    is not recorded or not measured in the last given frame, or if there are too few frames."""
+    is not recorded or not measured in the last given frame, or if there are too few frames.
+    """
     return _carried(recording, points, (), given, np.zeros((len(points), 0)))
 
 
@@ -54,7 +55,8 @@ def mean_clamp_displacement_baseline_prediction(
     """Predict, as a baseline without a model, that every point moves by the mean displacement of the clamped points.
 
     Displacements count from the last given frame. The path of the `clamped` points is known. Shape and errors are as in
-    `constant_position_baseline_prediction`."""
+    `constant_position_baseline_prediction`.
+    """
     share = np.full((len(points), len(clamped)), 1.0 / max(len(clamped), 1))
     return _carried(recording, points, clamped, given, share)
 
@@ -71,7 +73,8 @@ def interpolated_displacement_baseline_prediction(
 
     `parent` lists its points from end to end. Displacements are interpolated between its points `clamped` (default: its
     two ends). Children move with their junction: each child starts with the parent point of its junction. Shape and
-    errors are as in `constant_position_baseline_prediction`; a point without a branch also raises `DataError`."""
+    errors are as in `constant_position_baseline_prediction`; a point without a branch also raises `DataError`.
+    """
     known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
     at = _given_frame(recording, parent, given)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
@@ -95,7 +98,8 @@ def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
     """Root mean square of the Euclidean error over points and frames [m]. NaN if there is nothing to compare.
 
     The arrays have the shape (M, np, 3); different shapes raise `DataError`. The first `given` frames and missing
-    points do not count."""
+    points do not count.
+    """
     if predicted.shape != measured.shape:
         what = f"the prediction has the shape {predicted.shape}, the measurement {measured.shape}"
         raise DataError(what, where="predicted", allowed="equal shapes (M, np, 3)", hint="predict the measured frames")
@@ -190,7 +194,8 @@ def rmse_unit_and_count_by_channel(
 ) -> dict[str, dict[str, Any]]:
     """Root mean square error, unit and number of samples by channel, with the keys `rmse`, `unit`, `n`.
 
-    For points, the error of a sample is the Euclidean distance."""
+    For points, the error of a sample is the Euclidean distance.
+    """
     squares: dict[str, list[float]] = {}
     units: dict[str, str] = {}
     for result, episode in zip(results, episodes, strict=True):
@@ -215,7 +220,8 @@ def recording_from_prediction(
     """Convert the prediction `outcome` of an episode to a recording with the sensors' clocks and noise levels.
 
     `theta` are the parameter values of the prediction, which become `true_parameters`. With a `seed`, random noise is
-    added as the estimation assumes it, including constant torque offsets. Without a `seed` there is no noise."""
+    added as the estimation assumes it, including constant torque offsets. Without a `seed` there is no noise.
+    """
     rng = None if seed is None else np.random.default_rng(seed)
     system, source = predictor.system, episode.recording
     groups = []

@@ -41,7 +41,8 @@ def mean_step_inputs(
     commands are piecewise constant. A lost sample is interpolated from its neighbours. Each input acts later than
     recorded by `delay` (nu,) [s]. With `servos` (for all driven joints) the input is the position command. `where` is
     the name of the recording. Raises `DataError` if a joint is missing, or if efforts (with `servos`: commands) are not
-    recorded."""
+    recorded.
+    """
     if not driven:
         return np.zeros((grid.steps, 0))
     late = np.zeros(len(driven)) if delay is None else delay
@@ -198,7 +199,8 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
     """Remove effort noise from gear loads: the result is the model's loads plus the slow part of measured minus model.
 
     `measured` and `own` (the model's) are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
-    difference is constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts."""
+    difference is constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
+    """
     gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
@@ -207,7 +209,8 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     """Kinds of signals in recordings that effects can require, such as `joints.effort`.
 
     Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, each point group that
-    neither a camera nor an arm measured is a kind too: `points:GROUP`."""
+    neither a camera nor an arm measured is a kind too: `points:GROUP`.
+    """
     found, mounted = set[str](), set[str]()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.values_by_channel}
@@ -247,7 +250,8 @@ def prescribed_coordinates_at_nodes(
 ) -> Array:
     """Prescribed coordinates (steps + 1, nc) at every node, from smoothed recorded joints and clamp points.
 
-    Raises `DataError` if a joint or clamp point is not recorded or has too few measurements."""
+    Raises `DataError` if a joint or clamp point is not recorded or has too few measurements.
+    """
     if not system.prescribed:
         return np.zeros((grid.steps + 1, 0))
     course: dict[str, Array] = {}

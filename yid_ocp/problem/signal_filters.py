@@ -65,7 +65,8 @@ class LowPassFilter:
     def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeSmoother:
         """Make a matrix filter that smooths values at `nodes` out of `count` nodes, `step` [s] apart.
 
-        The filter does not use the value at node 0. The signal is constant before node 1 and after the last node."""
+        The filter does not use the value at node 0. The signal is constant before node 1 and after the last node.
+        """
         nodes = nodes[nodes < count]
         weight = _weights(self, step)
         reach = len(weight) // 2
@@ -137,7 +138,8 @@ class FirstOrderLag:
     """First-order lags of k channels, T dz/dt = x - z, with derivatives with respect to their time constants T.
 
     With the time step h, E = exp(-h/T) and f = T/h (1 - E). At T = 0 both are zero and the output z equals the input x.
-    Node values allow a negative T: then z leads x, with z = x - T dx/dt."""
+    Node values allow a negative T: then z leads x, with z = x - T dx/dt.
+    """
 
     time_constant: Array  # T, (k,) [s]
     time_constant_sensitivity: Array  # (k, d)
@@ -147,7 +149,8 @@ class FirstOrderLag:
         """Mean output z of the lag over each step, with derivatives, for inputs x (N, k) that are constant in a step.
 
         The mean is x + (z - x) f with z_{k+1} = x + (z - x) E, with E and f as in the class. The output starts at the
-        first input. `slope` (N, k, d) is the derivative of x."""
+        first input. `slope` (N, k, d) is the derivative of x.
+        """
         decay, share, decay_slope, share_slope = self._factors()
         held = self._following(value, np.zeros(value.shape), decay)
         gap = held - value
@@ -163,7 +166,8 @@ class FirstOrderLag:
 
         The lag starts at node 1. The output is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1} or, for negative T, x -
         T dx/dt by central differences. `slope` (N, k, d) is the derivative of x; its first columns are the parameters
-        of `time_constant_sensitivity`."""
+        of `time_constant_sensitivity`.
+        """
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         followed = self._straight(value, decay, share) - lead * (rates @ value)

@@ -48,7 +48,8 @@ class _AnimatedMotion:
     `positions` (F, K, 3) [m] are NaN where unknown. `point_indices` are the points that a sensor measures;
     `is_new_measurement` (F, number of points) separates new measurements from held ones. `acting` lists applied forces
     as (label, point index or -1, unit, values (F, k)). `arm` holds system, parameters and configurations (F, n) for
-    meshes."""
+    meshes.
+    """
 
     name: str
     sticks: Sequence[_Stick]
@@ -84,7 +85,8 @@ def animations_to_dict(scenes: Sequence[Animation], robot: str | None = None) ->
     """Convert scenes to JSON-ready data, with meshes by joint. Positions are integers in 0.1 mm, null if unknown.
 
     The meshes of the robot's URDF are drawn on the arm of a scene's last model or, in a scene without a model, on the
-    arm's measured motion. If no mesh can be read, the arm is drawn as sticks."""
+    arm's measured motion. If no mesh can be read, the arm is drawn as sticks.
+    """
     meshes: dict[str, list[list[int]]] | None = None
     made = []
     for scene in scenes:
@@ -102,7 +104,8 @@ def animations_to_dict(scenes: Sequence[Animation], robot: str | None = None) ->
 def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[list[int]]]:
     """Vertices and faces of a robot's thinned meshes by the joint that carries them, "" for what does not move.
 
-    Reading and thinning takes a second: the user's cache keeps them for the same files, mounted in the same way."""
+    Reading and thinning takes a second: the user's cache keeps them for the same files, mounted in the same way.
+    """
     with contextlib.suppress(OSError, YidError, SyntaxError):  # the last of a damaged URDF
         if robot is None or "<visual" not in read_input_text(resolve_urdf_path(robot)):
             return {}
@@ -167,7 +170,8 @@ class ConfigurationTrajectory:
     """Trajectory of a model, with configurations q (N, n) at times t (N,) [s].
 
     `acting` lists the applied forces and effects to draw: label, location (joint, segment, grasp or frame), unit and
-    values (N, k). Values are vectors in world axes (k = 3) or scalars (k = 1). Effects have no values."""
+    values (N, k). Values are vectors in world axes (k = 3) or scalars (k = 1). Effects have no values.
+    """
 
     name: str
     system: System
@@ -274,7 +278,8 @@ def animation_of_trajectories(
 ) -> Animation:
     """Animate model trajectories and the recorded motion. The first trajectory sets the times and joints.
 
-    The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames."""
+    The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames.
+    """
     t = _frame_times(told[0].t)
     motions = [_model_motion(entry, t, entry._q_at(t)) for entry in told]
     if recording is not None:
@@ -287,7 +292,8 @@ def recording_animation(
 ) -> Animation | None:
     """Animate a recording alone, without predictions. None if the recording holds no positions.
 
-    With `has_straight_object`, the model at the recorded angles is drawn too, with an undeformed object."""
+    With `has_straight_object`, the model at the recorded angles is drawn too, with an undeformed object.
+    """
     clock = max((group.t for group in recording.joint_and_point_groups), key=len)
     told = ConfigurationTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
     motion = _measured_motion(told, recording, t := _frame_times(clock))

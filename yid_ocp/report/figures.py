@@ -107,7 +107,8 @@ def prediction_and_residual_plots(
 ) -> tuple[TimePlotData, TimePlotData]:
     """Plot measured and predicted values, and their residual with a band of two standard deviations of the noise.
 
-    All arrays have shape (M,). For sparse measurements, `course` (t (K,), value (K,)) draws the first line densely."""
+    All arrays have shape (M,). For sparse measurements, `course` (t (K,), value (K,)) draws the first line densely.
+    """
     seen = np.isfinite(measured) & np.isfinite(std)
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     drawn = {name: (t, values) for name, values in lines.items()}
@@ -128,7 +129,8 @@ def time_plots_figure(
 ) -> Figure:
     """Plot measured points and lines over time, one row per plot.
 
-    `dots` is the color of measured points. `lines` maps line names to colors (default: the palette, in order)."""
+    `dots` is the color of measured points. `lines` maps line names to colors (default: the palette, in order).
+    """
     import plotly.graph_objects as go
 
     names = dict.fromkeys(name for curve in curves for name in curve.lines)
@@ -236,7 +238,8 @@ def rate_intervals_figure(
 ) -> Figure:
     """Plot rates between 0 and 1 with intervals. Each entry has `rate`, `low` and `high`.
 
-    A calibration plot shows the diagonal; all other plots have a logarithmic x axis."""
+    A calibration plot shows the diagonal; all other plots have a logarithmic x axis.
+    """
     figure = _styled_figure(340, x, y)
     if is_calibration:
         line = {"color": MEASURED_COLOR, "dash": "dot"}
@@ -379,7 +382,8 @@ class ValueBeforeAfter:
 def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]) -> Figure:
     """Plot values before and after a change, one row each. Error bars are two standard deviations.
 
-    `axis` is the title of the x axis, with unit. `words` are the legends of before, after and the reference marks."""
+    `axis` is the title of the x axis, with unit. `words` are the legends of before, after and the reference marks.
+    """
     figure = _rows_figure(110 + 32 * len(rows), list(rows), axis)
     moved = [(name, row.before, row.after) for name, row in rows.items() if row.after is not None]
     figure.add_scatter(
@@ -424,7 +428,8 @@ class TimeHeatMapRow:
 def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> Figure:
     """Plot a heat map over intervals with edges (J + 1,) [s], one row per quantity. Grey: no information.
 
-    `axis` is the title of the color scale."""
+    `axis` is the title of the color scale.
+    """
     values = np.array([row.values for row in rows])
     seen = np.abs(values[np.isfinite(values)])
     # even to the eye from one standard deviation to thousands
@@ -464,7 +469,8 @@ def candidate_ranking_figure(
     """Plot each candidate's gap closure after a refit [%], with interval, and the decrease that screening predicts.
 
     `entries` maps each label to (closure, low, high), or None without a refit, and the decrease. `closed` and
-    `promised` are the titles of the two axes."""
+    `promised` are the titles of the two axes.
+    """
     from plotly.subplots import make_subplots
 
     done = {name: closure for name, (closure, _) in entries.items() if closure}

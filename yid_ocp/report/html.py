@@ -31,7 +31,8 @@ def write_report(path: Path, findings: ReportData) -> bool:
     """Write the HTML report, and return whether it was written. Raises `OutputError` if writing fails.
 
     The page works offline: Plotly's script is embedded, unless `write_shared_plotly_script` left a copy in the page's
-    folder or up to two levels above. Without the extra `report`, a warning is logged and no page written."""
+    folder or up to two levels above. Without the extra `report`, a warning is logged and no page written.
+    """
     if not _installed():
         log.warning("no report is written, because jinja2 is not installed: pip install 'yid-ocp[report]'")
         return False

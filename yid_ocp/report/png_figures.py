@@ -30,7 +30,8 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     """Write `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
 
     The figures show the detection rate over effect size with binomial 95 % intervals, the first answers against the
-    truth, and observed against nominal rates of intervals and p-values. Raises `OutputError` if writing fails."""
+    truth, and observed against nominal rates of intervals and p-values. Raises `OutputError` if writing fails.
+    """
     from matplotlib.figure import Figure
 
     lines = {
@@ -103,7 +104,8 @@ _MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; b
 def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern]]) -> None:
     """Draw rows of sparsity patterns as PNG, with separated and named blocks. Raises `OutputError` if writing fails.
 
-    Patterns without rows or columns are omitted."""
+    Patterns without rows or columns are omitted.
+    """
     from matplotlib.figure import Figure
 
     rows = [kept for row in layout if (kept := [entry for entry in row if entry.nonzero_mask.size])]

@@ -110,7 +110,8 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
 def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     """Prediction error per group of held-out channels, compared with the best baseline without a model and the noise.
 
-    A sentence is given if the model does not explain the fitted data, or noise the prediction error."""
+    A sentence is given if the model does not explain the fitted data, or noise the prediction error.
+    """
     groups = dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"])
     for group in groups:
         channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]

@@ -37,7 +37,8 @@ class SummaryStatement:
     """One sentence of a summary, with its importance.
 
     The kind is `verdict` (answers the question of the command), `conclusion` (summarises several verdicts) or `note`. A
-    report shows conclusions first."""
+    report shows conclusions first.
+    """
 
     text: str
     kind: _StatementKind = "note"
@@ -76,7 +77,8 @@ def register_summary(
 ) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]], _Summary]:
     """Decorator that registers the summary of a result format. The summary returns a list of blocks.
 
-    Empty texts, and tables with only a header, are omitted."""
+    Empty texts, and tables with only a header, are omitted.
+    """
 
     def enter(make: Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]) -> _Summary:
         @functools.wraps(make)
@@ -130,7 +132,8 @@ def misfit_summary_blocks(
 ) -> SummaryBlockOrTextIterator:
     """Conclusions on a poor fit: baselines that predict better, the misfit, and values that are still meaningful.
 
-    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 %."""
+    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 %.
+    """
     worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
@@ -255,7 +258,8 @@ def aligned_table_lines(rows: TableRows) -> list[str]:
 def names_by_pattern_text(names: Sequence[str]) -> str:
     """Join names in one line. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
 
-    A long line is cut, with the number of omitted names."""
+    A long line is cut, with the number of omitted names.
+    """
     parts = [re.split(r"(\d+)", name) for name in names]
     taken: set[int] = set()
     said, left = list[str](), 0

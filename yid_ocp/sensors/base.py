@@ -85,7 +85,8 @@ class ChannelSpecification:
     """One kind of recorded quantity: its group, dataset, unit, components and sensor constants.
 
     Noise levels are stored in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std` or, for points, in the
-    dataset `std`."""
+    dataset `std`.
+    """
 
     group: str  # recording group; several are allowed, `GROUP` and `GROUP_NAME`, each with its own clock
     quantity: str  # dataset of the group, with one column for every name of the group
@@ -214,7 +215,8 @@ def expand_to_joint_values(
 class Sensor(ABC):
     """Base class of sensors, which predict a group of measured channels with a common clock. Sensors are hashable.
 
-    Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each)."""
+    Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
+    """
 
     channel: ClassVar[ChannelSpecification]  # kind of recorded channels
     group_name: str  # settings key: a point group, such as `points_camera`, or `joints.effort`
@@ -276,7 +278,8 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
 
     It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), with the
     symbols of `NodeState`. dy/dtheta has one column per parameter in `names`. v, a and lam refer to the recorded clock;
-    their derivatives have no columns if the readings do not depend on them."""
+    their derivatives have no columns if the readings do not depend on them.
+    """
     rows = {name: i for i, name in enumerate(system.effect_internal_coordinate_symbols)}
     n = system.n_coordinates
     sizes = {"q": n, "v": n, "a": n, "z": len(rows), "load": n, "lam": system.n_constraints}
@@ -320,7 +323,8 @@ class SensorDataInputs:
     """System, recording, options, nodes and filters from which a sensor's measurements are computed.
 
     `joint_mass_matrices` maps k joint names and K configurations of these joints (K, k) to the joints' blocks (K, k, k)
-    of the mass matrix [kg m^2 or kg]."""
+    of the mass matrix [kg m^2 or kg].
+    """
 
     system: System
     recording: _RecordingData

@@ -145,7 +145,8 @@ def smoothed_effort_data(
 
     `values` (M, k) are in the sensor's unit. `std` and `bias` (k,) are the standard deviations of white noise and of a
     constant error. With `is_sample`, a value is measured at its time, otherwise it is the mean until the next value's
-    time. Raises `DataError` if the recording is too short for the filter."""
+    time. Raises `DataError` if the recording is too short for the filter.
+    """
     period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
     # the mean of an interval belongs to its centre
     late = 0.0 if is_sample else 0.5 * period
@@ -188,7 +189,8 @@ def nodes_and_decorrelated_values(
 def is_noise_std_stated(joints: RecordedJointGroup, group: str, choice: SensorOptions) -> bool:
     """Whether recording or settings specify the noise of `group` (`joints.effort` or `joints.position`).
 
-    A recorded encoder resolution also specifies the noise of joint positions."""
+    A recorded encoder resolution also specifies the noise of joint positions.
+    """
     names = [CHANNEL_KINDS[group].std_attribute_names[0]]
     names += ["position_resolution"] if group == JOINT_POSITION_GROUP_NAME else []
     return choice.std is not None or any(getattr(joints, name) is not None for name in names)
@@ -262,7 +264,8 @@ def _smoothed_effort_noise(
     """Noise std (M, k) and correlation (M, k, k) of filtered efforts at `times` (M,).
 
     An error of the acceleration of one joint, from encoder noise, changes the torques of all inertially coupled joints.
-    With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. It is None if encoder noise is unknown."""
+    With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. It is None if encoder noise is unknown.
+    """
     value_gain, _, second_gain = around.effort_filter.noise_gains_of_value_and_rates(period)
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None

@@ -118,7 +118,8 @@ def _with_encoder_noise(
 ) -> tuple[Array, Array | None]:
     """Noise std (M, k) and correlation (M, k, k) of smoothed readings that are predicted from noisy encoders.
 
-    The responses to errors of angles, velocities and accelerations are linearised at standstill."""
+    The responses to errors of angles, velocities and accelerations are linearised at standstill.
+    """
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     known = None if joints is None else encoders.std if encoders.std is not None else joints.position_std
     names = () if joints is None else tuple(name for name in around.system.prescribed if name in joints.names)

@@ -122,7 +122,8 @@ def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], 
     """Pose (4, 4) of the camera that measured a point group. None if no camera measured it.
 
     A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Without a pose, the camera is
-    assumed at the world origin."""
+    assumed at the world origin.
+    """
     if group.pose is not None:
         return tuple(tuple(float(x) for x in row) for row in group.pose)
     if "camera" in group.name.lower() or "camera" in group.sensor.lower():

@@ -5,7 +5,8 @@ By the Euler-Lagrange equations of the cut model, the efforts of these joints ar
 
     d/dt dL/dv - dL/dq - F + Dphi(q)' lam.
 
-They are the force and torque of the sensor on the part beyond. The reading has the opposite sign."""
+They are the force and torque of the sensor on the part beyond. The reading has the opposite sign.
+"""
 
 from __future__ import annotations
 

@@ -90,7 +90,8 @@ class EstimateChecks:
     expected_prediction_errors : mapping of recording to mapping of channel to float
         Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
     step_stability : mapping
-        Growth of alternating errors at the `start` of the search and at the `estimate`."""
+        Growth of alternating errors at the `start` of the search and at the `estimate`.
+    """
 
     data_std: Mapping[str, float] = field(default_factory=dict)
     discretisation_shifts: Mapping[str, EstimateShiftByLinksAndTimeStep] = field(default_factory=dict)
@@ -132,7 +133,8 @@ class Solution(ReprMixin):
     problem : EstimationProblem, optional
         The problem, whitened at `x`.
     checks : EstimateChecks, optional
-        Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only."""
+        Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only.
+    """
 
     status: Status
     message: str
@@ -198,7 +200,8 @@ class Solution(ReprMixin):
         """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
         `lower` and `upper` are the 95 % interval, infinite at an open end. Raises `ConfigError` if pandas is not
-        installed."""
+        installed.
+        """
         try:
             pandas = importlib.import_module("pandas")
         except ImportError as error:
@@ -237,7 +240,8 @@ class Solver(Protocol):
 
     Optional class attributes, with their defaults: `needs_rollout` (True), whether the rollout must succeed at the
     start; `uses_process_noise_covariance` (False), whether the solver can whiten residuals by process noise;
-    `estimates_torque_errors` (False), whether torque errors are unknowns."""
+    `estimates_torque_errors` (False), whether torque errors are unknowns.
+    """
 
     @property
     def name(self) -> str:

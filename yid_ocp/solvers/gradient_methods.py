@@ -51,7 +51,8 @@ class GaussNewton(SolverWithCheckedSettings):
     predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5). The
     search ends at a stationary point (`is_stationary_point`), not at a short step or a small predicted decrease of a
     damped step. It also ends after many steps whose decrease is small against the noise, as happens if the cost is not
-    smooth (friction that changes sign, fast waves over many seconds)."""
+    smooth (friction that changes sign, fast waves over many seconds).
+    """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
     step_tolerance: Annotated[
@@ -158,7 +159,8 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
 class SingleShooting(SolverWithCheckedSettings):
     """Single shooting with SciPy's L-BFGS-B on unknowns scaled to order one.
 
-    Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236."""
+    Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
+    """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
     cost_tolerance: Annotated[
@@ -220,7 +222,8 @@ class SteepestDescent(SolverWithCheckedSettings):
     ----------
     Armijo (1966), Pacific J. Math. 16:1, doi:10.2140/pjm.1966.16.1.
     Bertsekas (1976), IEEE Trans. Automatic Control 21(2):174, doi:10.1109/TAC.1976.1101194 (projection).
-    Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory)."""
+    Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory).
+    """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 200
     gradient_tolerance: Annotated[

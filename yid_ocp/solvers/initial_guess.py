@@ -61,7 +61,8 @@ def guess_unknowns_and_node_states(
 
     The states of a recording come from a rollout with the tracking filter, so that they satisfy the equations of
     motion. If the rollout fails or deviates from the measurements, each node in `nodes` (K + 1,) instead gets the
-    equilibrium at the arms' measured posture. This guess has defects (gaps between steps) but follows the data."""
+    equilibrium at the arms' measured posture. This guess has defects (gaps between steps) but follows the data.
+    """
     lower, upper = problem.bounds
     best: tuple[float, UnknownsAndNodeStateGuess] | None = None
     for factor in _PARAMETER_FACTORS:
@@ -156,7 +157,8 @@ def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array
     cannot be estimated, and a poor shape can drive the amplitude to its bound. Several shapes are therefore tried for
     each such effect. The best shape starts with the amplitude that the linearised model predicts, clipped to the
     expected range. An effect without shape parameters keeps its zero amplitude, unless the residual's derivative is
-    zero there. Returns `x` unchanged if no effect was changed or if no changed start can be rolled out."""
+    zero there. Returns `x` unchanged if no effect was changed or if no changed start can be rolled out.
+    """
     place = {name: i for i, name in enumerate(problem.unknown_names)}
     for effect in problem.system.effects:
         if not isinstance(effect, EffectBase):

@@ -79,7 +79,8 @@ class MultipleShooting(SolverWithCheckedSettings):
     ----------
     Bock and Plitt (1984), IFAC Proc. 17(2):1603, doi:10.1016/S1474-6670(17)61205-9.
     Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
-    Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885 (condensing)."""
+    Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885 (condensing).
+    """
 
     condensing: Annotated[
         bool,
@@ -323,7 +324,8 @@ class _StepFilter:
     """Accepts trial points that improve on every point so far in cost or in defects.
 
     It replaces a merit function, whose weight between the two, once needed far from the solution, makes steps short
-    near it (Waechter and Biegler 2005, SIAM J. Optim. 16(1):1, doi:10.1137/S1052623403426556)."""
+    near it (Waechter and Biegler 2005, SIAM J. Optim. 16(1):1, doi:10.1137/S1052623403426556).
+    """
 
     def __init__(self, start: _Linearization) -> None:
         self._largest = 1e4 * max(start.defect, 1.0)

@@ -4,7 +4,8 @@
 
 f is half the sum of squares (or the Huber loss) of residuals, g the values of constraint terms. The module does not
 depend on mechanics or recordings. A term is one local function evaluated at many places, with directly assembled
-derivatives. CasADi would obtain the same derivatives by colouring the whole Jacobian, many times more slowly."""
+derivatives. CasADi would obtain the same derivatives by colouring the whole Jacobian, many times more slowly.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ class LocalVariableFunction:
 
     v are local variables, d data and s data shared by all calls. `jacobian` dy/dv (ny, nv) is derived from the value by
     default. Derivatives can be compiled. The value stays a CasADi expression, so that terms built on it can be
-    differentiated."""
+    differentiated.
+    """
 
     def __init__(
         self,
@@ -197,7 +199,8 @@ class ResidualTerm:
 
         With `exact`, the weight is the second derivative of the Huber loss: one up to the threshold, zero beyond.
         Without `exact`, it is the weight of iteratively reweighted least squares, which has the same gradient and is
-        never zero."""
+        never zero.
+        """
         if math.isinf(self.huber_threshold):
             return None
         size = ca.fabs(r)
@@ -212,7 +215,8 @@ class GaussNewtonHessianRidge:
 
     For such unknowns, the curvature that Gauss-Newton neglects can be as large as its own. The ridge adds factor * mean
     square residual / max(|w_i|, scale_i)^2 to the Gauss-Newton Hessian only. `factor` is a number or a function of the
-    unknowns w, whose value can change between iterates."""
+    unknowns w, whose value can change between iterates.
+    """
 
     index: IntArray
     scale: Array
@@ -306,7 +310,8 @@ class NonlinearProgram(ReprMixin):
     """Nonlinear program in CasADi that minimises f(w, p) over the variables w, under bounds and constraints.
 
     `nlp[name]` is a block of the variables w or of the parameters p, an MX of the block's shape. With one recording,
-    `nlp["q"]` is short for `nlp["q[NAME]"]`."""
+    `nlp["q"]` is short for `nlp["q[NAME]"]`.
+    """
 
     variables: Mapping[str, _VectorBlock]  # what the column `w` of unknowns is made of
     parameters: Mapping[str, _VectorBlock]  # what the column `p` of parameters is made of
@@ -329,7 +334,8 @@ class NonlinearProgram(ReprMixin):
     def named_block(self, name: str) -> _VectorBlock:
         """Find a named block's indices, row names and unit. With one recording, `[NAME]` can be omitted.
 
-        Raises `SolverError` if there is no such block, or more than one."""
+        Raises `SolverError` if there is no such block, or more than one.
+        """
         blocks = {**self.variables, **self.parameters}
         if name in blocks:
             return blocks[name]
@@ -447,7 +453,8 @@ class NonlinearProgram(ReprMixin):
         """Sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
 
         Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps the curvature of user
-        terms."""
+        terms.
+        """
         with CASADI_LOCK:
             if kind not in self._hessians:
                 self._hessians[kind] = self._data_curvature(kind == "exact") + self._other_curvature(kind == "exact")
@@ -507,7 +514,8 @@ class NonlinearProgram(ReprMixin):
         """Program with an additional objective term and constraint rows, expressions of its variables and parameters.
 
         Rows without bounds are equalities to zero. Raises `SolverError` if an expression contains other symbols, or if
-        the number of bounds is neither one nor the number of rows."""
+        the number of bounds is neither one nor the number of rows.
+        """
         rows = [constraints] if isinstance(constraints, ca.MX) else list(constraints)
         column = ca.vertcat(ca.MX(0, 1), *(ca.vec(ca.densify(row)) for row in rows))
         scalar = ca.MX(objective)
@@ -529,7 +537,8 @@ class NonlinearProgram(ReprMixin):
         """Make a `casadi.nlpsol` solver with the program's derivatives. Call the solver with `solver_arguments`.
 
         `plugin` is the name of a CasADi plug-in, `options` are options of `casadi.nlpsol`. Raises `SolverError` if
-        CasADi lacks the plug-in or refuses the options."""
+        CasADi lacks the plug-in or refuses the options.
+        """
         with CASADI_LOCK:
             options = {**QUIET_NLPSOL_OPTIONS, **options}
             try:

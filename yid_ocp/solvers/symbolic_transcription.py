@@ -9,7 +9,8 @@ forces), and x_0 is a function of it; a given initial state has no `rest`. The c
 equilibrium and the rows of every `NlpStepConstraints`. The objective contains the whitened samples, interpolated
 between nodes, and the priors. Recorded inputs and measurements are parameters. With process noise, its errors are
 unknowns too, after the states of their recording, with their standard deviations as priors. At the optimum this is the
-likelihood of `inference.whitening`, up to the linearisation there."""
+likelihood of `inference.whitening`, up to the linearisation there.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ def transcribe(
     NonlinearProgram
         Variables: `theta` and, per recording, `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]` and
         `lam[NAME]`. Parameters: `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`, `value.GROUP[NAME]`,
-        `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md."""
+        `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md.
+    """
     problem = _about_zero(problem)
     _check_transcribable(problem)
     compiled = problem.step.is_compiled if use_compiler is None else use_compiler
@@ -173,7 +175,8 @@ class _FreeParameterSymbols(NamedTuple):
 class _DrivenStage(NamedTuple):
     """One stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data (ubar, K, xbar).
 
-    `function` gives the rows; `effort` (prescribed joints) and `torque` (driven joints) include derivatives by v."""
+    `function` gives the rows; `effort` (prescribed joints) and `torque` (driven joints) include derivatives by v.
+    """
 
     function: LocalVariableFunction
     v: ca.SX
@@ -196,7 +199,8 @@ def _driven_stage(
 
     The applied torque is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k. K_k is absent if encoders are
     measurements, the errors if torques are exact. These are the two forms of `inference.whitening`, with the errors in
-    place of their covariance. `momentum` (nu, nu) is the derivative of the followed momenta by the previous torque."""
+    place of their covariance. `momentum` (nu, nu) is the derivative of the followed momenta by the previous torque.
+    """
     nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
     before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
     nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))

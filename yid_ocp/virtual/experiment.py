@@ -50,7 +50,8 @@ def baxter_foam_y_system(arms: int) -> System:
     """Build the system of Caldwell (ISER 2014), in which one or two arms of Baxter hold the foam Y by point grasps.
 
     The left arm holds the tip of T2 (43 coordinates), the right arm the tip of T3 (50). Every arm joint is driven, and
-    every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms."""
+    every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms.
+    """
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="arms", allowed="1 or 2")
     sides = ("left", "right")[:arms]
@@ -66,7 +67,8 @@ class ArmSensorNoise:
 
     Units are rad (angles), rad/s (velocities), N m (efforts, one value or one per joint) and m (each coordinate of a
     grasped point). The noise of efforts is in the recording, not in the applied torque. The recording states all
-    standard deviations, for efforts only with `records_effort_std`."""
+    standard deviations, for efforts only with `records_effort_std`.
+    """
 
     position_std: float = 2e-4
     velocity_std: float = 5e-3
@@ -82,7 +84,8 @@ class ArmSensorNoise:
 class VirtualArmOptions:
     """Properties of the arms in virtual experiments of `blind` that their description lacks, such as friction.
 
-    The nominal model contains the friction law, with free amplitudes, and uncertain link masses."""
+    The nominal model contains the friction law, with free amplitudes, and uncertain link masses.
+    """
 
     friction: Annotated[
         Literal["none", "varied", "coulomb", "stribeck", "load", "load_stribeck"],
@@ -108,7 +111,8 @@ class PointCamera:
     """A slow camera that measures positions of the object's points that no arm holds.
 
     `pose` (4, 4) is the camera's pose in the world (x right, y down, z forward). By default the camera is 2 m from the
-    object, opposite the robot."""
+    object, opposite the robot.
+    """
 
     point_std: float = 5e-3  # std of the white noise on each coordinate of a point [m]
     frame_rate: float = 3.0  # mean rate; periods vary by up to a quarter [Hz]
@@ -121,7 +125,8 @@ class PointCamera:
 class VirtualExperimentSettings:
     """Settings of a virtual experiment: motion, simulation, sensors and noise.
 
-    The noise of each sensor has its own random stream from `seed`, so removing a sensor changes no other noise."""
+    The noise of each sensor has its own random stream from `seed`, so removing a sensor changes no other noise.
+    """
 
     motion: MultisineMotion | None = None  # default: `random_multisine_motion` with `seed`
     initial_joint_angles: Mapping[str, float] | None = None  # [rad or m]; default: `grasping_joint_angles`
@@ -142,7 +147,8 @@ def run_virtual_experiment(
 
     `points_arm` holds the grasped points at the joints' sample times; `points_camera` has its own clock.
     `true_parameters` holds all stiffness, damping and mass parameters (`values`, by default nominal). Raises
-    `ConfigError` if torque noise does not match the joints; other errors are as in `simulate_in_mujoco`."""
+    `ConfigError` if torque noise does not match the joints; other errors are as in `simulate_in_mujoco`.
+    """
     chosen = experiment or VirtualExperimentSettings()
     duration = chosen.simulation.duration
     posture = chosen.initial_joint_angles

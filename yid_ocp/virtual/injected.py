@@ -4,7 +4,8 @@ Effects for which MuJoCo has a term (joint damping, armature, inertias, sites) a
 computed here in NumPy at every inner step. Sensor and clock errors are applied to the finished recording. The equations
 of `yid_ocp.effects` are not used, except for effects that only change the description of the system (masses, lengths,
 rest angles, gravity, grasp positions). Effects outside the library, whose correct verdict is `unknown`, exist only
-here."""
+here.
+"""
 
 from __future__ import annotations
 
@@ -156,7 +157,8 @@ def _body_forces(forces: Mapping[int, Callable[[Any], Array]]) -> _ForceCallback
 def _attached(offset: Sequence[float], pull: Callable[[float, Array], Array]) -> _ForceBuilder:
     """An effect with the force pull(size, way) on a tip or an arm's link; `way` [m] leads to a fixed anchor point.
 
-    The anchor is the start position plus `offset` for a tip, minus `offset` for an arm's link."""
+    The anchor is the start position plus `offset` for a tip, minus `offset` for an arm's link.
+    """
 
     def made(scene: _EffectContext, model: Any, place: str, size: float) -> _ForceCallback:
         body, anchors = scene.end_body_id(model, place), list[Array]()
@@ -188,7 +190,8 @@ def _memory_law(
 ) -> _ForceBuilder:
     """An effect with the force law(size, stiffnesses, q, z) of a segment's elastic joints, or of one joint.
 
-    The internal state is z = start(q) at the start of the motion, then advance(size, z, q, v, step)."""
+    The internal state is z = start(q) at the start of the motion, then advance(size, z, q, v, step).
+    """
 
     def made(scene: _EffectContext, model: Any, place: str, size: Any) -> _ForceCallback:
         is_tube = any(segment.name == place for segment in scene.system.segment_layouts)
@@ -249,7 +252,8 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
     """Dry friction of joints as MuJoCo's own `frictionloss`, whose size is updated at every inner step.
 
     It starts with the motion and is at most tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|. The load is the motor
-    torque minus that of weights and grasps."""
+    torque minus that of weights and grasps.
+    """
     names = list(dict.fromkeys(effect.location for effect in effects))
     at = np.array([model.joint(name).id for name in names])
     sizes = {key: np.zeros(len(names)) for key in ("tau_c", "tau_s", "share")}
@@ -480,7 +484,8 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
 class InjectedEffect:
     """An effect that is present in simulated data but not in the model, with kind, location and parameter values.
 
-    `values` are the effect's parameters; a kind outside the library has `size`, in the unit of its force."""
+    `values` are the effect's parameters; a kind outside the library has `size`, in the unit of its force.
+    """
 
     kind: str
     location: str
@@ -506,7 +511,8 @@ def run_experiment_with_effects(
     force. If `ordinary_friction` is given (it can be empty), MuJoCo's constraint solver simulates it and the joint
     friction in `effects`, including sticking. Raises `ConfigError` if an effect kind cannot be simulated, and
     `ModelError` if a payload is too far from its frame or removes more mass than its link has. Other errors are as in
-    `run_virtual_experiment`."""
+    `run_virtual_experiment`.
+    """
     known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_FORCE_BUILDERS)
     known = known if ordinary_friction is None else tuple(dict.fromkeys((*known, *_ORDINARY_FRICTION)))
     for effect in (*effects, *(ordinary_friction or ())):

@@ -45,7 +45,8 @@ class MultisineMotion:
     """Multisine motion of the driven joints about their initial angles, starting from standstill.
 
     The offset of joint j is r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji). The ramp r = 10 s^3 - 15 s^4 +
-    6 s^5, s = min(t / ramp, 1), is twice continuously differentiable."""
+    6 s^5, s = min(t / ramp, 1), is twice continuously differentiable.
+    """
 
     joints: tuple[str, ...]
     amplitude: Array  # shape (nj, nf) [rad or m]
@@ -72,7 +73,8 @@ class MultisineOptions:
 
     The motion of each arm is scaled separately to the travel of its gripper. With two arms, much more travel than the
     default makes the foam Y snap between shapes. Each frequency band is divided into equal parts in log frequency, with
-    one sine in each part. The band of `shake` sines should be well below half the sample rate of the torque."""
+    one sine in each part. The band of `shake` sines should be well below half the sample rate of the torque.
+    """
 
     gripper_travel: float = 0.11  # largest distance of a gripper from its start [m]
     max_joint_speed: float = 1.4  # an arm that would exceed it travels less [rad/s]
@@ -98,7 +100,8 @@ def random_multisine_motion(
     """Draw a random multisine motion, scaled to the requested travel of the grippers.
 
     Amplitudes decrease with frequency (as 1/frequency) and towards the base. By default, parameter values are nominal
-    and initial angles [rad or m] come from `grasping_joint_angles`."""
+    and initial angles [rad or m] come from `grasping_joint_angles`.
+    """
     chosen = excitation or MultisineOptions()
     rng = np.random.default_rng(seed)
     shape = len(system.driven), chosen.sines_per_joint

@@ -1,7 +1,8 @@
 """Express a system in the terms of a rigid-body engine, and as a MuJoCo model (MJCF).
 
 An effect is classified by its equations and the parts of the description that it changes, so kinds from plug-ins are
-treated like those of the library."""
+treated like those of the library.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +76,8 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 class JointDynamicsTerms:
     """Stiffness, damping, dry friction, armature and constant force of one joint, in SI units.
 
-    The force is constant - stiffness q - cubic q^3 - damping v - friction."""
+    The force is constant - stiffness q - cubic q^3 - damping v - friction.
+    """
 
     stiffness: float = 0.0
     constant_force: float = 0.0
@@ -192,7 +194,8 @@ def _actuation(
 ) -> tuple[float, float, float, float]:
     """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
 
-    The true value is gain x recorded - offset, delayed and with a first-order lag. The last acts on the reading."""
+    The true value is gain x recorded - offset, delayed and with a first-order lag. The last acts on the reading.
+    """
     true = reading = ca.SX.sym("reading")
     channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
     for effect in reversed(effects):
@@ -282,7 +285,8 @@ def mujoco_xml(
         and lag of the actuator give the applied torque. Without actuators, true torques are applied as `qfrc_applied`.
         A servo always is an actuator, whose control is the command.
     gear_play : mapping of joint name to float, optional
-        Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`."""
+        Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
+    """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml: time_step", allowed="a number above 0 [s]")
     tree, weights = _weighed(system.numeric_mechanism(values))

@@ -1,7 +1,8 @@
 """Simulate in MuJoCo a controller that moves driven joints along a motion, or the replay of a recording.
 
 Simulator and estimator share only the description of the system. Equations, integrator and grasps are MuJoCo's own, so
-that estimates are not tested against the estimator's own errors."""
+that estimates are not tested against the estimator's own errors.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +109,8 @@ class SimulationResult:
     """Noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
 
     Depending on `effort_kind`, `effort` is the torque at t_k, its mean from t_k to t_{k+1} [N m], or the servo command
-    at t_k. The last row of `effort` was computed but not applied. Points are `system.point_frames` in the world."""
+    at t_k. The last row of `effort` was computed but not applied. Points are `system.point_frames` in the world.
+    """
 
     t: Array  # shape (N + 1,) [s]
     q: Array  # shape (N + 1, n)
@@ -147,7 +149,8 @@ def simulate_in_mujoco(
         Forces and model changes beyond the system's description. MuJoCo has one callback for the whole process, so no
         other simulation may run at the same time in another thread.
     gear_play : mapping of joint to float, optional
-        Full backlash width of gears behind servos [rad]."""
+        Full backlash width of gears behind servos [rad].
+    """
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
         allowed = f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
@@ -217,7 +220,8 @@ def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
     """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
 
     `damping` replaces the joint damping while the scene settles, because it can decide which of several equilibria is
-    found."""
+    found.
+    """
     data, driven, held = scene.data, scene.moved_joint_ids, _settling_model(scene, damping)
     target = data.qpos[driven].copy()
     held.dof_damping[driven] += _HOLD_DAMPING
@@ -251,7 +255,8 @@ class TrackingController:
     """Computed-torque controller that keeps the driven joints on a motion.
 
     The torque is the inverse dynamics along the motion, plus the load of the grasps at equilibrium, plus feedback.
-    Before the motion the scene is at equilibrium, held by the torques `balance` (nu,) [N m]."""
+    Before the motion the scene is at equilibrium, held by the torques `balance` (nu,) [N m].
+    """
 
     def __init__(self, scene: MujocoScene, motion: JointMotion, balance: Array) -> None:
         self._scene, self._motion = scene, motion
@@ -323,7 +328,8 @@ def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
 
     With short steps, a gripper that is not at its grasped point can throw a fine chain about, because the time constant
     of a grasp is two steps. If the state is lost, the scene restarts, and grasps close at the usual rate in the first
-    0.1 s."""
+    0.1 s.
+    """
     data, step = scene.data, scene.mujoco.mj_step
     start, commands = data.qpos.copy(), data.ctrl.copy()
     block = max(1, round(0.1 / held.opt.timestep))
@@ -395,7 +401,8 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 class ReplayErrorAgainstRecording:
     """Root mean square error of a replayed model against the recording, in one channel or group of channels.
 
-    The error of a point is the distance. `noise_rms` is expected from sensor noise alone, zero if not recorded."""
+    The error of a point is the distance. `noise_rms` is expected from sensor noise alone, zero if not recorded.
+    """
 
     rmse: float
     noise_rms: float
@@ -419,7 +426,8 @@ def replay_mismatch_by_channel(
 
     Returns `joints.position` of driven joints [rad] or `joints.effort` of prescribed joints [N m], all joints together,
     and `GROUP.POINT` of every point [m]. Raises `ModelError` if the recording lacks the channels that drive the model,
-    the model does not settle, or it diverges; `DataError` if MuJoCo is not installed."""
+    the model does not settle, or it diverges; `DataError` if MuJoCo is not installed.
+    """
     mujoco, model = import_mujoco(), mujoco_model_from_mjcf(text)
     moved = system.driven or system.prescribed
     joints = recording.joints

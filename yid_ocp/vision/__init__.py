@@ -1,6 +1,7 @@
 """Measure points of an object in the clouds of a depth camera, and simulate such clouds with a virtual camera.
 
-Letters in shapes: N points of a cloud, K links or skeleton nodes, np points of the model, M frames, s tubes."""
+Letters in shapes: N points of a cloud, K links or skeleton nodes, np points of the model, M frames, s tubes.
+"""
 
 from yid_ocp.vision.calibration import CameraCalibration as CameraCalibration
 from yid_ocp.vision.calibration import CameraCalibrationOptions as CameraCalibrationOptions

@@ -2,7 +2,8 @@
 
 The remaining uncertainty is an error common to all frames; it is part of the standard deviation of every point. A frame
 whose own clock offset differs from the common offset was stamped late. Offset and latency cannot be separated: both are
-stamp minus joint time."""
+stamp minus joint time.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +95,8 @@ def stamp_delay_beyond_clock_offset(
     """Estimate the delay [s] of a frame's time stamp beyond the common clock offset. None if the arm is not in view.
 
     `points` (N, 3) [m] are the frame's points in the world. If the misfit is close to the `usual` misfit of other
-    frames [m^2], only nearby delays are searched."""
+    frames [m^2], only nearby delays are searched.
+    """
     t, origin = float(state.stamps_to_joint_clock(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_MAX_START_POINTS]]
     chosen = points[arm.near_moving_surface_off_grasps_mask(points, t, 2 * _OFF_ARM_DISTANCE)][:_MAX_ARM_POINTS]
@@ -226,7 +228,8 @@ class CameraCalibration:
     def point_std_from_calibration(self, points: Array, velocity: Array, stamps: Array) -> Array:
         """Standard deviations (N, 3) [m] of points due to the camera's uncertain pose, depth and clock.
 
-        The error is common to all points at one location. `velocity` (N, 3) is in m/s, `stamps` (N,) in s."""
+        The error is common to all points at one location. `velocity` (N, 3) is in m/s, `stamps` (N,) in s.
+        """
         slopes = np.empty((len(points), 3, CAMERA_STATE_SIZE))
         slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.world_point_jacobian_by_pose_and_depth(points)
         # a point dated too early is at a later position of the motion
@@ -260,7 +263,8 @@ def calibrate_camera(
 
     `glimpses` is a subset of the frames, with thinned point clouds of the robot and its surroundings. The search starts
     at the pose `pose` (4, 4). `source` names the data in error messages. Raises `DataError` if the arm is not in view,
-    does not match the clouds, or moves too little to determine the clock."""
+    does not match the clouds, or moves too little to determine the clock.
+    """
     about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
     told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:

@@ -290,7 +290,8 @@ def initial_camera_states(
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
     Returns at most `most` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets are within `search` [s]
-    of the offset of the specified state `told`."""
+    of the offset of the specified state `told`.
+    """
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
     sides, ahead = (np.arange(-n, n + 1, _CELL_STRIDE) for n in (_SIDEWAYS_CELLS, _FORWARD_CELLS))

@@ -5,7 +5,8 @@
 p_i is a point of the cloud (f = 1), or a node of its skeleton, the mean of a tube's visible half (f = pi/4). c_i is the
 nearest point of the model's line segments, r_i the radius of its tube, rho the Geman-McClure loss. g is the distance of
 held frames from the grippers. b are bends times the square root of their stiffness. Twists about a tube's axis do not
-move its centre line and stay at zero."""
+move its centre line and stay at zero.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +108,8 @@ class ShapeFitter:
     """Fits the bending angles of a flexible object to camera points. Parameters default to nominal values.
 
     The joints in `loose`, such as a free root (`initial_shapes.system_with_free_root`), are fitted too, with an almost
-    flat prior. Raises `DataError` if the system has no object."""
+    flat prior. Raises `DataError` if the system has no object.
+    """
 
     def __init__(
         self,
@@ -186,7 +188,8 @@ class ShapeFitter:
 
         The fit has two stages. Cheap passes on skeleton nodes run from every guess in `starts` (default: the undeformed
         shape). Passes on points run from the best result. `sight` is the filtered cloud. Raises `DataError` if it has
-        no points."""
+        no points.
+        """
         if not len(sight.points) or not len(sight.skeleton_nodes):
             what, allowed = "the cloud has no points or no skeleton nodes", "one point and one node or more"
             raise DataError(what, where="sight", allowed=allowed, hint="check the filters, or give another cloud")

@@ -1,6 +1,7 @@
 """Read and write folders of clouds or depth images with time stamps and a camera (`yid-frames/1`).
 
-PLY files (Turk 1994, The PLY polygon file format) are read in Python: a damaged file must not end the process."""
+PLY files (Turk 1994, The PLY polygon file format) are read in Python: a damaged file must not end the process.
+"""
 
 from __future__ import annotations
 
@@ -218,7 +219,8 @@ def read_frame_folder(
     `intrinsics` and `depth_unit` [m] of depth images. `timestamps.csv` has the columns `file` and `t` [s]. The files
     are PLY, PCD, NPZ or XYZ clouds, or 16-bit PNG depth images, in any order; each is read on demand. The arguments
     `pose` (4, 4) and `unit` replace the folder's values. Raises `DataError` if the folder, its time stamps or pose are
-    missing, a key or unit is unknown, or depth images have no intrinsics."""
+    missing, a key or unit is unknown, or depth images have no intrinsics.
+    """
     path = Path(folder)
     if not path.is_dir():
         allowed = f"a folder with {STAMP_FILE} and clouds or depth images"

@@ -1,7 +1,8 @@
 """Read frame sequences from a folder, a ROS bag, an MCAP file, or a RealSense or Azure Kinect recording.
 
 Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`. They are
-read on demand."""
+read on demand.
+"""
 
 from __future__ import annotations
 
@@ -227,7 +228,8 @@ def read_frames(
     `path` is a folder (`read_frame_folder`), a ROS 1 or ROS 2 bag, an MCAP or RealSense file with clouds or depth
     images under `topic`, or an Azure Kinect `.mkv` (if the Open3D build reads it). `pose` (4, 4) is the pose of the
     camera in the world, `unit` the unit of clouds. Both replace the values of a folder and are required for other
-    formats. Raises `DataError` if the input cannot be read, or lacks time stamps, pose or intrinsics."""
+    formats. Raises `DataError` if the input cannot be read, or lacks time stamps, pose or intrinsics.
+    """
     place = Path(path)
     ending = place.suffix.lower()
     if place.is_dir():

@@ -187,7 +187,8 @@ def tracked_states_and_points(
     """Arrays of `TrackResult`: times, configurations, positions, standard deviations and their shared part.
 
     Only good frames and the system's points with the indices `columns` are included. Raises `DataError` if no frame is
-    good, or if no point is known well enough in any frame."""
+    good, or if no point is known well enough in any frame.
+    """
     good, sizes, calibration = _good_fits(frames), common.dimensions, common.camera_calibration
     if not good:
         raise _none_good(frames, sizes, things, source)
@@ -261,7 +262,8 @@ def frames_with_consistent_root_end(
     """Make the object's root the same end in all fits. Also returns a text that says how the end was chosen.
 
     A choice is needed if a shape fits equally well with its root at another end. Ends are first followed from frame to
-    frame. The root is then the end that does not move (if it is fixed) or the higher end."""
+    frame. The root is then the end that does not move (if it is fixed) or the higher end.
+    """
     if options.root_placement == "model":
         return list(frames), ""
     fitted = _good_fits(frames)

@@ -9,7 +9,8 @@ With x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and theta = atan r, a point has the pixel
 References
 ----------
 Brown (1971), Photogrammetric Engineering 37:855. Kannala & Brandt (2006), doi:10.1109/TPAMI.2006.153. Names and order
-of the coefficients: sensor_msgs/CameraInfo of ROS (REP 104)."""
+of the coefficients: sensor_msgs/CameraInfo of ROS (REP 104).
+"""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ class CameraIntrinsics:
     """Intrinsics of a camera with axes x right, y down, z forward.
 
     Without distortion u = fx x/z + cx, v = fy y/z + cy, with focal lengths fx, fy and principal point (cx, cy) in
-    pixels. Raises `DataError` for an unknown distortion model."""
+    pixels. Raises `DataError` for an unknown distortion model.
+    """
 
     width: int
     height: int
@@ -82,7 +84,8 @@ class CameraIntrinsics:
     def points_from_depth(self, depth: ArrayLike) -> Array:
         """Convert a depth image (height, width) to points (N, 3) [m] in the camera's frame, row by row.
 
-        Zero or NaN marks missing depth. Errors are as in `measured_depth_mask`."""
+        Zero or NaN marks missing depth. Errors are as in `measured_depth_mask`.
+        """
         image = np.asarray(depth, float)
         seen = np.flatnonzero(self.measured_depth_mask(image))
         # a third of the time that a mask over rows takes
@@ -253,7 +256,8 @@ class OcclusionMap:
         """Whether world positions (S, 3) are occluded, shadowed by something nearer, or outside the image.
 
         A surface occludes a position if it is nearer to the camera by more than `radius` (S,) plus `margin` [m].
-        `radius` is also the extent of the position across the line of sight."""
+        `radius` is also the extent of the position across the line of sight.
+        """
         seen, depth = _picture(places, self.camera_pose)
         asked, wide = seen.T, radius / np.maximum(depth, _MIN_DEPTH)
         if self.intrinsics is not None:

@@ -6,7 +6,8 @@ tips of the object in every way that agrees with the path lengths between them. 
 
 References
 ----------
-Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, doi:10.1007/PL00007210."""
+Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, doi:10.1007/PL00007210.
+"""
 
 from __future__ import annotations
 
@@ -271,7 +272,8 @@ class InitialShapeFinder:
         """Find initial shapes that follow a centerline whose path lengths between ends match the lengths of the object.
 
         Raises `DataError` if the number of ends or the lengths do not match, because a part of the object is hidden or
-        something else is connected to it."""
+        something else is connected to it.
+        """
         leaves, n_ends = trace.end_nodes, len(self._end_distances)
         if not n_ends <= len(leaves) <= _MAX_ENDS:
             counts = f"the cloud has {len(leaves)} ends, the object {n_ends}"

@@ -188,7 +188,8 @@ def statistical_inlier_mask(
 
     A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + ratio s, where s is
     the median absolute deviation scaled to a standard deviation. Median and s are computed from the whole cloud, with
-    weights, so that outliers, each alone in its voxel, have little influence."""
+    weights, so that outliers, each alone in its voxel, have little influence.
+    """
     if len(cloud) <= neighbours:
         return np.zeros(len(cloud), bool)
     tree = cKDTree(cloud.points, compact_nodes=False, balanced_tree=False)
@@ -210,7 +211,8 @@ def wanted_colour_mask(colours: ArrayLike, wanted: ArrayLike, angle: float) -> B
     """Whether each point has one of the wanted colours, (N,).
 
     `colours` (N, 3) and `wanted` (C, 3) are red, green and blue, 0 to 255 (sRGB). `angle` [rad] is the largest angle
-    between matching colours as directions of linear light, which do not depend on brightness."""
+    between matching colours as directions of linear light, which do not depend on brightness.
+    """
     seen, asked = (_light_directions(np.asarray(entry, float) / 255.0) for entry in (colours, wanted))
     return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(angle))
 

@@ -6,7 +6,8 @@ is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). With a wide prior P, frames ref
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 
 The second term is the scatter between frames. b is the error shared by all frames: end positions shift with the
-camera's pose, and depth noise changes a radius by its square over the radius."""
+camera's pose, and depth noise changes a radius by its square over the radius.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ class BackgroundPoints:
 
         The background is all points of an empty scene or, with fitted `shapes`, points that are static in most frames
         and off the shapes. Points are counted in cubes of edge `voxel` and have the standard deviation `noise`. Points
-        that were ever nearer than `near` to a tube's surface can belong to the object and are excluded."""
+        that were ever nearer than `near` to a tube's surface can belong to the object and are excluded.
+        """
         if not clouds or (shapes is not None and not shapes):
             return BackgroundPoints()
         cells = [np.unique(np.floor(cloud / voxel).astype(np.int64), axis=0) for cloud in clouds]
@@ -104,7 +106,8 @@ def group_foreign_clusters(
 
     `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
     `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already
-    removed."""
+    removed.
+    """
     groups: list[list[tuple[float, ForeignCluster]]] = []
     for t, thing in ((t, thing) for t, seen in things for thing in seen):
         home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
@@ -233,7 +236,8 @@ class TubeDimensionEstimates:
 
         `points` (np, 3, 2 s) are the derivatives of the points with respect to the 2 s dimensions of s segments. An
         estimated dimension contributes its standard deviation, a contradicted dimension that is not estimated its whole
-        displacement."""
+        displacement.
+        """
         used = np.array(self.estimated_dimension_mask)
         wrong = np.where(self.contradicted_model_value_mask & ~used, self.log_ratio, 0.0)
         chosen = points[..., used]
@@ -255,7 +259,8 @@ def estimate_and_check_dimensions(
     """Estimate the tubes' dimensions from some frames and compare them with the model.
 
     `std` holds the standard deviations [m] of a point's distance from the surface and of the position error shared by
-    all frames. `fitted` fits the frames, given parameter values and the configurations of the previous round."""
+    all frames. `fitted` fits the frames, given parameter values and the configurations of the previous round.
+    """
     sizes = tube_link_lengths_and_radii(system, given).values()
     told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
     count, many = len(told), len(told) // 2

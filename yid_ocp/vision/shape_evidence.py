@@ -2,7 +2,8 @@
 
 Points away from the tubes' surface form a foreign cluster if they are connected and as many as on a piece of tube as
 long as its diameter. If the cluster's surface continues the shape's, points within two tube radii of the contact are
-contested and not used. A tube station without own points is either hidden or visibly empty."""
+contested and not used. A tube station without own points is either hidden or visibly empty.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def tube_link_projections(
     """Project points (N, 3) on the nearest tube axis, with axis ends `corners` (K, 2, 3) and radii (K,) [m].
 
     The nearest link has the smallest distance minus `share` times its radius. Returns link index (N,), position along
-    the link from 0 to 1 (N,), unit vectors (N, 3) from axis to point, and distances (N,) from the axis [m]."""
+    the link from 0 to 1 (N,), unit vectors (N, 3) from axis to point, and distances (N,) from the axis [m].
+    """
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
     # (p - a).d and |p - a|^2 for all points and links, by matrix products
@@ -212,7 +214,8 @@ def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) ->
     """Masks of skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube of radius r = `radius`.
 
     Around a tube, points have a large spread in one direction and r/sqrt(3) across. On a table, wall or body they have
-    a large spread in two directions."""
+    a large spread in two directions.
+    """
     within = _SURROUNDING_RADII * radius
     thin = np.zeros(len(sight.skeleton_nodes), bool)
     for i, around in enumerate(sight._point_tree.query_ball_point(sight.skeleton_nodes, within)):
@@ -327,7 +330,8 @@ def nearest_surface_residuals(
     """Distances of points p (N, 3) from the surfaces of tubes: e = |p - c| - f r, with the nearest axis point c.
 
     f = `share` scales the radius r. Axis ends `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest
-    to a tube's far side is assigned to the near side."""
+    to a tube's far side is assigned to the near side.
+    """
     link, along, normal, distance = tube_link_projections(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
     error = sign * distance - share * radius[link]
@@ -342,7 +346,8 @@ def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera
 
     At a distance u from the axis across the line of sight, the surface of a tube of radius r is sqrt(r^2 - u^2) nearer
     to the camera than the axis. Errors along the surface normal would give the same tube position, but a radius too
-    small by several times noise^2/r. Points near the rim, where depth is not informative, are omitted."""
+    small by several times noise^2/r. Points near the rim, where depth is not informative, are omitted.
+    """
     link, along, normal, distance = tube_link_projections(corners, radius, points)
     axis = link_axes(corners)[link]
     sight = camera - points
@@ -365,7 +370,8 @@ class FrameTubeDimensionCost:
     """Quadratic cost g'x + x'Sx/2 of tube dimensions x in one frame, minimised over the joint angles.
 
     x (2 s,) holds the logarithms of the lengths of all s segments, then of all radii, relative to the fit's dimensions.
-    g is the gradient and S the Hessian."""
+    g is the gradient and S the Hessian.
+    """
 
     gradient: Array  # (2 s,)
     hessian: Array  # (2 s, 2 s)

@@ -5,7 +5,8 @@ disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
 
 References
 ----------
-Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations (5) and (10)."""
+Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations (5) and (10).
+"""
 
 from __future__ import annotations
 
@@ -129,7 +130,8 @@ class TriangleMesh:
 class ArticulatedSurfaces:
     """Surface meshes on the joints of a numeric mechanism, with ray and distance queries. Joint -1 is the world.
 
-    Each joint has a scene in its own frame. Rays and points are transformed to it, so motion needs no new scene."""
+    Each joint has a scene in its own frame. Rays and points are transformed to it, so motion needs no new scene.
+    """
 
     def __init__(self, mechanism: Mechanism, meshes: Mapping[int, TriangleMesh]) -> None:
         o3d = import_open3d()
@@ -203,7 +205,8 @@ class ArticulatedSurfaces:
     ) -> tuple[Array, Array, IntArray]:
         """Render noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
 
-        All have shape (height, width), with inf, 0 and -1 where there is no surface. `pose` (4, 4) is in the world."""
+        All have shape (height, width), with inf, 0 and -1 where there is no surface. `pose` (4, 4) is in the world.
+        """
         rays, camera = pinhole.pixel_rays_at_unit_depth, np.asarray(pose, float)
         size = rays.shape[:2]
         depth, cosine, owner = np.full(size, np.inf), np.zeros(size), np.full(size, -1)
@@ -225,7 +228,8 @@ class ArticulatedSurfaces:
         """Find where rays, from `origin` (3,) in the world along `directions` (N, 3), first meet a surface.
 
         Returns distances (N,) as multiples of the direction vectors, unit normals (N, 3) that face the origin, and part
-        indices (N,). A ray without intersection has distance inf, normal zero and part -1."""
+        indices (N,). A ray without intersection has distance inf, normal zero and part -1.
+        """
         distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
         owner = np.full(len(directions), -1)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
@@ -268,7 +272,8 @@ def load_robot_meshes_by_joint(
     """Load meshes of a robot's links by joint index, in the joint's frame. Index -1 is the fixed base.
 
     `urdf` is a file or `package:baxter`. `mechanism` (numeric) contains this robot, alone or within a larger mechanism.
-    Raises `ModelError` if the file or a mesh is missing or unreadable, or if there is no mesh at all."""
+    Raises `ModelError` if the file or a mesh is missing or unreadable, or if there is no mesh at all.
+    """
     import yourdfpy
 
     path = resolve_urdf_path(urdf)
@@ -330,7 +335,8 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
     """Load meshes missing from the URDF, by joint index (-1: the world).
 
     Raises `ConfigError` if a link does not exist or an entry does not define exactly one shape, and `ModelError` if a
-    file is unreadable."""
+    file is unreadable.
+    """
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
         where = f"model: extra_meshes: {number}"
@@ -537,7 +543,8 @@ def render_virtual_frames(
 
     The configurations `q` (N, n) at times `t` (N,) [s] can come from any simulator; a cubic spline interpolates them.
     In a scene with a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or
-    `ModelError` if Open3D or an object is missing, a mesh is unreadable, or the pose is invalid."""
+    `ModelError` if Open3D or an object is missing, a mesh is unreadable, or the pose is invalid.
+    """
     lens, pose = camera.sensor_model.intrinsics, validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
     taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)

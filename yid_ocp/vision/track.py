@@ -1,7 +1,8 @@
 """Track an object's points in a frame sequence, from filtering to shape fit and frame selection.
 
 A first pass over some frames estimates the calibration shared by the sequence. A second pass processes each frame and
-keeps no cloud. Each frame gets a fitted shape or a reason why it was dropped."""
+keeps no cloud. Each frame gets a fitted shape or a reason why it was dropped.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +99,8 @@ class _Look(NamedTuple):
 class FrameTracker:
     """Processes the frames of a sequence one by one, in any process. Arguments are as in `track_object`.
 
-    `frame_order` lists all frames by time stamp, `calibration_frames` the frames used to calibrate the camera."""
+    `frame_order` lists all frames by time stamp, `calibration_frames` the frames used to calibrate the camera.
+    """
 
     def __init__(
         self,

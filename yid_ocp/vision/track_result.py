@@ -137,7 +137,8 @@ def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os
     """Write a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit.
 
     Files are `NAME_1_cloud.png` to `NAME_5_fit.png` in `folder`, which is created. The last title says why the frame
-    was dropped. Raises `OutputError` if writing fails."""
+    was dropped. Raises `OutputError` if writing fails.
+    """
     path, report, parts = make_folder(folder), stages.report, [np.empty((0, 3))]
     parts += [] if stages.filtered_points is None else [stages.filtered_points]
     parts += [] if report.shape_fit is None else [report.shape_fit.link_ends.reshape(-1, 3)]

@@ -66,7 +66,8 @@ def batch_runs_from_configs(
 
     With a pattern such as `fleet/*.h5` (`**`: any folders), each run estimates on one recording and has no held-out
     recording, unless `overrides` (`a.b=c` each) say otherwise. Raises `ConfigError` if a configuration does not exist
-    or is listed twice, or if no recording matches."""
+    or is listed twice, or if no recording matches.
+    """
     paths = [Path(config) for config in configs]
     for i, path in enumerate(paths):
         if not path.is_file():
@@ -109,7 +110,8 @@ def run_batch(
     The batch is successful if all runs are; a failed run states its reason. The folder `out` contains `runs/NAME/` (run
     folders), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which
     shows `command_line`. Raises `OutputError` if `out` holds something else or cannot be created; `WorkerError` as in
-    `run_tasks`."""
+    `run_tasks`.
+    """
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)
     results: dict[str, TaskResult] = {}

@@ -1,6 +1,7 @@
 """The command `blind`: diagnose synthetic cases without their labels, then open the labels and score.
 
-Experiments are variations of configurations. The cases of an experiment are drawn from its ensemble."""
+Experiments are variations of configurations. The cases of an experiment are drawn from its ensemble.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +99,8 @@ def run_blind(
     sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), `slice.json`
     (`yid-blind-slice/1`: labels and answers with hashes, for `join_slices`), `result.json` (`yid-blind/1`), `table.md`
     and pictures. A calibration ensemble also has `thresholds.json` (`yid-calibration/1`). Raises `OutputError` if the
-    folder holds another ensemble."""
+    folder holds another ensemble.
+    """
     if count < 1:
         raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
     if seed < 0:
@@ -282,7 +284,8 @@ def _diagnose_case_from_recordings_task(
     """Task: diagnose a case from its recordings, the last one held out. Returns {seconds, result, evidence}.
 
     `evidence` allows the case to be judged again. For calibration, a case without a gap also has `open`: the statistics
-    of a diagnosis with permissive thresholds."""
+    of a diagnosis with permissive thresholds.
+    """
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
     begun = time.perf_counter()

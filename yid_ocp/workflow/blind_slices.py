@@ -47,7 +47,8 @@ def join_slices(
     """Score slices of one ensemble together, from their files `slice.json` or the folders of these files.
 
     `out` receives the files of a whole ensemble without recordings, so that the ensemble can be judged again. Raises
-    `DataError` if a slice belongs to another ensemble or is given twice, or if labels were changed."""
+    `DataError` if a slice belongs to another ensemble or is given twice, or if labels were changed.
+    """
     found: list[dict[str, Any]] = []
     for file in files:
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
@@ -133,7 +134,8 @@ def rescore_blind(
     """Judge finished cases of a blind validation again, with the present rules and the thresholds in `overrides`.
 
     Nothing is refitted. `out` receives `result.json` (`yid-blind/1`): `rescored` lists the cases whose verdict or
-    effects change, `not_judged` counts the cases that need a refit that the original diagnosis did not make."""
+    effects change, `not_judged` counts the cases that need a refit that the original diagnosis did not make.
+    """
     made, target = Path(folder), make_folder(out)
     commitment = read_input_json(made / "commitment.json")
     labels = {}

@@ -47,7 +47,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
 
     Each of the object's links is divided into `link_division` links with the same stiffness and damping in total; edges
     of a cable are not divided. Raises `ConfigError` or `ModelError`, with the setting, if a name does not exist or a
-    value is outside its bounds."""
+    value is outside its bounds.
+    """
     model, arms = run.model, run.model.arms
     run_inputs.input_files_by_name(run)
     run_inputs.load_plugins(run)
@@ -125,7 +126,8 @@ def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
 def arms_are_estimated_states(run: RunSettings) -> bool:
     """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
 
-    Arms with sensors on links remain prescribed, because such sensors cannot be weighted under process noise."""
+    Arms with sensors on links remain prescribed, because such sensors cannot be weighted under process noise.
+    """
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
     recordings = read_recordings_of_role(run)
@@ -254,7 +256,8 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
     """Settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
     Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.link_mass_std` and the frames'
-    `position_std` come first. Raises `ConfigError` if a name or pattern matches nothing."""
+    `position_std` come first. Raises `ConfigError` if a name or pattern matches nothing.
+    """
     sections = _section_parameter_settings(run, parameters)
     result = dict(sections)
     for key, given in run.parameters.items():
@@ -393,7 +396,8 @@ def _with_extra_frames(
     """Robot (or clamps) and objects with the additional frames of the settings.
 
     A frame of uncertain position, or that recordings locate (`marker_positions_from_reference_pose`), has parameters
-    NAME.x, .y, .z."""
+    NAME.x, .y, .z.
+    """
     made = list(items)
     for name, said in run.model.frames.items():
         where, parent = ("model", "frames", name), said.parent_frame
@@ -435,7 +439,8 @@ def marker_positions_from_reference_pose(
     """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
 
     Empty if no frame uses `marker_reference_pose`. Raises `ConfigError` if the object is not fixed in the world, or a
-    marker is not a point of a recording, and `DataError` if a recording has no `straight` positions."""
+    marker is not a point of a recording, and `DataError` if a recording has no `straight` positions.
+    """
     names = [name for name, said in run.model.frames.items() if said.marker_reference_pose]
     if not names:
         return {}

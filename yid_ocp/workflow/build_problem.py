@@ -1,6 +1,7 @@
 """Build the estimation problem of a run from recordings, options and free parameters on a compiled step.
 
-Recordings are checked first: duplicates count once, and gaps are cut out. Other issues are reported, not corrected."""
+Recordings are checked first: duplicates count once, and gaps are cut out. Other issues are reported, not corrected.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ _MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
 def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
     """Make the options of the estimation problem that a run's settings describe.
 
-    Values that differ between recordings (edges of a cable, marker positions) come from `recordings`."""
+    Values that differ between recordings (edges of a cable, marker positions) come from `recordings`.
+    """
     parameters = system.parameters
     chosen = build.settings_by_parameter_name(run, parameters)
     for name in run.problem.initial_state_fit_parameters:
@@ -135,7 +137,8 @@ def build_problem(
     """Build the estimation problem of a run, with the marker positions of `reference_recordings`.
 
     Raises `ConfigError`, `DataError` or `ModelError` if settings, recordings or names are inconsistent, a grasp cannot
-    be closed, or a recording is unusable. With `recordings.strict`, any issue of a recording raises an error."""
+    be closed, or a recording is unusable. With `recordings.strict`, any issue of a recording raises an error.
+    """
     system = build_system(run) if step is None else step.system
     free = free_parameter_names(run, system.parameters)
     if not free:

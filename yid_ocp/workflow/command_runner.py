@@ -70,7 +70,8 @@ def print_result(
     """Print a command's result in one of three modes: as text, as path or as JSON.
 
     By default, the lines of `texts` and the line `place` are printed. With `quiet`, only `path` is printed. With
-    `json`, only JSON is printed on standard output, and `place` on standard error."""
+    `json`, only JSON is printed on standard output, and `place` on standard error.
+    """
     if arguments.json:
         print_json(result)
         if not arguments.quiet:
@@ -106,7 +107,8 @@ _USUAL_ITERATIONS = 20  # usual number of iterations of a search
 class _RemainingTime:
     """Remaining time of a command whose stages state their usual time, else of a stage with counted parts.
 
-    The pace is the ratio of spent to usual time over imports and past stages; each counts half as much as the next."""
+    The pace is the ratio of spent to usual time over imports and past stages; each counts half as much as the next.
+    """
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._spent = min(max(import_time, _USUAL_IMPORT_TIME / 4), _USUAL_IMPORT_TIME * 32)

@@ -152,7 +152,8 @@ def propose_config_choices(
     grasps : mapping of frame to point, optional
         Other grasps. Default: ends of the object, if it stands on the ground or two arms were recorded.
     standing : bool
-        Whether the object stands on the ground and arms hold its ends."""
+        Whether the object stands on the ground and arms hold its ends.
+    """
     allowed = "joint states of the robot, which say how it was moved"
     for other in recordings:
         if other.joints is None:
@@ -327,7 +328,8 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
     """Find a time [s] of standstill in the later part of a recording, at which the held-out part starts. None without.
 
-    From standstill, the held-out part can be predicted from equilibrium, and so tests the model on held-out data."""
+    From standstill, the held-out part can be predicted from equilibrium, and so tests the model on held-out data.
+    """
     first, duration = min(group.t[0] for group in recording.joint_and_point_groups), recording.duration
     for part in np.arange(0.75, 0.5, -0.01):
         time = first + float(part) * duration

@@ -143,7 +143,8 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
 def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: Progress) -> dict[str, Any]:
     """Write a run's final model and, except for `yaml`, a manifest of what the format represents. Returns the manifest.
 
-    Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this."""
+    Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this.
+    """
     if form not in _MODEL_FORMATS:
         why = "mjcf: UsdPhysics has no schema for cables yet, nor springs on joints that turn about three axes"
         hint, allowed = why if form == "usd" else "", ", ".join(_MODEL_FORMATS)

@@ -23,7 +23,8 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Fit every friction law with one kind of motion left out in turn, and write the run folder.
 
-    Successful if the warranted law's fit to all recordings converged. Raises `DataError` for one kind of motion."""
+    Successful if the warranted law's fit to all recordings converged. Raises `DataError` for one kind of motion.
+    """
     joints = None if run.model.friction is None else run.model.friction.joints
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")

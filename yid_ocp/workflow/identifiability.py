@@ -45,7 +45,8 @@ class IdentifiabilityOptions:
     `evaluation_point` is the solution, or the initial values without solving. `start_knowledge`: initial states are
     `assumed` as in the settings, so that verdicts equal the verdicts of `solve`, or all `unknown` and estimated.
     `grasp_offset_std` is the prior standard deviation of grasp positions [m]; None keeps the grasps of the settings.
-    `interval_parameters` get profile likelihoods; `auto` means all in a small problem and none in a large one."""
+    `interval_parameters` get profile likelihoods; `auto` means all in a small problem and none in a large one.
+    """
 
     evaluation_point: Literal["solution", "initial"] = "solution"
     start_knowledge: fisher.InitialStateKnowledge = "assumed"
@@ -90,7 +91,8 @@ def run_identifiability(
     """Solve, analyse identifiability and write the run folder.
 
     If the solver fails, the analysis is omitted and the run folder holds the reason. `workers` compute intervals, one
-    parameter per task, and the changed experiments of `what_if` (default: this process)."""
+    parameter per task, and the changed experiments of `what_if` (default: this process).
+    """
     asked = options or IdentifiabilityOptions()
     with atomic_run_folder(run, out, "identifiability") as folder:
         folder.record_run_start(run, "identifiability", asked._command_line_flags())

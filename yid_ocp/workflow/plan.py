@@ -43,7 +43,8 @@ def run_plan(
 ) -> CommandOutcome[_Plan]:
     """Plan the motion of a run's goal, and write recording, CSV tables, `trajectory.json`, result.json and report.
 
-    The command is successful if the goal is reached within all limits; otherwise the run folder holds the reason."""
+    The command is successful if the goal is reached within all limits; otherwise the run folder holds the reason.
+    """
     with atomic_run_folder(run, out, "plan") as folder:
         folder.record_run_start(run, "plan")
         progress.begin_stage("building the model and its compiled step")
@@ -87,7 +88,8 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
     """Joint positions at the start of the motion, from the settings or else from the first recording.
 
     None means the joint angles of the first grasp of the undeformed object. Two arms that hold a straight object are
-    then fully stretched, and it snaps to either side; recordings rarely start like this."""
+    then fully stretched, and it snaps to either side; recordings rarely start like this.
+    """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
     [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system

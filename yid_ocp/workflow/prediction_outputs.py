@@ -29,7 +29,8 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     """Estimated torque offset of every joint in every recording, held-out too: `value`, `std`, `prior_std` [N m].
 
     The problem's whitening filters are fixed near `x` (nx,). The result is empty without filters, or without offsets in
-    the model."""
+    the model.
+    """
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
     known = list(zip(problem.episodes, whitening.torque_biases_and_stds_by_recording(problem, x), strict=True))
@@ -60,7 +61,8 @@ def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, fold
 
     The result holds `values` with total standard deviations, `joints` (number of links and range of joint stiffness [N
     m/rad], per segment and deformation), lines of `yaml` and `mjcf`, rows of `latex`, the command that exports the
-    model of the run `folder`, and what to cite."""
+    model of the run `folder`, and what to cite.
+    """
     found = {n: e for n, e in solution.parameters.items() if e.free and e.verdict == "identifiable"}
     if not found:
         return {}
@@ -131,7 +133,8 @@ def write_solve_trajectories(
     `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m) [N
     s], `torque` (N, nu) [N m] or, for servos, `command` (N, nu) [rad or m] (NaN while a motor is off), `effort` (N, nc)
     [N m], the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with
-    `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`. Raises `OutputError` if writing fails."""
+    `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`. Raises `OutputError` if writing fails.
+    """
     pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:
         done = solution.episode_predictions
@@ -173,7 +176,8 @@ def write_diagnosis_hdf5(
     attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each, and `start`, the time of the first node [s].
 
     `events/RECORDING/CHANNEL/`, for every event force: `t` (M,) [s], `value` (M,) of the force beyond model and
-    recording, `allowed` (M,), the assumed model error; the attribute `unit`. Raises `OutputError`."""
+    recording, `allowed` (M,), the assumed model error; the attribute `unit`. Raises `OutputError`.
+    """
     with create_hdf5_atomically(path) as file:
         file.attrs["format"] = DIAGNOSIS_TRAJECTORIES_FORMAT
         for episode, before, after in pairs:

@@ -118,7 +118,8 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
 
     The name is `out`, or `NAME-COMMAND-YYYYmmdd-HHMMSS` in `output.runs_folder`. The name is reserved first, so that
     two runs never write to one folder. Remains of killed runs next to the folder are deleted. Raises `OutputError` if
-    the folder exists and is not empty, is being written by another run, or cannot be created or written to."""
+    the folder exists and is not empty, is being written by another run, or cannot be created or written to.
+    """
     stem = "-".join(filter(None, (run.name, command)))
     targets = _targets(run, out, stem)
     made = [parent for parent in targets[0].parents if not parent.exists()]

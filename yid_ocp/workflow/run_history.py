@@ -51,7 +51,8 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     """Read estimates and covariance of free parameters from the run folder of a `solve` or `diagnose`.
 
     Raises `DataError` if the folder holds no finished run, if its result cannot be read, belongs to another command or
-    has an old format, or if the solve failed."""
+    has an old format, or if the solve failed.
+    """
     file, result = Path(folder) / "result.json", read_estimation_result(folder)
     try:
         said = result.get("model", result)  # of a diagnosis, the final model

@@ -32,7 +32,8 @@ def load_plugins(run: RunSettings) -> None:
     """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once per process.
 
     Raises `ConfigError` if a plug-in is missing, raises an error, registers nothing, uses a registered name, or changed
-    after this process ran it. Nothing of this plug-in is then registered."""
+    after this process ran it. Nothing of this plug-in is then registered.
+    """
     for entry in _installed():
         name, of = f"entry point {entry.name}", _distribution(entry)
         if name not in _loaded:
@@ -130,7 +131,8 @@ def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[s
 def input_files_by_name(run: RunSettings) -> dict[str, Path]:
     """All input files of a run (configuration, plug-ins, robot, recordings), by their name in the settings.
 
-    Raises `ConfigError` if a file does not exist. The message has the setting and the most similar existing file."""
+    Raises `ConfigError` if a file does not exist. The message has the setting and the most similar existing file.
+    """
     files = {"configuration": Path(run.config_file)} if run.config_file else {}
     for i, path in enumerate(run.plugins):
         files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
@@ -166,7 +168,8 @@ def resolve_recording_path(path: str) -> Path:
 def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
     """Read the first `count` recordings (None: all) of `recordings.estimate` or `held_out`, uniquely named.
 
-    Errors are as in `read_recording`, with the setting."""
+    Errors are as in `read_recording`, with the setting.
+    """
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
     for i, path in enumerate(paths[:count]):

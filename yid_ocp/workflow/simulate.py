@@ -40,7 +40,8 @@ def run_simulate(
     parameter values, and every sensor is predicted at its sample times. Without a recording, MuJoCo simulates a random
     motion of the driven arms, as a virtual experiment. If the rollout fails, no recording is written. `noise` adds
     noise with the recorded standard deviations to the predictions (a virtual experiment always has noise). `seed`
-    determines the motion and the noise."""
+    determines the motion and the noise.
+    """
     with atomic_run_folder(run, out, "simulate") as folder:
         flags = [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
         folder.record_run_start(run, "simulate", flags)

@@ -39,7 +39,8 @@ def run_solve(
     """Estimate, validate and write the run folder. The command is successful if the solver converged.
 
     If the solver failed, the run folder holds the reason and the best point. With `is_live`, a table of cost and
-    parameters is reported at every iterate, which a terminal updates."""
+    parameters is reported at every iterate, which a terminal updates.
+    """
     with atomic_run_folder(run, out) as folder:
         folder.record_run_start(run, "solve")
         progress.begin_stage("building the model and its compiled step", ahead=20.0)

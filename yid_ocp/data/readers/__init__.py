@@ -31,7 +31,8 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
 
     Formats: HDF5 recording, CSV file, rosbag, MCAP file, ROS 2 bag folder, C3D file, LeRobot dataset. `options` are
     those of the reader in `READERS`. Raises `DataError` if the format or an option is unknown, or the reader refuses
-    the file."""
+    the file.
+    """
     path = Path(path)
     known_as = _format_of(path)
     reader, known = READERS[known_as], reader_option_names(path)

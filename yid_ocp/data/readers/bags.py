@@ -151,7 +151,8 @@ class BagOptions(base.SelectionAndUnitOptions):
 
     Messages that lack one of the `joints` are skipped. `joints` is required if the messages of a topic differ in their
     joints. `points` are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`. By default they are all topics of
-    points, poses and transforms except `/tf`, each under the last descriptive part of its name."""
+    points, poses and transforms except `/tf`, each under the last descriptive part of its name.
+    """
 
     joint_topics: Sequence[str] | None = None  # topics of the joint states; all that there are when absent
     # topic of joint states whose positions are commands: `position_command`, held until the next command
@@ -181,7 +182,8 @@ def read_bag(
 
     Times are header stamps (recording times if a message has no stamp), relative to the first message. A joint channel
     that is empty or all NaN is omitted. `notes` lists unused topics. Raises `DataError` if `rosbags` is not installed,
-    if the bag cannot be read, has no usable topic or is ambiguous, or if `validated_recording` refuses the result."""
+    if the bag cannot be read, has no usable topic or is ambiguous, or if `validated_recording` refuses the result.
+    """
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
     if distance is not None and not 0 < distance < float("inf"):

@@ -141,7 +141,8 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
     """Convert the recording `raw` to SI units, select joints and points, and validate the result.
 
     Raises `DataError` for an unknown joint, point, quantity or unit, for a current without torque constants, or if
-    `validated_recording` refuses the result."""
+    `validated_recording` refuses the result.
+    """
     factors = _factors(options.units or {}, where)
     group = raw.joints
     if group is not None:
@@ -269,7 +270,8 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
-    its periods around it. Raises `DataError` if two sources share a joint, differ in channels, or share no time."""
+    its periods around it. Raises `DataError` if two sources share a joint, differ in channels, or share no time.
+    """
     if len(groups) == 1:
         return groups[0][1], ()
     _check_separate(groups, where)

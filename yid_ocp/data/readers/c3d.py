@@ -52,7 +52,8 @@ def read_c3d(
     to their names; by default all labelled markers that were ever seen are kept. `notes` lists omitted content:
     unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels. Raises
     `DataError` if `ezc3d` is not installed, if the file cannot be read or has no markers, or if `validated_recording`
-    refuses the result."""
+    refuses the result.
+    """
     path = Path(path)
     digest = file_sha256(path)
     found = _markers(path)

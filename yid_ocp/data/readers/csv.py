@@ -51,7 +51,8 @@ class CsvOptions(base.SelectionAndUnitOptions):
 
     `columns` gives the meaning of columns that `read_csv` does not recognise by name: `t`, `channel:joint`,
     `axis:point`, or `skip`. A `*` in a column name matches any text and is replaced by this text in the meaning:
-    `*_pos` with `position:*`."""
+    `*_pos` with `position:*`.
+    """
 
     columns: Mapping[str, str] | None = None
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
@@ -80,7 +81,8 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are recognised by their headers, which also state
     the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. The joints, the points or a
     sensor have no sample at a time if all their cells in this row are empty. Raises `DataError` if the file, a column,
-    cell, option or unit cannot be understood, or if `validated_recording` refuses the result."""
+    cell, option or unit cannot be understood, or if `validated_recording` refuses the result.
+    """
     path = Path(path)
     digest = file_sha256(path)
     said = options.description, path.name, path.stem, digest

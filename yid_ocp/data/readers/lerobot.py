@@ -76,7 +76,8 @@ def read_lerobot_episode(
     be radians, or if LeRobot never records this robot in radians. `notes` lists images and other features. The other
     options are those of `SelectionAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
     `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode, or if
-    `validated_recording` refuses the result."""
+    `validated_recording` refuses the result.
+    """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
     names, channels, left = _channels(dataset, table)

@@ -48,7 +48,8 @@ class ClampPoseDefinition:
     """Definition of a clamp's pose by two measured points: the origin, and a second point on the z axis.
 
     Two points do not determine the roll angle about z. With `level` it is zero (x axis perpendicular to world y). With
-    `transported` it starts as `level`, and the clamp never rotates about its own z axis."""
+    `transported` it starts as `level`, and the clamp never rotates about its own z axis.
+    """
 
     clamp_name: str
     origin_point_name: str
@@ -140,7 +141,8 @@ class InitCommandObjectFactory:
     """Template of an object for one value of `init --object`.
 
     `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
-    Raises `ConfigError` if an input is missing."""
+    Raises `ConfigError` if an input is missing.
+    """
 
     default_links: int  # per segment
     build: Callable[[Mapping[str, Any], int], InitCommandObject]
@@ -189,7 +191,8 @@ class ObjectBuilder:
     """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
     A subclass overrides `kind`, and `build_segments` or `build`. A kind that is a whole system is also a
-    `ClampedObject`."""
+    `ClampedObject`.
+    """
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
     default_link_refinement: ClassVar[bool] = False

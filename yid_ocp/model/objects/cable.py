@@ -10,7 +10,8 @@ edge with five equations (position and direction, free roll) or six.
 
 Motion capture measures neither force nor mass: if masses, rigidities and dampings are multiplied by one factor, the
 motion does not change. The linear density is therefore fixed at a nominal value, and every result is relative to it: a
-bending rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight."""
+bending rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ class CableOptions:
     rest angle of each joint is then (1 - memory) x undeformed + memory x (start angle - load/stiffness), where the load
     is the joint's torque in equilibrium at the start. The fraction becomes the parameter `SEGMENT.memory`. For a
     recording that starts in motion it is multiplied by 1/(1 + (start speed/`start.speed_scale`)^2). Branches without an
-    entry have the `default_branch`. `gravity` is in m/s^2."""
+    entry have the `default_branch`. `gravity` is in m/s^2.
+    """
 
     branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by branch, parent and children")] = (
         field(default_factory=dict)
@@ -138,7 +140,8 @@ def clamped_cable_system(
     The six coordinates of each clamp, `clamp_start` and `clamp_end`, are prescribed. Frames are all vertices,
     `junction_CHILD` and `last_edge`. Parameters are those of each segment (`parent.bend`, ...), the length of the first
     edge `clamp_start.length` [m], its roll angle `clamp_start.roll` [rad] and, if the end clamp is a weld, the roll of
-    the last edge `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent."""
+    the last edge `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent.
+    """
     options = options or CableOptions()
     item = flexible_object(_segments(cable, lengths, options), name="cable")
     if options.has_rest_angle_parameters:

@@ -35,7 +35,8 @@ class TaperedRod(MountedObjectBuilder):
     """A solid round rod whose radius changes linearly from the clamped base to the tip. The segment is named `rod`.
 
     `rod.bend` and `rod.twist` [N m^2] and `rod.damping` [N m^2 s] are the values at the base. At radius r they are
-    multiplied by (r / base radius)^4. `rod.taper` is tip radius / base radius."""
+    multiplied by (r / base radius)^4. `rod.taper` is tip radius / base radius.
+    """
 
     default_link_refinement = True
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {

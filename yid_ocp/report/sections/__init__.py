@@ -1,6 +1,7 @@
 """Input data, registration and rendering of report sections. Each file of this folder registers some sections.
 
-A plug-in can register sections too; its template `NAME.html` is next to its file."""
+A plug-in can register sections too; its template `NAME.html` is next to its file.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ class ReportData:
     """Input data of a report: `result` (content of result.json) and, if available, problem, solution and other objects.
 
     `animations` replaces the animations made from `problem`, `solution` and `held_out`. `section_data` holds other data
-    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn."""
+    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn.
+    """
 
     name: str
     description: str
@@ -56,7 +58,8 @@ def register_report_section(name: str, order: int, title: str) -> Callable[[_Pre
     """Decorator that registers a function as the report section `name`. Sections with lower `order` come first.
 
     The function returns the context of the template `NAME.html` or, for a section without a template, pairs (title,
-    figure). It returns None or no pair if the section has no content."""
+    figure). It returns None or no pair if the section has no content.
+    """
 
     def enter(prepare: _PrepareContext) -> _PrepareContext:
         REPORT_SECTIONS.register(name)(_ReportSection(order, title, prepare))
