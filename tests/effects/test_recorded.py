@@ -86,16 +86,18 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     one, other = (p.evaluate(p.initial_unknowns, derivatives=False) for p in (plain, full))
     assert one.ok, one.message
     assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
-    assert plain.has_no_input_corrections
-    assert full.with_free_parameters_without_recompiling(["T1.bend", "kelvin_voigt@T3.tau"]).has_no_input_corrections
+    assert plain.are_input_corrections_neutral_and_fixed
+    assert full.with_free_parameters_without_recompiling(
+        ["T1.bend", "kelvin_voigt@T3.tau"]
+    ).are_input_corrections_neutral_and_fixed
     # the momentum that an LQR filter follows depends on an arm's damping and on how fast the clock runs
     damped = problem(bench, (), feedback=feedback, free=("left_a.damping",))
-    assert damped.has_no_input_corrections is (feedback != "lqr")
+    assert damped.are_input_corrections_neutral_and_fixed is (feedback != "lqr")
     assert full.with_free_parameters_without_recompiling(
         ["T1.bend", "clock_scale@clock.scale"]
-    ).has_no_input_corrections is (feedback != "lqr")
+    ).are_input_corrections_neutral_and_fixed is (feedback != "lqr")
     for name in ("effort_delay@left.delay", "effort_lag@left_c.time_constant", "camera_latency@camera.delay"):
-        assert not full.with_free_parameters_without_recompiling([name]).has_no_input_corrections
+        assert not full.with_free_parameters_without_recompiling([name]).are_input_corrections_neutral_and_fixed
     with pytest.raises(SolverError, match="gauss_newton"):
         MultipleShooting(condensing=True).minimize_cost(full, full.initial_unknowns, None)
 

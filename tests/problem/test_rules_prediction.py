@@ -194,16 +194,18 @@ def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder)
 
 def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
     plain = problem_of(urdf_folder, "free", seeds=(1,))
-    assert plain.has_no_input_corrections
+    assert plain.are_input_corrections_neutral_and_fixed
     for case in ("prescribed", "prescribed gears", "driven", "driven, filtered", "robust"):
-        assert not problem_of(urdf_folder, case, seeds=(1,)).has_no_input_corrections, case
+        assert not problem_of(urdf_folder, case, seeds=(1,)).are_input_corrections_neutral_and_fixed, case
     neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.inverse": 1.0}
     made = problem_of(urdf_folder, "all prescribed", seeds=(1,))
-    assert not made.with_parameter_values(neutral).has_no_input_corrections, "a free one may change it"
+    assert not made.with_parameter_values(neutral).are_input_corrections_neutral_and_fixed, "a free one may change it"
     fixed = made.with_free_parameters_without_recompiling(("elbow.damping",))
-    assert fixed.with_parameter_values(neutral).has_no_input_corrections
-    assert not fixed.with_parameter_values(neutral | {"encoder_offset@shoulder.offset": 0.01}).has_no_input_corrections
-    assert problem_of(urdf_folder, "local", seeds=(1,)).has_no_input_corrections
+    assert fixed.with_parameter_values(neutral).are_input_corrections_neutral_and_fixed
+    assert not fixed.with_parameter_values(
+        neutral | {"encoder_offset@shoulder.offset": 0.01}
+    ).are_input_corrections_neutral_and_fixed
+    assert problem_of(urdf_folder, "local", seeds=(1,)).are_input_corrections_neutral_and_fixed
 
 
 def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_folder):
@@ -238,7 +240,10 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     problem = problem_of(urdf_folder, "driven, filtered, both", seeds=(1,))
     episode, vector = problem.episodes[0], problem.system.parameters.vector
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
-    none, shifted = np.zeros(problem.step.sizes["nx"]), problem.predictor.inputs_with_effect_momentum_shift
+    none, shifted = (
+        np.zeros(problem.step.sizes["nx"]),
+        problem.predictor.inputs_with_effect_momentum_in_tracking_reference,
+    )
     assert shifted(episode, vector(neutral), (), none).momentum_shift is None
     name = "rotor_inertia@shoulder.armature"
     found = shifted(episode, vector(neutral | {name: 0.05}), (name,), none)

@@ -315,7 +315,7 @@ class Recording(ReprMixin):
         first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
         where, hint = f"recording '{self.name}'", "choose start and stop within the recording"
-        require_data(start < stop and kept, what, where, f"start < stop, {allowed}", hint)
+        raise_data_error_unless(start < stop and kept, what, where, f"start < stop, {allowed}", hint)
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
         channels = tuple(group for group in kept if isinstance(group, SensorChannelGroup))
@@ -340,25 +340,29 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     """
     origin = where or f"recording '{recording.name}'"
     allowed, hint = "joints, points, points_<name>", "add joints or points"
-    require_data(recording.all_groups, "the recording has no group", origin, allowed, hint)
+    raise_data_error_unless(recording.all_groups, "the recording has no group", origin, allowed, hint)
     texts = (("description", recording.description), ("source", recording.source))
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        require_data(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
+        raise_data_error_unless(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
     names = [group.name for group in recording.points]
     for group in recording.points:
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
         what, hint = f"a group of points is called '{group.name}'", f"rename it, such as points_{group.name}"
-        require_data(legal, what, origin, "points, points_<name>", hint)
+        raise_data_error_unless(legal, what, origin, "points, points_<name>", hint)
         once = names.count(group.name) == 1
-        require_data(once, f"two groups of points are called '{group.name}'", origin, "every name once", "rename one")
+        raise_data_error_unless(
+            once, f"two groups of points are called '{group.name}'", origin, "every name once", "rename one"
+        )
         _validate_points(group, f"{origin}: {group.name}")
     for channels in recording.channel_groups:
         repeated = sum(group.name == channels.name for group in recording.channel_groups) > 1
-        require_data(not repeated, f"two groups are called '{channels.name}'", origin, "every name once", "rename one")
+        raise_data_error_unless(
+            not repeated, f"two groups are called '{channels.name}'", origin, "every name once", "rename one"
+        )
         _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
@@ -370,7 +374,7 @@ def _sampled(t: Array) -> str:
     return f"{count_with_noun(len(t), 'sample')} at {rate:.4g} Hz" if rate else count_with_noun(len(t), "sample")
 
 
-def require_data(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+def raise_data_error_unless(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
     """Raise a `DataError` with the texts `what`, `where`, `allowed` and `hint` unless a condition holds."""
     if not condition:
         hint = hint or "correct this entry of the recording, or import the original data again"
@@ -421,10 +425,10 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         hint = f"check the unit of the channel; import the original data again with --units {channel}=UNIT"
         if unit == "rad":
             hint = f"if the unit is degrees, import the original data again with --units {channel}=deg"
-        require_data(size.max() <= _LARGEST[unit], what, place, f"at most {_LARGEST[unit]:g} {unit}", hint)
+        raise_data_error_unless(size.max() <= _LARGEST[unit], what, place, f"at most {_LARGEST[unit]:g} {unit}", hint)
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
-    require_data(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
+    raise_data_error_unless(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
     for name in JOINT_NOISE_AND_SERVO_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
@@ -432,7 +436,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortSamplingKind)
         what, hint = f"the kind of the efforts is '{joints.effort_kind}'", "leave the attribute out if it is not known"
-        require_data(joints.effort_kind in kinds, what, place, ", ".join(kinds), hint)
+        raise_data_error_unless(joints.effort_kind in kinds, what, place, ", ".join(kinds), hint)
 
 
 def _validate_points(group: PointGroup, where: str) -> None:
@@ -453,7 +457,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
         seen = group.std[~unseen]
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
         what = f"the standard deviation of a point that was seen is {next(iter(wrong), 0.0):g} m"
-        require_data(wrong.size == 0, what, f"{where}/std", f"0 to {_LARGEST_SPREAD:g} m")
+        raise_data_error_unless(wrong.size == 0, what, f"{where}/std", f"0 to {_LARGEST_SPREAD:g} m")
     if group.pose is not None:
         _check_pose(group.pose, f"{where}, attribute pose")
 
@@ -464,7 +468,7 @@ def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
         "if the unit is millimetres, convert the values to metres",
     )
     what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
-    require_data(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
+    raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
 
 
 def _validate_channels(group: SensorChannelGroup, where: str) -> None:
@@ -473,16 +477,20 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
     hint = "add a dataset of this name, or leave the group out"
-    require_data(own, "the group has no values", where, ", ".join(declared) or "a group that a sensor declares", hint)
+    raise_data_error_unless(
+        own, "the group has no values", where, ", ".join(declared) or "a group that a sensor declares", hint
+    )
     for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:
             what = f"no sensor declares a {noun} '{name}' here"
-            require_data(name in known, what, where, **unknown_name_error_arguments(name, known))
+            raise_data_error_unless(name in known, what, where, **unknown_name_error_arguments(name, known))
     for quantity, values in own.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
-        require_data(np.isfinite(values).all(), "a value is not finite", f"{where}/{quantity}", "finite numbers")
+        raise_data_error_unless(
+            np.isfinite(values).all(), "a value is not finite", f"{where}/{quantity}", "finite numbers"
+        )
     for name, std in stds.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
@@ -491,52 +499,58 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
     if np.ndim(std) > 0:
         _check_shape(np.asarray(std), (count,), where, letters)
     good = np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD))
-    require_data(good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", "leave it out if it is not known")
+    raise_data_error_unless(
+        good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", "leave it out if it is not known"
+    )
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
     allowed, hint = "`straight` beside a group of points", "add the group of points, or leave `straight` out"
-    require_data(groups, "the recording has `straight`, but no group of points", where, allowed, hint)
+    raise_data_error_unless(groups, "the recording has `straight`, but no group of points", where, allowed, hint)
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
     finite, allowed = np.isfinite(straight).all(), "finite coordinates of every point"
-    require_data(finite, "a position is not finite", where, allowed)
+    raise_data_error_unless(finite, "a position is not finite", where, allowed)
     _check_distances(straight, where)
     # a file lists its groups by name, so other orders are not stored
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    require_data(first is groups[0], what, where, "groups of points sorted by name", "sort the groups by name")
+    raise_data_error_unless(
+        first is groups[0], what, where, "groups of points sorted by name", "sort the groups by name"
+    )
 
 
 def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "a rigid transform")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
-    require_data(np.isfinite(pose).all(), "the pose has a value that is not finite", where, allowed)
+    raise_data_error_unless(np.isfinite(pose).all(), "the pose has a value that is not finite", where, allowed)
     last_is_unit, orthonormal = (
         np.allclose(array, expected, rtol=0, atol=1e-6)
         for array, expected in ((pose[3], np.eye(4)[3]), (rotation.T @ rotation, np.eye(3)))
     )
-    require_data(last_is_unit, f"the last row of the pose is {pose[3].tolist()}", where, allowed)
-    require_data(orthonormal, "the axes of the pose are not orthonormal", where, allowed)
-    require_data(np.linalg.det(rotation) > 0, "the pose is a reflection", where, allowed)
+    raise_data_error_unless(last_is_unit, f"the last row of the pose is {pose[3].tolist()}", where, allowed)
+    raise_data_error_unless(orthonormal, "the axes of the pose are not orthonormal", where, allowed)
+    raise_data_error_unless(np.linalg.det(rotation) > 0, "the pose is a reflection", where, allowed)
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, where: str) -> None:
     place, allowed = f"{where}, names", "one name for every column, each once"
-    require_data(group.names, "the group has no names", where, allowed, "write the attribute `names`")
+    raise_data_error_unless(group.names, "the group has no names", where, allowed, "write the attribute `names`")
     allowed, hint = "one sample or more", "leave the group out, or import the data again"
-    require_data(group.t.size > 0, "the group has no samples", where, allowed, hint)
+    raise_data_error_unless(group.t.size > 0, "the group has no samples", where, allowed, hint)
     for name, count in Counter(group.names).items():
         usable = isinstance(name, str) and name and not _CONTROL_CHARACTER.search(name)
         what, allowed = f"the name {name!r} cannot be used", "text without control characters, not empty"
-        require_data(usable, what, place, allowed, "rename it")
+        raise_data_error_unless(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
-        require_data(count == 1, what, place, "every name once", "rename all but one")
+        raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
     clocks, place = get_args(ClockKind), f"{where}, attribute clock"
-    require_data(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
+    raise_data_error_unless(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
     what = f"the time at index {next(iter(bad), 0)} is {group.t[next(iter(bad), 0)]}"
-    require_data(bad.size == 0, what, f"{where}/t", "finite numbers [s]", "remove this sample from every channel")
+    raise_data_error_unless(
+        bad.size == 0, what, f"{where}/t", "finite numbers [s]", "remove this sample from every channel"
+    )
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])
@@ -548,7 +562,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
     what, allowed = f"the array has shape {array.shape}", f"{shape}, that is {letters}"
-    require_data(array.shape == shape, what, where, allowed, "write an array of the allowed shape")
+    raise_data_error_unless(array.shape == shape, what, where, allowed, "write an array of the allowed shape")
 
 
 def _check_text(where: str, *texts: tuple[str, str]) -> None:
@@ -556,4 +570,4 @@ def _check_text(where: str, *texts: tuple[str, str]) -> None:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
         what, allowed = f"the text {text!r} cannot be stored", "Unicode text without null characters and surrogates"
-        require_data(storable, what, f"{where}, attribute {name}", allowed, "remove these characters")
+        raise_data_error_unless(storable, what, f"{where}, attribute {name}", allowed, "remove these characters")

@@ -31,8 +31,8 @@ from yid_ocp.data.recording import (
     PointGroup,
     Recording,
     SensorChannelGroup,
+    raise_data_error_unless,
     read_only_copy,
-    require_data,
     validated_recording,
 )
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
@@ -59,7 +59,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
     hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
-    require_data(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
+    raise_data_error_unless(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
     with open_hdf5_after_read_check(path) as file:
         recording = _from_file(file, path, digest)
     return validated_recording(recording, allow_nan_effort=allow_nan_effort, where=str(path))
@@ -110,7 +110,9 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     }
     what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file has no format"
     hint = "update yid_ocp if a newer version wrote the file; else import the original data with this version"
-    require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT, hint)
+    raise_data_error_unless(
+        texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT, hint
+    )
     joints, points, straight, channels, gain = None, [], None, [], {}
     if _GAIN in file.attrs:  # of all joints alike
         gain = {_GAIN: read_only_copy(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
@@ -120,12 +122,14 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         where, declared = f"{origin}: {name}", channel_kinds_for_group_name(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_question(name, ("joints", "points", *further, _STRAIGHT))
-        require_data(legal, f"the format has no group '{name}'", origin, allowed, hint or "rename or delete the group")
+        raise_data_error_unless(
+            legal, f"the format has no group '{name}'", origin, allowed, hint or "rename or delete the group"
+        )
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
             continue
         group = file[name]
-        require_data(isinstance(group, h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
+        raise_data_error_unless(isinstance(group, h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
         if name == "joints":
             joints = JointGroup(**gain | _read_group(group, where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
         elif declared:
@@ -141,10 +145,12 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             points.append(PointGroup(name, **_read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)))
     truth = _json(texts["truth"] or "{}", f"{origin}, attribute truth")
     where, allowed = f"{origin}, attribute truth", '{"name": number, ...}'
-    require_data(isinstance(truth, dict), "the JSON text is not an object", where, allowed)
+    raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object", where, allowed)
     notes = _json(texts["notes"] or "[]", f"{origin}, attribute notes")
     good = isinstance(notes, list) and all(isinstance(note, str) for note in notes)
-    require_data(good, "the JSON text is not a list of text", f"{origin}, attribute notes", '["sentence", ...]')
+    raise_data_error_unless(
+        good, "the JSON text is not a list of text", f"{origin}, attribute notes", '["sentence", ...]'
+    )
     said = texts["description"], texts["source"], path.stem, digest, truth, straight, tuple(notes)
     return Recording(joints, tuple(points), *said, tuple(channels))
 
@@ -168,7 +174,9 @@ def _read_group(
             what, hint = f"the {noun} '{name}' is missing", f"add the {noun}, or leave the group out"
             raise DataError(what, where=where, allowed=", ".join(known), hint=hint)
     both = "std" in group and "std" in group.attrs
-    require_data(not both, "`std` is both a dataset and an attribute", where, "one of the two", "delete one of them")
+    raise_data_error_unless(
+        not both, "`std` is both a dataset and an attribute", where, "one of the two", "delete one of them"
+    )
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
     for name, value in group.attrs.items():
         place = f"{where}, attribute {name}"
@@ -183,10 +191,12 @@ def _read_group(
 
 def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
     numeric = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    require_data(numeric, "this is not a dataset of real numbers", where, "floating point or integer numbers")
+    raise_data_error_unless(
+        numeric, "this is not a dataset of real numbers", where, "floating point or integer numbers"
+    )
     found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
     hint = f"convert the values to {unit}, and change the attribute: recordings are never converted silently"
-    require_data(found == unit, f"the unit is '{found}'", where, unit, hint)
+    raise_data_error_unless(found == unit, f"the unit is '{found}'", where, unit, hint)
     return np.asarray(dataset[()], dtype=np.float64)
 
 
@@ -201,7 +211,7 @@ def _text(value: object, where: str) -> str:
         except UnicodeDecodeError as error:
             hint = "write the attribute again as UTF-8"
             raise DataError("the text is not UTF-8", where=where, allowed="text in UTF-8", hint=hint) from error
-    require_data(isinstance(value, str), f"the value {value} is not text", where, "text")
+    raise_data_error_unless(isinstance(value, str), f"the value {value} is not text", where, "text")
     return str(value)
 
 

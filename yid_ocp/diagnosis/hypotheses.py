@@ -16,8 +16,8 @@ from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
     problem_relinearized_at_torque_bias,
+    problem_with_held_out_kalman_whitening,
     problem_with_relinearized_held_out_whitening,
-    problem_with_whitened_held_out,
     problem_with_whitening_at,
 )
 from yid_ocp.integrator.step import compile_step_like
@@ -168,7 +168,7 @@ class AllCandidatesProblem:
         x, errors = self.problem.vector(values), (episode.input_errors for episode in self.problem.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
         made = problem_with_whitening_at(self.problem, x, rounds=1 if known else 2)
-        return replace(self, problem=problem_with_whitened_held_out(made, x))
+        return replace(self, problem=problem_with_held_out_kalman_whitening(made, x))
 
     def linearized_about_estimated_input_errors(self, solved: EstimationProblem) -> AllCandidatesProblem:
         """Problem linearised about the input errors that a solved problem of the same recordings estimated."""

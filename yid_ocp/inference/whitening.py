@@ -282,7 +282,7 @@ def _about_smoothed(
     errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
-        inputs = predictor.inputs_with_effect_momentum_shift(episode, own, (), result.rollout.state[0])
+        inputs = predictor.inputs_with_effect_momentum_in_tracking_reference(episode, own, (), result.rollout.state[0])
         driven = predictor.system.driven_coordinate_indices
         guided = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         assert guided is not None
@@ -336,7 +336,7 @@ def problem_with_whitening_at(
     return found if rounds < 2 else problem_with_whitening_at(found, x, equilibrium_guesses, rounds - 1)
 
 
-def problem_with_whitened_held_out(
+def problem_with_held_out_kalman_whitening(
     problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
 ) -> EstimationProblem:
     """Return a problem that whitens the residuals of held-out recordings by sensor and input noise.

@@ -211,9 +211,11 @@ class EstimationProblem(ReprMixin):
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
     @property
-    def has_no_input_corrections(self) -> bool:
+    def are_input_corrections_neutral_and_fixed(self) -> bool:
         """Whether all effects that correct recorded inputs, times or tracked references are neutral and fixed."""
-        return all(self.predictor.has_no_input_corrections(episode, self.theta) for episode in self.episodes)
+        return all(
+            self.predictor.are_input_corrections_neutral_and_fixed(episode, self.theta) for episode in self.episodes
+        )
 
     def theta_and_initial_state_deviation(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""

@@ -96,7 +96,7 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
     """Raise `SolverError` if an effect changes recorded inputs or times, which node-state solvers do not support."""
-    if not problem.has_no_input_corrections:
+    if not problem.are_input_corrections_neutral_and_fixed:
         message = "an effect changes recorded inputs, times or the reference of the tracking feedback"
         allowed = "effects that change the mechanics or the readings of sensors"
         raise SolverError(message, where=where, allowed=allowed, hint="set solver.name: gauss_newton")

@@ -37,7 +37,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
     if apart:
         is_whitened = any(problem.held_out_whitening_filters)
-        weigh = whitening.problem_with_whitened_held_out
+        weigh = whitening.problem_with_held_out_kalman_whitening
         held = problem if is_whitened else weigh(problem, x, keep_weights=True)
         for (episode, result), own in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
             is_apart = episode.initial_state_shared_with is None

@@ -155,5 +155,5 @@ def solution_to_result_dict(
 def discretisation_shifts_to_dict(
     shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Convert estimates' discretisation shifts for result.json, with parameters' data standard deviations `std`."""
+    """Convert the shifts of estimates with more links or shorter steps for result.json, beside the `std` of noise."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}
