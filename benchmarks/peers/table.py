@@ -15,7 +15,7 @@ BEGIN, END = "<!-- peers: begin -->", "<!-- peers: end -->"
 HELD_OUT = {"springs": (1e3, "mm"), "servo": (1.0, "rad")}  # scale and unit; torques elsewhere
 MARKERS = "osD^v<>PX*"
 HEADER = (
-    "tool", "called known", "largest error of these", "called known, but wrong", "intervals that contain the truth",
+    "tool", "confident estimates", "largest error of these", "confident but wrong", "intervals that contain the truth",
     "held out", "CPU [s]", "lines",
 )  # fmt: skip
 MADE_BY = {
@@ -62,7 +62,7 @@ def rows(case: str, entry: Mapping[str, Any]) -> list[list[str]]:
         cells = ["-"] * 4
         if entry["truth"]:
             error = found["error"]
-            shown = f"none; {100 * found['error_of_all']:.2g} % of all" if error is None else f"{100 * error:.2g} %"
+            shown = f"none; {100 * found['error_of_all']:.2g} % over all parameters" if error is None else f"{100 * error:.2g} %"
             failed = f"; {found['failed']} runs failed" if found["failed"] else ""
             cells[:2] = [f"{found['known']} of {found['of']}{failed}", shown]
             cells[2:] = ["no intervals"] * 2
@@ -82,7 +82,7 @@ def markdown(known: Mapping[str, Any]) -> str:
     parts = [f"Versions: {versions}."]
     for case, entry in known["cases"].items():
         seeds = max(len(own["runs"]) for own in entry["tools"].values())
-        what = "kinds of motion, each held out once" if entry["made_by"] == "real" else "draws of noise"
+        what = "kinds of motion, each held out once" if entry["made_by"] == "real" else "repetitions with different noise"
         parts.append(
             f"**{entry['title'][0].upper()}{entry['title'][1:]}** ({seeds} {what}; {MADE_BY[entry['made_by']]})"
         )
@@ -100,7 +100,7 @@ def write_documentation(known: Mapping[str, Any]) -> None:
 
 
 def draw(known: Mapping[str, Any], path: Path) -> None:
-    """Wrong claims, held-out errors over the least of each case, and CPU time, by case and tool."""
+    """Estimates that are confident but wrong, held-out errors over the least of each case, and CPU time."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -123,7 +123,7 @@ def draw(known: Mapping[str, Any], path: Path) -> None:
                     axis.plot(x, y, **style)
     axes[0].set_yticks(range(len(cases)), [entry["title"] for entry in cases.values()])
     axes[0].set_ylim(len(cases) - 0.5, -0.5)
-    titles = ("called known, but wrong [%]", "held-out error over the least of the case", "CPU time [s]")
+    titles = ("confident but wrong [%]", "held-out error over the least of the case", "CPU time [s]")
     for axis, title in zip(axes, titles, strict=True):
         axis.set_xlabel(title)
         axis.grid(alpha=0.3)
