@@ -68,7 +68,7 @@ class TorqueLaw(EffectBase):
     coordinate s with ds/dt = 1). f is a natural cubic spline whose parameters are its values at equally spaced knots,
     and constant beyond the knots; for two quantities it is a sum of two splines. The command is the torque that the
     servo requests, after saturation; for a DC motor it is the torque of the duty cycle without back-EMF. A law of the
-    command is zero while the motor is off. At a segment, the load of a joint is the torque of its spring.
+    command is zero while the motor is off. Load and command exist at arm joints only.
     """
 
     knots: Mapping[str, Array] | None = None  # knots of every quantity
