@@ -62,7 +62,8 @@ def rows(case: str, entry: Mapping[str, Any]) -> list[list[str]]:
         cells = ["-"] * 4
         if entry["truth"]:
             error = found["error"]
-            shown = f"none; {100 * found['error_of_all']:.2g} % over all parameters" if error is None else f"{100 * error:.2g} %"
+            over_all = f"none; {100 * found['error_of_all']:.2g} % over all parameters"
+            shown = over_all if error is None else f"{100 * error:.2g} %"
             failed = f"; {found['failed']} runs failed" if found["failed"] else ""
             cells[:2] = [f"{found['known']} of {found['of']}{failed}", shown]
             cells[2:] = ["no intervals"] * 2
@@ -82,7 +83,8 @@ def markdown(known: Mapping[str, Any]) -> str:
     parts = [f"Versions: {versions}."]
     for case, entry in known["cases"].items():
         seeds = max(len(own["runs"]) for own in entry["tools"].values())
-        what = "kinds of motion, each held out once" if entry["made_by"] == "real" else "repetitions with different noise"
+        real = entry["made_by"] == "real"
+        what = "kinds of motion, each held out once" if real else "repetitions with different noise"
         parts.append(
             f"**{entry['title'][0].upper()}{entry['title'][1:]}** ({seeds} {what}; {MADE_BY[entry['made_by']]})"
         )
