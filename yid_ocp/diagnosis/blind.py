@@ -227,7 +227,7 @@ class BlindCaseGenerator:
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
-            what, allowed = "a blind proof needs driven arms", "a robot with driven and without prescribed joints"
+            what, allowed = "a blind test needs driven arms", "a robot with driven and without prescribed joints"
             raise ConfigError(what, where="model.arms.mode", allowed=allowed, hint="set model.arms.mode: driven")
         if seed < 0:
             raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")

@@ -22,7 +22,6 @@ from yid_ocp.effects.base import (
 )
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.files import read_input_text
-from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
@@ -94,9 +93,9 @@ class TorqueLaw(EffectBase):
 
     def step_terms(self, state: MidpointState) -> StepTerms:
         force = ca.SX(state.system.n_coordinates, 1)
-        for index, spring in _coordinates_and_springs(state.system, self.location):
+        for index in _coordinate_indices(state.system, self.location):
             for quantity in self.quantities:
-                x = _quantity(quantity, state, self.label, index, spring)
+                x = _quantity(quantity, state, self.label, index)
                 torque = self._torque(quantity, x)
                 if quantity == "command":
                     torque = ca.if_else(_servo_input(state, index) < MOTOR_OFF_COMMAND / 2, torque, 0)
@@ -130,21 +129,21 @@ def _spline_weights(count: int) -> Array:
     return np.asarray(np.linalg.inv(inner)[:, :count], float)
 
 
-def _coordinates_and_springs(system: System, location: str) -> list[tuple[int, ElasticJoint | None]]:
-    """Indices of the coordinates on which a law at a location acts, each with its spring or None."""
+def _coordinate_indices(system: System, location: str) -> list[int]:
+    """Indices of the coordinates on which a law at a location acts."""
     index = system.mechanism.joint_index
     if location in segment_names(system):
         springs = elastic_joints_within_segment(system, location)
         bends = [spring for spring in springs if spring.deformation == "bend"]
-        return [(index(spring.joint_name), spring) for spring in bends or springs]
-    return [(index(location), None)]
+        return [index(spring.joint_name) for spring in bends or springs]
+    return [index(location)]
 
 
 def _servo_input(state: MidpointState, index: int) -> ca.SX:
     return state.u[state.system.driven_coordinate_indices.index(index)]
 
 
-def _quantity(quantity: str, state: MidpointState, label: str, index: int, spring: ElasticJoint | None) -> ca.SX:
+def _quantity(quantity: str, state: MidpointState, label: str, index: int) -> ca.SX:
     system = state.system
     if quantity == "time":
         return state.z[state.internal_rows[f"{label}.time"]]
@@ -156,8 +155,6 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int, sprin
         u, servo = _servo_input(state, index), system.servos[system.mechanism.joints[index].name]
         drag = servo.damping * state.v[index] if servo.motor_kind == "dc" else 0
         return ca.if_else(u < MOTOR_OFF_COMMAND / 2, servo.torque(u, state.q[index], state.v[index]) + drag, 0)
-    if spring is not None:
-        return spring.stiffness * state.q[index]
     return system.input_force(state.u, state.q, state.v)[index] - system.weight_and_grasp_force_on_coordinate(
         state, index
     )
@@ -187,8 +184,7 @@ def torque_law_quantity_values_along_rollout(
     n, h = system.n_coordinates, float(nodes["time_step"])
     if quantity == "time":
         return np.asarray((np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h, float)
-    places, q = _coordinates_and_springs(system, location), nodes["state"][:, :n]
-    at = [index for index, _ in places]
+    at, q = _coordinate_indices(system, location), nodes["state"][:, :n]
     if quantity == "speed":
         return np.asarray(np.diff(q[:, at], axis=0) / h, float)
     if quantity == "angle":
@@ -210,7 +206,7 @@ def torque_law_quantity_values_along_rollout(
         rows,
         ca.SX(h),
     )
-    wanted = ca.vertcat(*(_quantity(quantity, state, "", index, spring) for index, spring in places))
+    wanted = ca.vertcat(*(_quantity(quantity, state, "", index) for index in at))
     wanted = ca.substitute(wanted, ca.vertcat(*internal.values()), symbols["z"]) if internal else wanted
     function = ca.Function("quantity", [*symbols.values(), system.parameters.symbols], [wanted])
     z = nodes["state"][:-1, 2 * n :]

@@ -471,7 +471,7 @@ def _require_compatible(run: RunSettings) -> None:
         raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:
-        what, hint = "a blind proof needs arms that are driven by torques", "set model.arms.mode: driven"
+        what, hint = "a blind test needs arms that are driven by torques", "set model.arms.mode: driven"
         raise run.config_error(what, "model", "arms", "mode", allowed="driven, without servos", hint=hint)
 
 
