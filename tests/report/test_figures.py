@@ -185,6 +185,9 @@ def test_meshes_are_read_again_where_a_file_changed(single_arm, tmp_path, monkey
     for file in (tmp_path / "cache").glob("meshes-*"):
         file.write_text(file.read_text()[:9])
     assert (width(0.3), len(reads)) == (pytest.approx(0.3), 3)
+    # nor is a cache that cannot be made
+    monkeypatch.setenv("YID_OCP_CACHE", str(robot / "cache"))
+    assert width() == pytest.approx(0.3)
     robot.write_text("<robot><visual")
     assert animations_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"] == {}
 

@@ -111,15 +111,18 @@ def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[l
             return {}
         mechanism = system.numeric_mechanism()
         told = (file_sha256(Path(__file__)), mesh_sources_sha256(robot, mechanism), system.mechanism.joint_names)
-        file = private_cache_folder() / f"meshes-{json_sha256(told)[:32]}.json"
-        if file.is_file():
+        file: Path | None = None
+        with contextlib.suppress(YidError):  # a page has its meshes without a cache, too
+            file = private_cache_folder() / f"meshes-{json_sha256(told)[:32]}.json"
+        if file and file.is_file():
             with contextlib.suppress(ValueError):
                 return dict(json.loads(file.read_text(encoding="utf-8")))
         found = load_robot_meshes_by_joint(robot, mechanism)
         names = (*system.mechanism.joint_names, "")
         made = {names[j]: _integer_lists(mesh) for j, mesh in _thinned(found).items()}
         with contextlib.suppress(OutputError):
-            write_text(file, json.dumps(made, separators=(",", ":")))
+            if file:
+                write_text(file, json.dumps(made, separators=(",", ":")))
         return made
     return {}
 
