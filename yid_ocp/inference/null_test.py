@@ -158,13 +158,12 @@ def residual_spread_from_encoder_noise(
         found = own.evaluate(x, False)
         return found.residual if found.ok else None
 
-    residual_of = predicted or evaluated
-    before = residual_of(problem)
+    residual_of, nothing = predicted or evaluated, np.zeros((problem.residual_rows.weak_priors.stop, 0))
     points = {group.name for episode in problem.episodes for group in episode.recording.points}
     rows = [c.residual_indices for c in residual_channels(problem) if c.group in points]
     moves_object = problem.system.prescribed and problem.system.unprescribed_coordinate_indices
-    if before is None or not rows or not moves_object:
-        return np.zeros((0 if before is None else len(before), 0))
+    if not rows or not moves_object or (before := residual_of(problem)) is None:
+        return nothing
     rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
     for _ in range(_N_PATH_NOISE_DRAWS):
         drawn = [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
@@ -172,7 +171,7 @@ def residual_spread_from_encoder_noise(
         if after is not None:
             found.append(np.zeros(len(before)))
             found[-1][at] = (after - before)[at]
-    return np.stack(found, axis=1) / np.sqrt(len(found)) if found else np.zeros((len(before), 0))
+    return np.stack(found, axis=1) / np.sqrt(len(found)) if found else nothing
 
 
 def _with_path_noise_redrawn(episode: Episode, problem: EstimationProblem, rng: np.random.Generator) -> Episode:
