@@ -53,7 +53,7 @@ def lqr_tracking_feedback(
     """Compute a feedback with finite-horizon LQR gains that keeps the driven arms near their measured motion.
 
     The gains act on the arms' angles and momenta. They minimise the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 +
-    du|^2/torque^2 over the recording, with fixed scales for angle, rate and torque (Anderson and Moore 1990, Optimal
+    |du|^2/torque^2 over the recording, with fixed scales for angle, rate and torque (Anderson and Moore 1990, Optimal
     Control: Linear Quadratic Methods, section 2.4). The model contains the arms without the object and is linearised
     about the measured motion. The reference momentum follows from the measured angles (N + 1, nu) [rad] and torques (N,
     nu) [N m] by the arms' DEL equations, and is therefore comparable with the model's momentum. The angles must be
