@@ -161,8 +161,7 @@ def _inspect(parser: argparse.ArgumentParser) -> None:
     text = "print an equation, with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]', or where a "
     text += "parameter enters"
     _repeated(parser, "--entry", "ROW[, COLUMN]", text, "entries")
-    text = "folder for the equations as CasADi functions, C and a LaTeX sheet"
-    parser.add_argument("--export", metavar="DIR", help=text)
+    parser.add_argument("--export", metavar="DIR", help="folder for the equations as CasADi functions and C")
 
 
 def _import(parser: argparse.ArgumentParser) -> None:

@@ -307,7 +307,7 @@ def test_inspect(carried_out, pendulum, tmp_path):
     assert f"  which is {before:.6g} at rest at the first posture of estimate" in done.out
     files = {path.name for path in (tmp_path / "eq").iterdir()}
     assert files == {pathlib.Path(name).name for name in result["exported"]}
-    assert {"rows.casadi", "equations.c", "equations.tex", "names.json"} <= files
+    assert {"rows.casadi", "equations.c", "names.json"} <= files
 
 
 def test_inspect_agrees_with_finite_differences(carried_out, written, urdf_folder):

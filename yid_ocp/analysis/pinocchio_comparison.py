@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
 from yid_ocp.files import MAX_TEXT_BYTES, check_input_file
 from yid_ocp.model.kinematics import (
@@ -62,7 +61,7 @@ def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) 
 
     The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations.
     """
-    built = system_with_numeric_parameters(system, theta)
+    built = _with_numeric_parameters(system, theta)
     gravity = np.array(ca.DM(built.gravity)).ravel()
     inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))
     return _compared("the built model", built.mechanism, gravity, inert, heavy, posture)
@@ -121,6 +120,18 @@ def _place(configuration: Array, joint: Any, value: float) -> None:
     """Set a joint in Pinocchio's configuration, in which a continuous joint is a cosine and a sine."""
     values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
     configuration[joint.idx_q : joint.idx_q + joint.nq] = values
+
+
+def _with_numeric_parameters(system: System, theta: Array) -> System:
+    """The system with numbers instead of its parameters, and zero internal coordinates."""
+    inner = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
+    symbols = ca.vertcat(system.parameters.symbols, inner)
+    values = np.concatenate([theta, np.zeros(inner.numel())])
+
+    def number(expression: ca.SX) -> ca.SX:
+        return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(values)))
+
+    return system.map_expressions(number)
 
 
 def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:

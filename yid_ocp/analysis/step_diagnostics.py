@@ -15,7 +15,6 @@ from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
-from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import Sensor, sensor_reading_function
 
@@ -82,18 +81,6 @@ def linearise_step_equations(
     return step.kernel.linearize_step_equations(
         theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True
     )
-
-
-def system_with_numeric_parameters(system: System, theta: Array) -> System:
-    """Return a system with numbers instead of its parameters, and zero internal coordinates."""
-    inner = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
-    symbols = ca.vertcat(system.parameters.symbols, inner)
-    values = np.concatenate([theta, np.zeros(inner.numel())])
-
-    def number(expression: ca.SX) -> ca.SX:
-        return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(values)))
-
-    return system.map_expressions(number)
 
 
 def _differences(function: Callable[[Array], Array], at: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Equations of one step with named rows and columns, and their entries as text or LaTeX."""
+"""Equations of one step with named rows and columns, and their entries as text."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 
@@ -18,19 +17,9 @@ from yid_ocp.integrator.discrete import DiscreteEquations
 # Binding strength of an expression: an operand that binds less than required gets parentheses.
 _COMPARISON, _SUM, _PRODUCT, _POWER, _ATOM = range(5)
 _LEAF_OPERATIONS = (ca.OP_INPUT, ca.OP_CONST)
-_MAX_FRACTION_LENGTH = 60  # characters beyond which a fraction is written on one line, which TeX can break
 
 # operation: template, binding strength, required strength of its operands
 _OperationTemplate = tuple[str, int, tuple[int, ...]]
-
-
-def _comparisons(**signs: str) -> dict[int, _OperationTemplate]:
-    """Templates of comparisons and of conditions joined by a sign."""
-    logic = ("AND", "OR")
-    return {
-        getattr(ca, f"OP_{name}"): ("{0} " + sign + " {1}", _COMPARISON, ((_ATOM if name in logic else _SUM),) * 2)
-        for name, sign in signs.items()
-    }
 
 
 _TEXT_TEMPLATES: dict[int, _OperationTemplate] = {
@@ -43,31 +32,19 @@ _TEXT_TEMPLATES: dict[int, _OperationTemplate] = {
     ca.OP_INV: ("1/{0}", _PRODUCT, (_POWER,)),
     ca.OP_SQ: ("{0}^2", _POWER, (_ATOM,)),
     **dict.fromkeys((ca.OP_POW, ca.OP_CONSTPOW), ("{0}^{1}", _POWER, (_ATOM, _ATOM))),
-    **_comparisons(LT="<", LE="<=", EQ="==", NE="!=", AND="and", OR="or"),
+    ca.OP_LT: ("{0} < {1}", _COMPARISON, (_SUM, _SUM)),
+    ca.OP_LE: ("{0} <= {1}", _COMPARISON, (_SUM, _SUM)),
+    ca.OP_EQ: ("{0} == {1}", _COMPARISON, (_SUM, _SUM)),
+    ca.OP_NE: ("{0} != {1}", _COMPARISON, (_SUM, _SUM)),
+    ca.OP_AND: ("{0} and {1}", _COMPARISON, (_ATOM, _ATOM)),
+    ca.OP_OR: ("{0} or {1}", _COMPARISON, (_ATOM, _ATOM)),
     ca.OP_NOT: ("not {0}", _COMPARISON, (_ATOM,)),
     ca.OP_IF_ELSE_ZERO: ("if({0}, {1}, 0)", _ATOM, (_COMPARISON, _COMPARISON)),
     ca.OP_FABS: ("abs({0})", _ATOM, (_COMPARISON,)),
     ca.OP_FMIN: ("min({0}, {1})", _ATOM, (_COMPARISON, _COMPARISON)),
     ca.OP_FMAX: ("max({0}, {1})", _ATOM, (_COMPARISON, _COMPARISON)),
 }
-_LATEX_TEMPLATES: dict[int, _OperationTemplate] = _TEXT_TEMPLATES | {
-    ca.OP_MUL: (r"{0} \, {1}", _PRODUCT, (_PRODUCT, _PRODUCT)),
-    ca.OP_DIV: (r"\frac{{{0}}}{{{1}}}", _ATOM, (_COMPARISON, _COMPARISON)),
-    ca.OP_TWICE: (r"2 \, {0}", _PRODUCT, (_PRODUCT,)),
-    ca.OP_INV: (r"\frac{{1}}{{{0}}}", _ATOM, (_COMPARISON,)),
-    ca.OP_SQ: ("{{{0}}}^{{2}}", _POWER, (_ATOM,)),
-    **dict.fromkeys((ca.OP_POW, ca.OP_CONSTPOW), ("{{{0}}}^{{{1}}}", _POWER, (_ATOM, _COMPARISON))),
-    **_comparisons(LE=r"\le", EQ="=", NE=r"\ne", AND=r"\land", OR=r"\lor"),
-    ca.OP_NOT: (r"\lnot {0}", _COMPARISON, (_ATOM,)),
-    ca.OP_IF_ELSE_ZERO: (r"[{0}] \, {1}", _PRODUCT, (_COMPARISON, _PRODUCT)),
-    ca.OP_FABS: ("|{0}|", _ATOM, (_COMPARISON,)),
-}
 _FUNCTION_NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}
-
-
-class _SymbolName(NamedTuple):
-    text: str
-    latex: str
 
 
 @dataclass(frozen=True)
@@ -87,30 +64,24 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
     return sum(function.instruction_id(i) not in skipped for i in range(function.n_instructions()))
 
 
-def format_expressions(
-    expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[_SymbolName], latex: bool = False
-) -> _FormulaText:
-    """Format scalar expressions as text or LaTeX. `names` are those of the variables (k, 1), their only symbols."""
+def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[str]) -> _FormulaText:
+    """Format scalar expressions as text. `names` are those of the variables (k, 1), their only symbols."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
     for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
         uses[used] += 1
-    layouts = _LATEX_TEMPLATES if latex else _TEXT_TEMPLATES
     written: list[tuple[str, int]] = []
     shared: list[tuple[str, str]] = []
     for i, (op, parts, value) in enumerate(nodes):
         if op == ca.OP_INPUT:
-            name = names[int(value)]
-            written.append((name.latex if latex else name.text, _ATOM))
+            written.append((names[int(value)], _ATOM))
         elif op == ca.OP_CONST:
-            mantissa, _, exponent = (text := f"{value:.12g}").partition("e")
-            text = rf"{mantissa} \cdot 10^{{{int(exponent)}}}" if latex and exponent else text
-            written.append((text, _SUM if value < 0 else _ATOM))
+            written.append((f"{value:.12g}", _SUM if value < 0 else _ATOM))
         else:
-            text, tightness = _written(op, [written[part] for part in parts], layouts, latex)
+            text, tightness = _written(op, [written[part] for part in parts])
             simple = op == ca.OP_NEG and nodes[parts[0]][0] in _LEAF_OPERATIONS
             if uses[i] > 1 and not simple:
-                name_of = f"c_{{{len(shared) + 1}}}" if latex else f"c{len(shared) + 1}"
+                name_of = f"c{len(shared) + 1}"
                 shared.append((name_of, text))
                 text, tightness = name_of, _ATOM
             written.append((text, tightness))
@@ -145,18 +116,10 @@ def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
     return nodes, results
 
 
-def _written(
-    op: int, parts: list[tuple[str, int]], layouts: dict[int, _OperationTemplate], latex: bool
-) -> tuple[str, int]:
-    if op not in layouts:
-        called, arguments = _FUNCTION_NAMES[op], ", ".join(text for text, _ in parts)
-        if latex and called == "sqrt":
-            return rf"\sqrt{{{arguments}}}", _ATOM
-        known = called in ("sin", "cos", "tan", "exp", "log", "sinh", "cosh", "tanh", "min", "max")
-        head = called if not latex else "\\" + called if known else rf"\operatorname{{{called}}}"
-        return f"{head}({arguments})", _ATOM
-    long = latex and op in (ca.OP_DIV, ca.OP_INV) and sum(len(text) for text, _ in parts) > _MAX_FRACTION_LENGTH
-    template, tightness, asked = (_TEXT_TEMPLATES if long else layouts)[op]
+def _written(op: int, parts: list[tuple[str, int]]) -> tuple[str, int]:
+    if op not in _TEXT_TEMPLATES:
+        return f"{_FUNCTION_NAMES[op]}({', '.join(text for text, _ in parts)})", _ATOM
+    template, tightness, asked = _TEXT_TEMPLATES[op]
     texts = [text if has >= wants else f"({text})" for (text, has), wants in zip(parts, asked, strict=True)]
     return template.format(*texts), tightness
 
@@ -169,15 +132,13 @@ _MAX_LISTED_SYMBOLS = 6  # names of one block that are still listed one by one
 class SymbolBlock:
     """A named block of equations or variables of one kind, as a symbolic column (k, 1).
 
-    `labels` has one entry per row: the name of a joint, grasp equation, internal coordinate or parameter. In the LaTeX
-    template, `#` is replaced by the label.
+    `labels` has one entry per row: the name of a joint, grasp equation, internal coordinate or parameter.
     """
 
     name: str
     labels: tuple[str, ...]
     expressions: ca.SX
     meaning: str
-    latex_template: str
 
     @property
     def full_names(self) -> tuple[str, ...]:
@@ -244,23 +205,22 @@ class NamedStepEquations(ReprMixin):
         e, system = equations, equations.system
         joints, internal = system.mechanism.joint_names, tuple(system.effect_internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
-        k, after = r"_{k,\,#}", r"_{k+1,\,#}"
         rows = (
-            SymbolBlock("del", joints, e.momentum_balance, "DEL equation, balance of momentum", "R" + k),
-            SymbolBlock("internal", internal, e.internal_residual, "equation of an internal coordinate", "Z" + k),
-            SymbolBlock("constraint", closed, e.constraint_residual, "equation of a grasp", r"\varphi" + after),
-            SymbolBlock("p1", joints, e.p1, "momentum after the step", "p" + after),
+            SymbolBlock("del", joints, e.momentum_balance, "DEL equation, balance of momentum"),
+            SymbolBlock("internal", internal, e.internal_residual, "equation of an internal coordinate"),
+            SymbolBlock("constraint", closed, e.constraint_residual, "equation of a grasp"),
+            SymbolBlock("p1", joints, e.p1, "momentum after the step"),
         )
         columns = (
-            SymbolBlock("q0", joints, e.q0, "coordinates before the step", "q" + k),
-            SymbolBlock("p0", joints, e.p0, "momenta before the step", "p" + k),
-            SymbolBlock("z0", internal, e.z0, "internal coordinates before the step", "z" + k),
-            SymbolBlock("u", system.driven, e.u, "commands of servos" if system.servos else "motor torques", "u" + k),
-            SymbolBlock("theta", system.parameters.names, e.theta, "parameters", r"\theta_{#}"),
-            SymbolBlock("time_step", ("h",), e.time_step, "time step", "h"),
-            SymbolBlock("q1", joints, e.q1, "coordinates after the step", "q" + after),
-            SymbolBlock("z1", internal, e.z1, "internal coordinates after the step", "z" + after),
-            SymbolBlock("lam", closed, e.lam, "multipliers of the grasps", r"\lambda" + k),
+            SymbolBlock("q0", joints, e.q0, "coordinates before the step"),
+            SymbolBlock("p0", joints, e.p0, "momenta before the step"),
+            SymbolBlock("z0", internal, e.z0, "internal coordinates before the step"),
+            SymbolBlock("u", system.driven, e.u, "commands of servos" if system.servos else "motor torques"),
+            SymbolBlock("theta", system.parameters.names, e.theta, "parameters"),
+            SymbolBlock("time_step", ("h",), e.time_step, "time step"),
+            SymbolBlock("q1", joints, e.q1, "coordinates after the step"),
+            SymbolBlock("z1", internal, e.z1, "internal coordinates after the step"),
+            SymbolBlock("lam", closed, e.lam, "multipliers of the grasps"),
         )
         return NamedStepEquations(equations, rows, columns)
 
@@ -289,15 +249,6 @@ class NamedStepEquations(ReprMixin):
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
         return found
 
-    @cached_property
-    def column_display_names(self) -> tuple[_SymbolName, ...]:
-        """Text and LaTeX names of all columns, in order."""
-        return tuple(
-            _SymbolName(name, block.latex_template.replace("#", rf"\mathrm{{{escape_latex(label)}}}"))
-            for block in self.column_blocks
-            for name, label in zip(block.full_names, block.labels, strict=True)
-        )
-
     def block_slice(self, block: str) -> slice:
         """Index range of a block among all rows or columns."""
         blocks = self.row_blocks if any(entry.name == block for entry in self.row_blocks) else self.column_blocks
@@ -322,7 +273,7 @@ class NamedStepEquations(ReprMixin):
         if len(said) == 2:
             at = _place(said[1], self.column_names, "column", self.column_blocks)
             expression, column = ca.jacobian(expression, self.column_symbols[at]), self.column_names[at]
-        made = format_expressions([expression], self.column_symbols, self.column_display_names)
+        made = format_expressions([expression], self.column_symbols, self.column_names)
         used = self._summarize_columns(made.variable_indices)
         return EquationOrDerivativeFormula(self.row_names[row], column, made, used, expression)
 
@@ -356,11 +307,6 @@ class NamedStepEquations(ReprMixin):
             "",
             *(f"{b.name} ({b.meaning}): {', '.join(b.full_names)}" for b in blocks),
         ]
-
-
-def escape_latex(name: str) -> str:
-    """Escape LaTeX's special characters in a name."""
-    return "".join("\\" + letter if letter in "_%#&${}" else letter for letter in name)
 
 
 def _headline(title: str, count: int, variables: Sequence[str]) -> str:

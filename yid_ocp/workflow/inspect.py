@@ -18,7 +18,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.display import Progress
 from yid_ocp.errors import ModelError
-from yid_ocp.export.equations import export_step_functions, write_equation_sheet
+from yid_ocp.export.equations import export_step_functions
 from yid_ocp.files import named_attributes
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
@@ -83,9 +83,7 @@ def _run_inspect(
         nlp = None if problem is None else _nlp(symbols, problem, pictures[1])
         files: tuple[Path, ...] = ()
         if export is not None:
-            sheet = Path(export) / "equations.tex"
-            files = (*export_step_functions(symbols, Path(export), point.theta, step.time_step), sheet)
-            write_equation_sheet(sheet, symbols, point.theta, free, step.time_step)
+            files = export_step_functions(symbols, Path(export), point.theta, step.time_step)
         dependences = _dependence(step, symbols, problem, point, rows)
         driven, prescribed = step.system.driven, step.system.prescribed
         roles = dict.fromkeys(driven, "driven") | dict.fromkeys(prescribed, "prescribed")
