@@ -108,9 +108,9 @@ def screening(settings: Sequence[str], count: int) -> dict[str, float]:
     before = peak()
     composed = AllCandidatesProblem.from_problem(problem, effects)
     nominal = fit_nominal_model(problem, composed)
-    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_grid_size)  # compiles
+    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_parameter_grid_size)  # compiles
     begun = time.process_time()
-    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_grid_size)
+    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_parameter_grid_size)
     return {"cpu": time.process_time() - begun, "memory": peak() - before, "candidates": len(effects)}
 
 

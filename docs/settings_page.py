@@ -80,7 +80,7 @@ def default(value: Any) -> str:
 
 EXAMPLES: Mapping[str, str] = {
     "virtual_arm": """\
-virtual_arm: {friction: load, max_relative_link_mass_error: 0.03, encoder_counts: 4096}
+virtual_arm: {friction: load, max_relative_link_mass_error: 0.03, encoder_counts_per_turn: 4096}
 """,
     **{section: text for kind in OBJECT_KINDS for section, text in OBJECT_KINDS[kind].settings_examples.items()},
     "The file": """\
@@ -222,7 +222,7 @@ track:
 """,
     "track.options": """\
 track:
-  options: {max_frame_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
+  options: {max_point_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
 """,
     "track.options.filters": """\
 track:
@@ -232,7 +232,7 @@ track:
     "track.options.skeleton": """\
 track:
   options:
-    skeleton: {neighbour_radius: 0.05, segment_neighbours: 30}     # [m]
+    skeleton: {neighbour_radius: 0.05, points_per_segment: 30}     # [m]
 """,
     "track.options.shape_fit": """\
 track:

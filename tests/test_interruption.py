@@ -22,7 +22,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 folder = Path(sys.argv[1])
 folder.mkdir()
 try:
-    with interruption.raise_on_signals(), interruption.remove_folder_on_forced_exit(folder):
+    with interruption.raise_on_termination_signals(), interruption.remove_folder_on_forced_exit(folder):
 {body}
 except interruption.InterruptedBySignal as error:
     print("ENDED", error, flush=True)
@@ -52,7 +52,7 @@ SWALLOWING = f"try:\n    {READY}\n    time.sleep(20)\nexcept BaseException:\n   
     [
         *((f"{READY}\ntime.sleep(20)", name) for name in ("SIGINT", "SIGTERM", "SIGHUP")),
         pytest.param(f"{SWALLOWING}time.sleep(20)", "SIGINT", id="swallowed, raised again"),
-        pytest.param(f"{SWALLOWING}interruption.raise_if_requested()\nprint('LOST')", "SIGTERM", id="looked for"),
+        pytest.param(f"{SWALLOWING}interruption.raise_if_interrupted()\nprint('LOST')", "SIGTERM", id="looked for"),
     ],
 )
 def test_a_signal_is_raised_by_its_name_also_where_it_was_swallowed(tmp_path, body, name):
@@ -76,7 +76,7 @@ def test_a_deferred_block_ends_first(tmp_path):
 def test_handlers_are_put_back_and_a_second_use_is_new():
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for _ in range(2):
-        with pytest.raises(interruption.InterruptedBySignal), interruption.raise_on_signals():
+        with pytest.raises(interruption.InterruptedBySignal), interruption.raise_on_termination_signals():
             signal.raise_signal(signal.SIGTERM)
         assert interruption.received_signal_number() is None
     assert {number: signal.getsignal(number) for number in before} == before
@@ -87,7 +87,7 @@ def test_other_threads_do_without():
     done = []
 
     def work():
-        with interruption.raise_on_signals():
+        with interruption.raise_on_termination_signals():
             done.append(True)
 
     thread = threading.Thread(target=work)

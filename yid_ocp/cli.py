@@ -486,7 +486,7 @@ def _parsed_and_carried_out(argv: Sequence[str] | None, as_json: bool) -> int:
     except ConfigError as error:
         return _wrong(error, as_json)
     try:
-        with interruption.raise_on_signals(), _notices():
+        with interruption.raise_on_termination_signals(), _notices():
             return _carried_out(arguments, as_json)
     except KeyboardInterrupt as error:
         what = f"interrupted ({str(error) or 'SIGINT'}); nothing half-finished was left"
@@ -514,7 +514,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
                 gc.enable()
         code = int(run(arguments))
         sys.stdout.flush()
-        interruption.raise_if_requested()
+        interruption.raise_if_interrupted()
         return code
     except Exception as error:
         number = interruption.received_signal_number()

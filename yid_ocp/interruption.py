@@ -43,7 +43,7 @@ def received_signal_number() -> int | None:
     return _STATE.asked
 
 
-def raise_if_requested() -> None:
+def raise_if_interrupted() -> None:
     """Raise `InterruptedBySignal` if a signal has requested the end of the command but a library suppressed it."""
     if _STATE.asked is not None:
         raise InterruptedBySignal(_STATE.asked)
@@ -73,7 +73,7 @@ def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def raise_on_signals() -> Iterator[None]:
+def raise_on_termination_signals() -> Iterator[None]:
     """Raise `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during a block (context manager).
 
     The exception is raised again every `_RERAISE_INTERVAL` seconds, because it can be lost in garbage collection, in

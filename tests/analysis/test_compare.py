@@ -173,7 +173,7 @@ def compared(monkeypatch):
 
         monkeypatch.setattr(module, "solve", solve)
         monkeypatch.setattr(estimation, "solve", whole)
-        monkeypatch.setattr(estimation, "with_intervals_and_checks", lambda _, made: replace(made, message="checked"))
+        monkeypatch.setattr(estimation, "add_intervals_and_checks", lambda _, made: replace(made, message="checked"))
         monkeypatch.setattr(
             module, "solution_with_profile_intervals", lambda _, made: replace(made, message="profiled")
         )

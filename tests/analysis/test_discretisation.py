@@ -25,13 +25,13 @@ from yid_ocp.analysis.discretisation import (
     largest_alternating_error_growth,
     longest_accurate_time_step,
     measure_discretisation_shifts,
-    refitted_residual_at_finer_step,
+    predicted_refit_residual_at_finer_step,
 )
 from yid_ocp.analysis.estimation import _checked_solution_and_step_stability
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step, copy_of_step_with_time_step, simulate
+from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -215,11 +215,9 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     drawn = replace(drawn, joints=replace(drawn.joints, **levels), points=(points,))
     free, gains = ("elbow.damping", "elbow.stiffness"), (9.0,)
     options = ProblemOptions(arm_tracking_feedback=feedback, arm_tracking_feedback_gains=gains)
-    truth = EstimationProblem(copy_of_step_with_time_step(step, 0.0025), [drawn], free, options)
+    truth = EstimationProblem(step_with_time_step(step, 0.0025), [drawn], free, options)
     recording = truth.simulate_synthetic_recording(seed=1)
-    coarse, anew = (
-        EstimationProblem(copy_of_step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02)
-    )
+    coarse, anew = (EstimationProblem(step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02))
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
     found, finer = (solve(problem, GaussNewton()) for problem in (coarse, anew))
@@ -230,7 +228,9 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     assert np.abs(change).max() > 2
     np.testing.assert_allclose([own[name] for name in free] / std, change, rtol=0.1, atol=0.05)
     # what it leaves is what a fit with that step leaves
-    np.testing.assert_array_equal(refitted_residual_at_finer_step(fine, found.problem, found.x, found.evaluation), left)
+    np.testing.assert_array_equal(
+        predicted_refit_residual_at_finer_step(fine, found.problem, found.x, found.evaluation), left
+    )
     assert left @ left == pytest.approx(2 * finer.evaluation.cost, rel=0.02)
 
 
@@ -245,7 +245,7 @@ def test_a_brisk_motion_has_a_shorter_step_than_a_calm_one(urdf_folder):
         joints = replace(drawn.joints, effort_kind="command", effort_std=0.01, **moved)
         drawn = replace(drawn, joints=joints, points=points)
         options = ProblemOptions(arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,))
-        truth = EstimationProblem(copy_of_step_with_time_step(step, 0.00125), [drawn], ("elbow.stiffness",), options)
+        truth = EstimationProblem(step_with_time_step(step, 0.00125), [drawn], ("elbow.stiffness",), options)
         recording = truth.simulate_synthetic_recording(seed=1)
         problem = EstimationProblem(step, [recording], ("elbow.stiffness",), options)
         h = longest_accurate_time_step(problem)

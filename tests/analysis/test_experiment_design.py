@@ -16,8 +16,8 @@ from yid_ocp.analysis import torque_error_propagation as propagation
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    CandidateExperimentSensitivities,
-    CandidateExperimentSensitivityBuilder,
+    ExperimentVariantSensitivities,
+    ExperimentVariantSensitivityBuilder,
     FrameObservationSchedule,
     RecordedExperiment,
     extended_step_and_observable_frames,
@@ -100,7 +100,7 @@ def sloped():
     rng = np.random.default_rng(3)
     slopes = {(i, "camera", frame): rng.standard_normal((5, 3, 2)) for i in range(3) for frame in ("a", "b")}
     problem = SimpleNamespace(episodes=[SimpleNamespace(grid=TimeGrid(10.0, 0.5, 4))] * 3)
-    return CandidateExperimentSensitivities(problem, np.zeros(2), ("p", "q"), slopes, np.diag([7.0, 0.0]))
+    return ExperimentVariantSensitivities(problem, np.zeros(2), ("p", "q"), slopes, np.diag([7.0, 0.0]))
 
 
 def view(times, std, frame="a"):
@@ -188,7 +188,7 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     base = RecordedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
-    assert CandidateExperimentSensitivityBuilder(base).applicable_mechanical_changes() == possible.split()
+    assert ExperimentVariantSensitivityBuilder(base).applicable_mechanical_changes() == possible.split()
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +213,7 @@ def swung(urdf_folder):
 
 def built(problem, *mechanics, heard=None, **settings):
     """The builder of a problem's variants, and the variant with these changes."""
-    made = CandidateExperimentSensitivityBuilder(
+    made = ExperimentVariantSensitivityBuilder(
         RecordedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
     )
     found = made.build_sensitivities(frozenset(mechanics))
@@ -248,7 +248,7 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     problem = swung()
     x = np.array([np.nan, 0.1])
-    found = CandidateExperimentSensitivityBuilder(RecordedExperiment(problem, x)).build_sensitivities(frozenset())
+    found = ExperimentVariantSensitivityBuilder(RecordedExperiment(problem, x)).build_sensitivities(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
@@ -494,7 +494,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
 
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
-    builder = CandidateExperimentSensitivityBuilder(RecordedExperiment(noisy, noisy.initial_unknowns))
+    builder = ExperimentVariantSensitivityBuilder(RecordedExperiment(noisy, noisy.initial_unknowns))
     made = builder.build_sensitivities(frozenset({"motion"}))
     assert not isinstance(made, str), made
     own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors

@@ -210,7 +210,7 @@ def test_one_measurement_listed_twice_is_told_also_in_part():
     assert duplicate_data_issue(RECORDING, made(2)) is None
 
 
-def encoder_counts(seed: int, n: int = 3000) -> Recording:
+def encoder_counts_per_turn(seed: int, n: int = 3000) -> Recording:
     """A slow motion of one joint, read to a 4096th of a turn at uneven times."""
     rng = np.random.default_rng(seed)
     t = np.cumsum(0.0053 + 0.0005 * rng.uniform(-1, 1, n))
@@ -221,7 +221,7 @@ def encoder_counts(seed: int, n: int = 3000) -> Recording:
 
 def test_the_step_of_an_encoder_is_noise_of_its_variance_stated_or_seen_in_gaps_between_values():
     step, unstated = 2 * np.pi / 4096, SensorOptions()
-    seen = encoder_counts(1, n=400).joints
+    seen = encoder_counts_per_turn(1, n=400).joints
     assert joint_angle_noise_std(replace(seen, position_std=0.0), ("a",), unstated, "") == pytest.approx(step / 12**0.5)
     both = replace(seen, position_std=3e-4, position_resolution=1e-3)
     assert joint_angle_noise_std(both, ("a",), unstated, "") == pytest.approx(np.hypot(3e-4, 1e-3 / 12**0.5))
@@ -232,7 +232,7 @@ def test_the_step_of_an_encoder_is_noise_of_its_variance_stated_or_seen_in_gaps_
 
 
 def test_equal_counts_of_an_encoder_are_no_second_copy_but_a_copied_stretch_is():
-    one, other = encoder_counts(1), encoder_counts(2)
+    one, other = encoder_counts_per_turn(1), encoder_counts_per_turn(2)
     assert np.isin(other.joints.position, one.joints.position).mean() > 0.8
     assert duplicate_data_issue(one, other) is None
     steady = replace(one, joints=replace(one.joints, t=0.005 * np.arange(3000)))

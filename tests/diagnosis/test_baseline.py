@@ -10,7 +10,7 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, _estimated_without, with_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, _estimated_without, add_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -33,8 +33,8 @@ recordings: {estimate: [bare.h5]}
 parameters:
   beam.bend: {free: true, initial: 0.015}
   beam.damping: {free: true, initial: 8.0e-5}
-problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, initial_configuration_std: 0.2,
-          initial_velocity_std: 3.0}
+problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, initial_configuration_prior_std: 0.2,
+          initial_velocity_prior_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
 output: {write_report: false, checked_discretisations: none}
 """
@@ -130,7 +130,7 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     std = alone.std["beam.bend"] * times
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
-    both = refit_with_effects(AllCandidatesProblem(with_baseline_prior(problem, known), (), False), (), {})
+    both = refit_with_effects(AllCandidatesProblem(add_baseline_prior(problem, known), (), False), (), {})
     [shift] = EarlierRunsBaseline.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:

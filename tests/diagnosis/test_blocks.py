@@ -18,7 +18,9 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 def swinging(urdf_folder):
     """A pendulum let go, with dry friction in the elbow that the model does not know."""
     step, record = swinging_pendulum(urdf_folder, ("joint_coulomb", "elbow", {"tau_c": 0.02}))
-    options = ProblemOptions(initial_state="estimated", initial_configuration_std=0.5, initial_velocity_std=2.0)
+    options = ProblemOptions(
+        initial_state="estimated", initial_configuration_prior_std=0.5, initial_velocity_prior_std=2.0
+    )
     return EstimationProblem(step, [record(1, 400, 0.4, 1e-3)], ("elbow.damping", "shoulder.damping"), options)
 
 

@@ -20,9 +20,9 @@ from yid_ocp.diagnosis.select import (
     _near_best_models,
     _pairs_to_refit,
     _refit_shortlist,
+    bic_difference,
     held_out_gap_closure,
     held_out_improvement,
-    penalized_chi2_excess_over,
     select_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -509,7 +509,7 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     spring, offset = (replace(own, residual_count=100) for own in (spring, offset))
     assert held_out_improvement(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
-    assert penalized_chi2_excess_over(offset, spring) == pytest.approx(4.0 - math.log(100.0))
+    assert bic_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
     assert near(spring, offset) == ["offset@elbow", "spring@elbow"]
     assert near(spring, replace(offset, cost=101.5)) == ["spring@elbow", "offset@elbow"]
     # up to odds of 150 to 1

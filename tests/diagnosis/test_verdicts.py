@@ -14,7 +14,7 @@ from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.display import Progress
 from yid_ocp.errors import YidError
-from yid_ocp.integrator.step import copy_of_step_with_time_step
+from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
 FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
@@ -118,7 +118,7 @@ def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench,
     """Steps four times as long as those of the recordings; refits of the finer step have names of their own."""
     own = {"joint_coulomb@elbow": friction} if friction else {}
     recordings = [bench.recording(own, seed, duration=3.0) for seed in (1, 2)]
-    coarse, names = Bench(bench.system, copy_of_step_with_time_step(bench.step, 0.04)), []
+    coarse, names = Bench(bench.system, step_with_time_step(bench.step, 0.04)), []
     known = NominalSolutionAndRefitStore(
         store=SimpleNamespace(get=lambda name: None, put=lambda name, fit: names.append(name))
     )

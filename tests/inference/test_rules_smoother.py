@@ -224,7 +224,7 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
         less = Dense(models, found.group_variance | {source: 0.0}).log_evidence
         assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
     assert found.plant_or_sensor_origin == "both"
-    assert sum(v > 0 for v in smoothed(monkeypatch, models, max_unknown_groups=2).group_variance.values()) == 2
+    assert sum(v > 0 for v in smoothed(monkeypatch, models, max_smoother_unknown_groups=2).group_variance.values()) == 2
     assert not any(smoothed(monkeypatch, models, min_log_bayes_factor=1e6).group_variance.values())
 
 

@@ -31,6 +31,7 @@ from yid_ocp.inference.uncertainty import (
     _cost_checked_std,
     _misfit_sandwich_covariance,
     _score_covariance,
+    apply_profile_interval,
     assess_goodness_of_fit,
     misfit_robust_covariance,
     needs_no_profile_likelihood,
@@ -38,7 +39,6 @@ from yid_ocp.inference.uncertainty import (
     parameter_verdict,
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
-    with_profile_interval,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.options import ExcessResidualCriteria
@@ -72,7 +72,7 @@ def stiffness(value, std, said):
     ],
 )
 def test_no_verdict_and_no_spread_contradicts_a_profile(value, std, said, interval, expected, spread):
-    found = with_profile_interval(stiffness(value, std, said), interval, 10.0)
+    found = apply_profile_interval(stiffness(value, std, said), interval, 10.0)
     assert (found.verdict, found.interval, found.value) == (expected, interval, value)
     assert found.std == pytest.approx(spread, rel=1e-12)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.step import compile_step, copy_of_step_with_time_step, simulate
+from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import NewtonStatusCode
 from yid_ocp.model import Grasp, Parameters, Segment, StepTerms, System, flexible_object
 from yid_ocp.model.mechanism import Inertia
@@ -290,7 +290,7 @@ def test_wrong_shapes_name_the_array(parts, urdf_folder, change, words):
 def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
     system = parts.cable()
     coarse, expected = (compile_step(system, h, use_compiler=use_compiler) for h in (4e-3, 1e-4))
-    fine = copy_of_step_with_time_step(coarse, 1e-4)
+    fine = step_with_time_step(coarse, 1e-4)
     assert fine.model.tolerance == expected.model.tolerance < coarse.model.tolerance
     state, theta = np.concatenate([BENT, np.zeros(9)]), system.parameters.vector()
     names = ("C.bend", "C.twist")
@@ -303,7 +303,7 @@ def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
     assert coarse.time_step == 4e-3
     assert np.max(np.abs(coarse(*at)[0] - made[0])) > 1e-6
     with pytest.raises(ModelError, match="time_step = 0"):
-        copy_of_step_with_time_step(coarse, 0.0)
+        step_with_time_step(coarse, 0.0)
 
 
 PULL, WEIGHT = 100.0, 9.81  # [N]

@@ -177,7 +177,7 @@ def test_damping_is_right_where_markers_are_half_a_millisecond_late(tmp_path):
     late = [swung(0.0005, frequency, i) for i, frequency in enumerate((0.9, 1.4))]
     truth, found = {"elbow.stiffness": 3.0, "elbow.damping": 0.02}, {}
     for std in (0.0, None):
-        sensors = {"joints.position": SensorOptions(std=1e-4), "points": SensorOptions(std=5e-4, clock_std=std)}
+        sensors = {"joints.position": SensorOptions(std=1e-4), "points": SensorOptions(std=5e-4, clock_offset_std=std)}
         told = ProblemOptions(path_cutoff=20.0, sensors=sensors, has_uncertain_point_clocks=True)
         solution = solve(EstimationProblem(compile_step(system, 0.005), late, tuple(truth), told), GaussNewton())
         entries = {name: solution.parameters[name] for name in truth}
@@ -188,7 +188,7 @@ def test_damping_is_right_where_markers_are_half_a_millisecond_late(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("free", "effects", "clock_std", "group", "expected"),
+    ("free", "effects", "clock_offset_std", "group", "expected"),
     [
         ("elbow.damping", (), None, "points_mocap", H / 2),
         ("elbow.mass", (), None, "points_mocap", None),
@@ -199,9 +199,12 @@ def test_damping_is_right_where_markers_are_half_a_millisecond_late(tmp_path):
     ],
     ids=["half a sample", "no damper is free", "the arm's", "one clock", "as stated", "an effect of the model says it"],
 )
-def test_a_clock_is_uncertain_where_dampers_are_free(urdf_folder, free, effects, clock_std, group, expected):
+def test_a_clock_is_uncertain_where_dampers_are_free(urdf_folder, free, effects, clock_offset_std, group, expected):
     step = pendulum_step(urdf_folder, effects, prescribed=tuple(BIAS))
-    sensors = {"joints.position": SensorOptions(std=1e-4), "points_mocap": SensorOptions(clock_std=clock_std)}
+    sensors = {
+        "joints.position": SensorOptions(std=1e-4),
+        "points_mocap": SensorOptions(clock_offset_std=clock_offset_std),
+    }
     told = ProblemOptions(sensors=sensors, has_uncertain_point_clocks=True)
     made = taken(step, 3, efforts=False, camera=False)
     made = replace(made, points=(replace(made.points[0], name=group),))

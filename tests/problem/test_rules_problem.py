@@ -87,7 +87,9 @@ def test_start_bounds_and_values_by_name(make):
 
 def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, free_step):
     """The momentum's prior is that of a velocity times the inertia at the joint."""
-    problem = make(initial_state="estimated", initial_configuration_std=0.07, initial_velocity_std=0.3, seeds=(1,))
+    problem = make(
+        initial_state="estimated", initial_configuration_prior_std=0.07, initial_velocity_prior_std=0.3, seeds=(1,)
+    )
     theta = free_step.system.parameters.vector()
     inertia = [momentum(free_step, np.zeros(2), velocity, theta)[i] for i, velocity in enumerate(np.eye(2))]
     # two rods: 1/3 m l^2 and more about the shoulder
@@ -266,8 +268,8 @@ def held(free_step, make, roll):
 def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, configuration, velocity):
     options = {
         "initial_state": "estimated",
-        "initial_configuration_std": configuration,
-        "initial_velocity_std": velocity,
+        "initial_configuration_prior_std": configuration,
+        "initial_velocity_prior_std": velocity,
     }
     problem = make(held_out=held, **options)
     x = problem.initial_unknowns

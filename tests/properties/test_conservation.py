@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from yid_ocp.integrator.step import compile_step, copy_of_step_with_time_step
+from yid_ocp.integrator.step import compile_step, step_with_time_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import mass_matrix
 from yid_ocp.model.system import floating_joint_mechanism
@@ -141,7 +141,7 @@ def slopes(motion, split, roll, momentum):
         assert rollout.status.is_converged, rollout.status.message
         return rollout.state[-1, :n], rollout.state[-1, n : 2 * n]
 
-    ends = [finish(copy_of_step_with_time_step(plain, duration / count), count) for count in counts]
+    ends = [finish(step_with_time_step(plain, duration / count), count) for count in counts]
     count = 8 * counts[-1]
     reference = finish(compile_step(system, duration / count, "symmetric"), count)
     errors = [[np.linalg.norm(a - b) for a, b in zip(end, reference, strict=True)] for end in ends]

@@ -79,7 +79,7 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
         (["track.frames_path=nowhere"], "no such file or folder"),
         (["recordings.estimate=[]"], "no recording with the joint angles"),
         (["track.camera_pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
-        (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_frame_distance_in_radii'"),
+        (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_point_distance_in_radii'"),
         (["track.options.filters.robot_padding=-1"], "robot_padding = -1"),
     ],
 )

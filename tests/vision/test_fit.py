@@ -8,8 +8,8 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import ShapeFitOptions, ShapeFitter
 from yid_ocp.vision.fit import _NODE_RADIUS_FRACTION, _Task
-from yid_ocp.vision.initial_shapes import ObservedObjectEnd
 from yid_ocp.vision.shape_evidence import ProcessedFrameCloud
+from yid_ocp.vision.shape_guesses import ObservedObjectEnd
 
 CAMERA = np.array([2.6, 0.0, 0.45])
 NODES = 4  # of every link

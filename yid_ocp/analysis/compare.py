@@ -123,7 +123,7 @@ def compare_methods(
         able: Solver = next((solver for solver in solvers if uses_process_noise_covariance(solver)), GaussNewton())
         judged = estimation.solve(whole, able, callback=listener(_SOLVE_LABEL))
     else:
-        judged = estimation.with_intervals_and_checks(problem, best.solution)
+        judged = estimation.add_intervals_and_checks(problem, best.solution)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
     explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.has_process_noise))
     return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)

@@ -18,7 +18,7 @@ from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, Param
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step, compile_step, copy_of_step_with_time_step, simulate
+from yid_ocp.integrator.step import Step, compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -127,7 +127,7 @@ def _gauss_newton_step_in_finer_model(
     return {name: moved[name] / factor for name, factor in factors.items()}, residual + jacobian @ step
 
 
-def refitted_residual_at_finer_step(
+def predicted_refit_residual_at_finer_step(
     fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> Array | None:
     """Predict the whitened residual of a fit with a shorter time step, or return None if the prediction fails.
@@ -243,7 +243,7 @@ def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> _F
         return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
     recordings = [episode.recording for episode in problem.episodes]
     steps, factors = sum(e.grid.steps for e in problem.episodes), options.divided_links_model.parameter_factors
-    step = copy_of_step_with_time_step(
+    step = step_with_time_step(
         options.divided_links_model.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE),
         problem.step.time_step,
     )
@@ -346,7 +346,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_frame_distance_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
     `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths.

@@ -65,12 +65,12 @@ def solve(
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.solve(problem, solver, initial_unknowns, callback, limits)
     safe = choose_cable_memory_fit(problem, solver, found, limits)
-    solution = with_intervals_and_checks(safe.problem, safe.solution, progress)
+    solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
     checks = replace(solution.checks or EstimateChecks(), cable_memory_message=safe.message)
     return replace(solution, checks=checks)
 
 
-def with_intervals_and_checks(
+def add_intervals_and_checks(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
     """Complete a fit with profile intervals, the error of the discretisation and `checks`. See `solve`."""

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns_by_name, with_nuisance_unknowns
+from yid_ocp.analysis.identifiability import InitialStateKnowledge, add_nuisance_unknowns, transfer_unknowns_by_name
 from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_sensor_fisher_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -174,7 +174,7 @@ def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_Observa
 
 
 @dataclass
-class CandidateExperimentSensitivities:
+class ExperimentVariantSensitivities:
     """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
@@ -228,15 +228,15 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 }
 
 
-class CandidateExperimentSensitivityBuilder:
+class ExperimentVariantSensitivityBuilder:
     """Builds and caches experiment variants for sets of mechanical changes."""
 
     def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
         self._progress = progress
-        self._layouts: dict[frozenset[str], CandidateExperimentSensitivities | str] = {}
+        self._layouts: dict[frozenset[str], ExperimentVariantSensitivities | str] = {}
 
-    def build_sensitivities(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
+    def build_sensitivities(self, mechanics: frozenset[str]) -> ExperimentVariantSensitivities | str:
         """Compute the sensitivities for the mechanical changes `mechanics`, or return a message if that fails."""
         if mechanics not in self._layouts:
             if mechanics:
@@ -258,7 +258,7 @@ class CandidateExperimentSensitivityBuilder:
         applies = {"weld": loose, "second_arm": second, "motion": moves, "travel": moves}
         return [name for name, does in (applies | {"torque": bool(robot) and not measured}).items() if does]
 
-    def _build(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities:
+    def _build(self, mechanics: frozenset[str]) -> ExperimentVariantSensitivities:
         setting, base = self.setting, self.setting.problem
         system, recordings, notes = self._experiment(mechanics)
         if "torque" in mechanics:
@@ -266,7 +266,7 @@ class CandidateExperimentSensitivityBuilder:
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
         step, seen = extended_step_and_observable_frames(step)
-        wide = with_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
+        wide = add_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
         dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]
@@ -290,7 +290,7 @@ class CandidateExperimentSensitivityBuilder:
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
         # priors of the parameters are excluded: the result is the information of the sensors
         stated[:, [problem.unknown_names.index(name) for name in names]] = 0.0
-        return CandidateExperimentSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
+        return ExperimentVariantSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
 
     def _joint_sensors(self, mechanics: frozenset[str]) -> dict[str, SensorOptions]:
         given = self.setting.problem.options.sensors

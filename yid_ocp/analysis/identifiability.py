@@ -34,6 +34,7 @@ from yid_ocp.inference.uncertainty import (
     MIN_RELATIVE_STD_TAKEN_AS_INFINITE,
     VERDICT_TABLE_TEXTS,
     ParameterEstimate,
+    apply_profile_interval,
     assess_goodness_of_fit,
     finite_or_none,
     misfit_robust_covariance,
@@ -44,7 +45,6 @@ from yid_ocp.inference.uncertainty import (
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
     value_and_uncertainty_text,
-    with_profile_interval,
 )
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.model.system import System
@@ -169,7 +169,7 @@ def identifiability(
         said = unknown_name_error_arguments(name, names)
         raise ConfigError(f"'{name}' is not a free parameter", where="intervals", **said)
     given = unknowns_from_solution(problem, solution)
-    wide = with_nuisance_unknowns(problem, start, grasp_std)
+    wide = add_nuisance_unknowns(problem, start, grasp_std)
     x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
     # the matrices are small: threads of the linear algebra library cost more than they gain
     with threadpoolctl.threadpool_limits(1):
@@ -211,7 +211,7 @@ def _profiles(
         index, size, entry = problem.unknown_names.index(name), sizes[name.split("[")[0]], judged[name]
         found = compute_profile_likelihood_interval(problem, best, index, float(entry.std), there)
         said = mark_unidentifiable_near_zero_estimate(problem, best, index, entry, size, there)
-        return found, with_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
+        return found, apply_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
     pairs = call_for_each_parameter_at_optimum(one, problem, view.x, wanted, progress)
@@ -245,7 +245,7 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
     return x
 
 
-def with_nuisance_unknowns(
+def add_nuisance_unknowns(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
     """Return the problem with unknown initial states (if `start` is "unknown") and grasp offsets (if `grasp_std`)."""

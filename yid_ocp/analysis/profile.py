@@ -20,12 +20,12 @@ from yid_ocp.inference.uncertainty import (
     CHI2_95_TWO_SIDED,
     ConfidenceInterval,
     ParameterEstimate,
+    apply_profile_interval,
     cost_without_weak_priors,
     needs_no_profile_likelihood,
     parameter_unknown_names,
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
-    with_profile_interval,
 )
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
@@ -119,7 +119,7 @@ def solution_with_profile_intervals(
         entry = mark_unidentifiable_near_zero_estimate(problem, best, index, solution.parameters[name], size, there)
         if entry.verdict != "not_identifiable" and not needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
-            entry = with_profile_interval(entry, profile.interval, size)
+            entry = apply_profile_interval(entry, profile.interval, size)
         return entry
 
     # each parameter takes about one and a half times as long as the solution

@@ -14,8 +14,8 @@ from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
     MECHANICAL_CHANGE_DESCRIPTIONS,
-    CandidateExperimentSensitivities,
-    CandidateExperimentSensitivityBuilder,
+    ExperimentVariantSensitivities,
+    ExperimentVariantSensitivityBuilder,
     FrameObservationSchedule,
     RecordedExperiment,
     observable_frames,
@@ -73,7 +73,7 @@ class ChangedExperimentResult:
 
 
 @dataclass(frozen=True, repr=False)
-class ExperimentRanking(ReprMixin):
+class ExperimentChangeRanking(ReprMixin):
     """Changes of an experiment, ranked by the number of parameters that they make identifiable.
 
     `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
@@ -96,7 +96,7 @@ class ExperimentRanking(ReprMixin):
 
 
 # From sets of changes and a factor on the stated variances to the predicted results, one for each set.
-ChangeSetEvaluator = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
+ExperimentChangeSetEvaluator = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
 
 
 def what_if(
@@ -108,8 +108,8 @@ def what_if(
     two_arm_system: System | None = None,
     considered_changes: Collection[str] | None = None,
     progress: Progress = NULL_PROGRESS,
-    evaluate_changes: ChangeSetEvaluator | None = None,
-) -> ExperimentRanking:
+    evaluate_changes: ExperimentChangeSetEvaluator | None = None,
+) -> ExperimentChangeRanking:
     """Rank changes of an experiment by the number of parameters that they make identifiable, without new measurements.
 
     A new sensor observes the simulation of the recorded motion, in which the tracking filter keeps the arms on that
@@ -141,7 +141,7 @@ def what_if(
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
     greedy = _greedy(outcomes, changes, base)
     smallest = _rank_results(_smallest(outcomes, changes, base))
-    return ExperimentRanking(base, tuple(singles), tuple(smallest), tuple(greedy), len(outcomes.known))
+    return ExperimentChangeRanking(base, tuple(singles), tuple(smallest), tuple(greedy), len(outcomes.known))
 
 
 def evaluate_experiment_change_sets(
@@ -204,10 +204,10 @@ class _Outcomes:
         setting: RecordedExperiment,
         inflation: float,
         progress: Progress = NULL_PROGRESS,
-        judge: ChangeSetEvaluator | None = None,
+        judge: ExperimentChangeSetEvaluator | None = None,
     ) -> None:
         self.setting, self.inflation, self.progress = setting, inflation, progress
-        self.builder = CandidateExperimentSensitivityBuilder(setting, progress)
+        self.builder = ExperimentVariantSensitivityBuilder(setting, progress)
         self.judge = judge or self._judged
         self.known: dict[frozenset[str], ChangedExperimentResult] = {}
 
@@ -264,7 +264,7 @@ class _Outcomes:
         return ChangedExperimentResult(names, words, std, verdicts, count, gain, "; ".join(layout.feasibility_notes))
 
     def _views(
-        self, episode: Episode, changes: Sequence[ExperimentChange], layout: CandidateExperimentSensitivities
+        self, episode: Episode, changes: Sequence[ExperimentChange], layout: ExperimentVariantSensitivities
     ) -> list[FrameObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_point_group_times_and_std(episode)
@@ -291,7 +291,7 @@ class _Outcomes:
 
 
 def _relative_stds_and_gain(
-    layout: CandidateExperimentSensitivities, information: Array
+    layout: ExperimentVariantSensitivities, information: Array
 ) -> tuple[dict[str, float], float]:
     """Relative standard deviation of every free parameter, and the gain, from the information of all unknowns."""
     problem, x = layout.problem, layout.x

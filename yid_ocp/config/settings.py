@@ -134,7 +134,7 @@ class JointActuationSettings:
     exclude_links: Annotated[
         _Names, OptionInfo("links of the URDF to remove with their subtrees, such as a hand that is not mounted")
     ] = ()
-    link_mass_std: Annotated[
+    relative_link_mass_std: Annotated[
         float,
         Ge(0),
         Lt(0.3),

@@ -74,7 +74,7 @@ class EarlierRunsComparison:
         return tuple(sorted(changed, key=lambda entry: entry.p_value))
 
 
-def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
+def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
     """Return the problem with a baseline's estimates as a joint prior, in which the baseline's parameters are free.
 
     Raises `ConfigError` if the model lacks a parameter or effect of the baseline, or if a parameter differs between

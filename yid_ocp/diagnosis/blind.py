@@ -30,8 +30,8 @@ from yid_ocp.virtual.injected import (
     INJECTABLE_EFFECT_KINDS,
     OUT_OF_LIBRARY_FORCE_BUILDERS,
     InjectedEffect,
-    ordinary_friction_range,
     run_experiment_with_effects,
+    typical_friction_amplitude_range,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -255,7 +255,7 @@ class BlindCaseGenerator:
         for effect in self._ordinary_friction:
             drawn |= {name: start[name] for name in effect.shape_parameter_names}
             for name in effect.amplitude_parameter_names:
-                drawn[name] = rng.uniform(*ordinary_friction_range(effect, system))
+                drawn[name] = rng.uniform(*typical_friction_amplitude_range(effect, system))
         return {name: float(value) for name, value in drawn.items()}
 
     @property
@@ -286,7 +286,7 @@ class BlindCaseGenerator:
         is_held = self.conditions.ordinary_friction is not None
         conditions = replace(self.conditions, ordinary_friction=tuple(friction) if is_held else None)
         conditions = replace(conditions, is_brisk=planned is not None and planned.is_brisk)
-        made = simulate_random_motion(nominal, system, posture, own, values, injected, rng, conditions)
+        made = record_random_motion(nominal, system, posture, own, values, injected, rng, conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
     def _linearize_clean_recordings(self) -> AllCandidatesLinearization:
@@ -302,7 +302,7 @@ class BlindCaseGenerator:
         nominal = fit_nominal_model(problem, composed, limits=self._limits)
         # whitened by all noise, including torque noise
         composed = replace(composed, problem=nominal.problem)
-        return linearize_candidates(composed, (), nominal.values, self._limits.shape_grid_size)
+        return linearize_candidates(composed, (), nominal.values, self._limits.shape_parameter_grid_size)
 
     @cached_property
     def _detectable(self) -> tuple[_Detectable, ...]:
@@ -433,7 +433,7 @@ class BlindCaseGenerator:
         return float(np.nanmax(np.abs(recorded.effort[:, recorded.names.index(joint)])))
 
 
-def simulate_random_motion(
+def record_random_motion(
     nominal: System,
     simulated: System,
     posture: Mapping[str, float],

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.discretisation import refitted_residual_at_finer_step
+from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnosis_messages import (
     diagnosis_summary_text,
     held_out_truncation_message,
@@ -27,7 +27,7 @@ from yid_ocp.diagnosis.diagnosis_messages import (
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
-    KEPT_HELD_OUT_DURATION_FRACTIONS,
+    SIMULATED_DURATION_FRACTIONS_TO_KEEP,
     AllCandidatesProblem,
     CandidateNamesOrAll,
     TruncatedHeldOutRecording,
@@ -112,7 +112,7 @@ def diagnose(
         Default: the package's log.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline, optional
         Estimates of earlier runs of the same model (`read_estimates`), used as priors, so that changes since then are
-        diagnosed. A problem that already has these priors (`with_baseline_prior`) is used as it is. An
+        diagnosed. A problem that already has these priors (`add_baseline_prior`) is used as it is. An
         `EarlierRunsBaseline` can also hold reference recordings made without the sought effects; these are predicted
         with the found effects removed.
 
@@ -129,7 +129,7 @@ def diagnose(
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
         earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_runs(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
-            problem = with_baseline_prior(problem, earlier.combined_estimates)
+            problem = add_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, told)
         clock["compose"] = time.perf_counter()
         limits = thresholds or DEFAULT_THRESHOLDS
@@ -291,7 +291,7 @@ def _finer_step_that_explains_gap(
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
     finer = search.problem.with_time_step(h)
     fine = problem_corrected_for_events(finer.problem, events)
-    left = refitted_residual_at_finer_step(fine, fit.problem, fit.problem.vector(fit.values), fit.evaluation)
+    left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.problem.vector(fit.values), fit.evaluation)
     if left is None:
         return None
     excess, rest = (float(r @ r) - np.count_nonzero(r) for r in (fit.evaluation.residual, left))
@@ -396,7 +396,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = before
-    for margin in KEPT_HELD_OUT_DURATION_FRACTIONS:
+    for margin in SIMULATED_DURATION_FRACTIONS_TO_KEEP:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)

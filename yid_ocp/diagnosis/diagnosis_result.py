@@ -15,8 +15,8 @@ from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, Refitte
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.select import (
     GapClosure,
+    bic_difference,
     held_out_gap_closure,
-    penalized_chi2_excess_over,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
@@ -245,7 +245,7 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
         "behind": {
             fit.effects[-1].label: {
                 "left": fit.held_out_loss.chi2_per_sample,
-                "squares": penalized_chi2_excess_over(fit, alone[0]),
+                "squares": bic_difference(fit, alone[0]),
             }
             for fit in alone
         },

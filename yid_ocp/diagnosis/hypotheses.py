@@ -34,7 +34,7 @@ CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
 _BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
 _MIN_PREDICTED_DURATION = 1.0  # shortest beginning of a held-out recording that is worth predicting [s]
-KEPT_HELD_OUT_DURATION_FRACTIONS = (0.9, 0.5, 0.0)
+SIMULATED_DURATION_FRACTIONS_TO_KEEP = (0.9, 0.5, 0.0)
 """Fractions of the successful part of a rollout to keep, tried in order while the rollout still fails: before it
 fails, a model has already deviated, and a fit on a shorter recording may fail earlier."""
 

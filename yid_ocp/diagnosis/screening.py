@@ -76,10 +76,10 @@ class CandidateScore:
     p_value: float
 
 
-def _shape_grid(effect: EffectBase, count: int = DEFAULT_THRESHOLDS.shape_grid_size) -> list[dict[str, float]]:
+def _shape_grid(effect: EffectBase, size: int = DEFAULT_THRESHOLDS.shape_parameter_grid_size) -> list[dict[str, float]]:
     """Grid values of a candidate's shape parameters, uniform or log-uniform over the prior range."""
     ranges = {name: effect.prior_ranges[name] for name in effect.shape_parameter_names}
-    axes = [(np.geomspace if low > 0 else np.linspace)(low, high, count) for low, high in ranges.values()]
+    axes = [(np.geomspace if low > 0 else np.linspace)(low, high, size) for low, high in ranges.values()]
     return [dict(zip(ranges, map(float, point), strict=True)) for point in zip(*axes, strict=True)] or [{}]
 
 
@@ -87,7 +87,7 @@ def linearize_candidates(
     problem: AllCandidatesProblem,
     base: Sequence[EffectBase],
     values: Mapping[str, float],
-    grid: int = DEFAULT_THRESHOLDS.shape_grid_size,
+    grid: int = DEFAULT_THRESHOLDS.shape_parameter_grid_size,
 ) -> AllCandidatesLinearization:
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
@@ -366,7 +366,7 @@ def screen_candidates(
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> ScreeningResult:
     """Screen all candidates not in `base` at `values` for detectability, scores and confusability."""
-    point = linearize_candidates(problem, base, values, limits.shape_grid_size)
+    point = linearize_candidates(problem, base, values, limits.shape_parameter_grid_size)
     visible = _candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
     ranked = _score_candidates(point, residual_channels(problem.problem), visible)
     everything = _make_joint_score_model(point, ranked)

@@ -86,7 +86,7 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
-def penalized_chi2_excess_over(fit: RefitStatistics, other: RefitStatistics) -> float:
+def bic_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
     """Difference of two fits' Bayesian information criterion (BIC): `fit` minus `other`, negative if `fit` is better.
 
     The BIC is r'r over estimation and held-out recordings (r: whitened residual) plus log(n) per effect parameter, with
@@ -111,9 +111,9 @@ def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> li
     """
     best = min(fits, key=_chi2)
     if _is_noise(best.held_out_loss, limits):
-        best = min(fits, key=lambda fit: penalized_chi2_excess_over(fit, best))
-        near = [fit for fit in fits if penalized_chi2_excess_over(fit, best) <= 2 * limits.min_log_bayes_factor]
-        near.sort(key=lambda fit: penalized_chi2_excess_over(fit, best))
+        best = min(fits, key=lambda fit: bic_difference(fit, best))
+        near = [fit for fit in fits if bic_difference(fit, best) <= 2 * limits.min_log_bayes_factor]
+        near.sort(key=lambda fit: bic_difference(fit, best))
     else:
         near = [fit for fit in fits if _is_predicting_as_well(fit, best)]
         near.sort(key=lambda fit: (fit.effect_parameter_count, _chi2(fit)))

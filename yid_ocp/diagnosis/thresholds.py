@@ -44,7 +44,7 @@ class Thresholds(SmootherThresholds):
     detectable_amplitude_z: Annotated[
         float, Gt(0), OptionInfo("ratio of amplitude to std at which an amplitude is detectable")
     ] = 2.576 + 1.282
-    shape_grid_size: Annotated[int, Ge(1), OptionInfo("number of values tried per shape parameter")] = 4
+    shape_parameter_grid_size: Annotated[int, Ge(1), OptionInfo("number of values tried per shape parameter")] = 4
     n_refit_per_round: Annotated[int, Ge(1), OptionInfo("number of candidates refitted per round")] = 6
     n_refit_lowest_p: Annotated[int, Ge(0), OptionInfo("candidates with the smallest p-values, always refitted")] = 2
     n_refit_pairs: Annotated[int, Ge(0), OptionInfo("pairs of candidates refitted if one effect leaves a gap")] = 4

@@ -248,7 +248,7 @@ def _selected(
     models: _Models, sources: _Groups, variance: _Variances, state: _State, limits: SmootherThresholds
 ) -> tuple[_Variances, _State]:
     """Add the group that raises the evidence most, repeatedly, while the rise exceeds chance."""
-    while sum(v > 0 for v in variance.values()) < limits.max_unknown_groups:
+    while sum(v > 0 for v in variance.values()) < limits.max_smoother_unknown_groups:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
         promising.sort(key=lambda s: -found[s][0] / max(found[s][1], 1e-300))

@@ -59,7 +59,7 @@ class SmootherThresholds:
     min_log_bayes_factor: Annotated[
         float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")
     ] = 5.0
-    max_unknown_groups: Annotated[int, Ge(1), OptionInfo("largest number of selected groups of unknowns")] = 4
+    max_smoother_unknown_groups: Annotated[int, Ge(1), OptionInfo("largest number of selected groups of unknowns")] = 4
     detectable_chi2: Annotated[float, Gt(0), OptionInfo("rise of r'r at which unknowns are detectable")] = 10.0
     force_prior_std: Annotated[float, Gt(0), OptionInfo("unknown force relative to the load at its location")] = 0.1
     grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
@@ -403,8 +403,8 @@ def _loose_start(course: _LinearizedEpisode) -> Array:
     options, joints = problem.options, course.system.mechanism.joint_names
     inertia = mass_matrix_diagonal_at_zero(problem.step, course.nominal.theta, tuple(joints[i] for i in free))
     loose = np.zeros(problem.step.sizes["nx"])
-    loose[free] = options.initial_configuration_std
-    loose[course.system.n_coordinates + free] = options.initial_velocity_std * np.abs(inertia)
+    loose[free] = options.initial_configuration_prior_std
+    loose[course.system.n_coordinates + free] = options.initial_velocity_prior_std * np.abs(inertia)
     return loose
 
 

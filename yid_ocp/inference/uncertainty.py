@@ -315,7 +315,7 @@ def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str
     return "weak" if relative <= MAX_WEAK_RELATIVE_STD or (near_zero and reach <= scale) else "not_identifiable"
 
 
-def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
+def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
     """Copy an estimate with a 95 % profile-likelihood interval, with which std and verdict become consistent.
 
     An open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in

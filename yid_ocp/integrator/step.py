@@ -204,7 +204,7 @@ def compile_step(
     return Step(model, CompiledKernel(model, library), is_compiled=True)
 
 
-def copy_of_step_with_time_step(step: Step, time_step: float) -> Step:
+def step_with_time_step(step: Step, time_step: float) -> Step:
     """Copy a step with another positive time step [s]. Equations and compiled code are shared."""
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_correction_tolerance(time_step))
     return Step(model, step.kernel.with_step_model(model), step.is_compiled)

@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
-from yid_ocp.integrator.step import Step, copy_of_step_with_time_step
+from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model.system import System
 from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.joint_paths import (
@@ -180,7 +180,7 @@ def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) ->
         evaluations += shot.n_evaluations
         if not shot.is_converged or halved == _MAX_STEP_HALVINGS:
             break
-        half = copy_of_step_with_time_step(rows.simulator.step, rows.simulator.step.time_step / 2)
+        half = step_with_time_step(rows.simulator.step, rows.simulator.step.time_step / 2)
         finer = _at_rest(rows.simulator, half, rows.simulator.theta)
         if _steady(rows, finer, shot.w):
             break

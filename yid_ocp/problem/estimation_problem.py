@@ -15,7 +15,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
-from yid_ocp.problem.episode_prediction import EpisodePredictor, with_observed_equilibrium_and_denoised_loads
+from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_observed_equilibrium_and_denoised_loads
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
@@ -110,7 +110,7 @@ class EstimationProblem(ReprMixin):
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
         ready, other = (
-            tuple(with_observed_equilibrium_and_denoised_loads(self.predictor, e, theta) for e in group)
+            tuple(episode_with_observed_equilibrium_and_denoised_loads(self.predictor, e, theta) for e in group)
             for group in (fitted, others)
         )
         self._set(functions, options, tuple(free), theta, ready, other)

@@ -213,10 +213,10 @@ def stated_prior_stds(
     for name in unknowns.unknown_names:
         base = name.split("[")[0]
         if base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}q."):
-            stds.append(options.initial_configuration_std)
+            stds.append(options.initial_configuration_prior_std)
         elif base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}p."):
             mass = float(inertia((base.removeprefix(f"{INITIAL_STATE_UNKNOWN_PREFIX}p."),))[0])
-            stds.append(options.initial_velocity_std * max(mass, 1e-9))
+            stds.append(options.initial_velocity_prior_std * max(mass, 1e-9))
         elif base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}z."):
             stds.append(limits[base.removeprefix(f"{INITIAL_STATE_UNKNOWN_PREFIX}z.")] / math.sqrt(3))
         else:

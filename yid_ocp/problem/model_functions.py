@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import Step, copy_of_step_with_time_step
+from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
     JointMotionWithSensitivities,
@@ -330,11 +330,9 @@ class ModelFunctions:
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
         """The same functions for another time step [s]. Functions independent of the time step are shared."""
-        made = ModelFunctions(
-            copy_of_step_with_time_step(self.step, time_step), self.parameter_names, self._start_parameters
-        )
+        made = ModelFunctions(step_with_time_step(self.step, time_step), self.parameter_names, self._start_parameters)
         made.input_corrections, made._sensors = self.input_corrections, self._sensors
-        made._arms = CasadiLockedCache(lambda _: copy_of_step_with_time_step(self.arms_only_integrator_step, time_step))
+        made._arms = CasadiLockedCache(lambda _: step_with_time_step(self.arms_only_integrator_step, time_step))
         return made
 
     @property

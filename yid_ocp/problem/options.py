@@ -137,10 +137,10 @@ class ProblemOptions:
             "a prior near their initial value; 0: none; weighting paper has none"
         ),
     ] = 10.0
-    initial_configuration_std: Annotated[
+    initial_configuration_prior_std: Annotated[
         float, Gt(0), OptionInfo("standard deviation of an estimated initial configuration", "rad")
     ] = 0.05
-    initial_velocity_std: Annotated[float, Gt(0), OptionInfo("velocity std of an estimated start", "rad/s")] = 0.2
+    initial_velocity_prior_std: Annotated[float, Gt(0), OptionInfo("velocity std of an estimated start", "rad/s")] = 0.2
     duration: Annotated[float | None, Gt(0), OptionInfo("use only the first seconds of every recording", "s")] = None
     initial_state_fit_window: Annotated[
         float, Gt(0), OptionInfo("duration of the measured points used for a fitted initial state", "s")

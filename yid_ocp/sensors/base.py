@@ -59,7 +59,7 @@ class SensorOptions:
             "N m, ...",
         ),
     ] = None
-    clock_std: Annotated[
+    clock_offset_std: Annotated[
         _NonNegative | None,
         OptionInfo(
             "standard deviation of a constant offset between the clocks of a point group and the joints, "

@@ -97,7 +97,7 @@ class VirtualArmOptions:
         Le(0.2),
         OptionInfo("largest relative error of a link's mass; the smallest is three fifths of it"),
     ] = 0.05
-    encoder_counts: Annotated[int, Ge(0), OptionInfo("encoder steps per turn; 0: continuous")] = 16384
+    encoder_counts_per_turn: Annotated[int, Ge(0), OptionInfo("encoder steps per turn; 0: continuous")] = 16384
     period_jitter_std: Annotated[
         float, Ge(0), Le(2e-3), OptionInfo("standard deviation of the controller's and recorder's tick times", "s")
     ] = 5e-4

@@ -99,7 +99,7 @@ _ORDINARY_FRICTION: Mapping[str, tuple[float, float]] = {
 _MAX_RATED_EFFORT = 100.0  # larger effort limits are not a motor's rating [N m]
 
 
-def ordinary_friction_range(effect: EffectBase, system: System) -> tuple[float, float]:
+def typical_friction_amplitude_range(effect: EffectBase, system: System) -> tuple[float, float]:
     """Smallest and largest amplitude of the ordinary dry friction of a joint, in the amplitude's unit."""
     low, high = _ORDINARY_FRICTION[effect.kind]
     if effect.definitions[0].unit == "1":

@@ -29,7 +29,6 @@ from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
 from yid_ocp.vision import shape_evidence
-from yid_ocp.vision.initial_shapes import InitialShapeFinder, ObservedObjectEnd
 from yid_ocp.vision.shape_evidence import (
     FrameShapeFit,
     FrameTubeDimensionCost,
@@ -39,6 +38,7 @@ from yid_ocp.vision.shape_evidence import (
     TubeLinks,
     tube_link_projections,
 )
+from yid_ocp.vision.shape_guesses import ObservedObjectEnd, ShapeGuessFinder
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _Left = tuple[BoolArray, BoolArray]
@@ -70,7 +70,7 @@ class ShapeFitOptions:
     surface_noise_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
     ] = 0.006
-    correlated_points: Annotated[
+    n_correlated_neighbours: Annotated[
         PositiveFloat,
         OptionInfo(
             "number of neighbouring points whose errors are correlated; the total weight of the points is divided by it"
@@ -107,7 +107,7 @@ class ShapeFitOptions:
 class ShapeFitter:
     """Fits the bending angles of a flexible object to camera points. Parameters default to nominal values.
 
-    The joints in `loose`, such as a free root (`initial_shapes.system_with_free_root`), are fitted too, with an almost
+    The joints in `loose`, such as a free root (`shape_guesses.system_with_free_root`), are fitted too, with an almost
     flat prior. Raises `DataError` if the system has no object.
     """
 
@@ -295,7 +295,7 @@ class ShapeFitter:
     ) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
         options, camera = self.options, sight.camera_position
-        factor = 1.0 / (options.correlated_points * options.surface_noise_std**2)
+        factor = 1.0 / (options.n_correlated_neighbours * options.surface_noise_std**2)
         weight = np.minimum(sight.point_weights, options.max_point_weight)[at_points]
         nodes, points = sight.skeleton_nodes[at_nodes], sight.points[at_points]
         # nodes together weigh as much as the points, whose errors they share
@@ -406,10 +406,10 @@ class ShapeFitter:
         hessian += by_held.T @ by_held + np.diag(self._prior**2)
         return LocalQuadraticModel(cost, gradient, hessian)
 
-    def make_initial_shape_finder(self) -> InitialShapeFinder:
-        """Make a finder of initial shapes for a system with a free root (`initial_shapes.system_with_free_root`)."""
+    def make_shape_guess_finder(self) -> ShapeGuessFinder:
+        """Make a finder of initial shapes for a system with a free root (`shape_guesses.system_with_free_root`)."""
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
-        return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
+        return ShapeGuessFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
 
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses

@@ -58,7 +58,7 @@ class TrackOptions:
         tuple[TubeDimensionKind, ...],
         OptionInfo("sizes of the tubes estimated from the clouds if these determine them; all sizes are checked"),
     ] = ()
-    max_frame_distance_in_radii: Annotated[
+    max_point_distance_in_radii: Annotated[
         PositiveFloat,
         OptionInfo(
             "a frame is dropped if the mean distance of its points from the fitted shape, beyond noise, is larger; "
@@ -68,7 +68,7 @@ class TrackOptions:
     max_frame_bend_angle: Annotated[
         PositiveFloat, OptionInfo("a frame is dropped if a joint of its shape is bent further", "rad")
     ] = 1.2
-    max_frame_distance_over_median: Annotated[
+    max_point_distance_over_median: Annotated[
         PositiveFloat, OptionInfo("a frame with a larger multiple of the good frames' median distance is dropped")
     ] = 1.7
     max_grasp_gap_change: Annotated[
@@ -132,17 +132,15 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
     widest, noise = (
-        options.max_frame_distance_in_radii * float(shape.link_radii.mean()),
+        options.max_point_distance_in_radii * float(shape.link_radii.mean()),
         shape.options.surface_noise_std,
     )
     limit = math.hypot(widest, _MEAN_ABS_DEVIATION * noise)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
-        off = (
-            f"{1e3 * fit.mean_distance:.1f} mm off on average, max_frame_distance_in_radii allows {1e3 * limit:.1f} mm"
-        )
-        return f"{_NO_FIT}: {off}"
+        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_point_distance_in_radii"
+        return f"{_NO_FIT}: {off} allows {1e3 * limit:.1f} mm"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > options.max_frame_bend_angle:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
@@ -162,7 +160,7 @@ def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -
     for k, fit in fits.items():
         reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
-        if fit.mean_distance > options.max_frame_distance_over_median * usual:
+        if fit.mean_distance > options.max_point_distance_over_median * usual:
             off = f"{1e3 * fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
             reason = f"the shape fits worse than in other frames: {off}"
         elif apart > options.max_grasp_gap_change:

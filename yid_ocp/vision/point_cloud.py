@@ -235,7 +235,7 @@ def weighted_median(values: Array, weight: Array) -> float:
 class SkeletonOptions:
     """Settings of the skeleton extraction."""
 
-    segment_neighbours: Annotated[int, Ge(2), OptionInfo("points per segment, k1 in Caldwell et al.")] = 50
+    points_per_segment: Annotated[int, Ge(2), OptionInfo("points per segment, k1 in Caldwell et al.")] = 50
     neighbour_radius: Annotated[
         PositiveFloat,
         OptionInfo("largest distance of neighbours; somewhat more than the thickest tube's diameter", "m"),
@@ -299,8 +299,8 @@ def _thin_to_nodes(
 def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
     """The nearest points of a centre within the radius, at most as many as a segment has."""
     square, within = _square_distances(points, centre), options.neighbour_radius**2
-    if len(square) > options.segment_neighbours:
-        found = np.argpartition(square, options.segment_neighbours - 1)[: options.segment_neighbours]
+    if len(square) > options.points_per_segment:
+        found = np.argpartition(square, options.points_per_segment - 1)[: options.points_per_segment]
         return np.asarray(found[square[found] <= within])
     return np.flatnonzero(square <= within)
 

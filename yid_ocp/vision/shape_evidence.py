@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import OcclusionMap
-from yid_ocp.vision.initial_shapes import ObservedObjectEnd
 from yid_ocp.vision.point_cloud import weighted_median
+from yid_ocp.vision.shape_guesses import ObservedObjectEnd
 
 _HIDDEN_SIDE_COSINE = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
 _MIN_LINK_STATIONS = 6  # fewest stations per link at which coverage is tested

@@ -31,7 +31,6 @@ from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
-from yid_ocp.vision.initial_shapes import InitialShapeFinder, cloud_centerline_tree, system_with_free_root
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
@@ -40,6 +39,7 @@ from yid_ocp.vision.sequence_calibration import (
     TubeDimensionEstimates,
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
+from yid_ocp.vision.shape_guesses import ShapeGuessFinder, cloud_centerline_tree, system_with_free_root
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, ObservedScene, TriangleMesh
 from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
 
@@ -122,7 +122,7 @@ class FrameTracker:
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
         self.shape_fitter = self._shape_of(values)
-        self.make_initial_shape_finder = self.shape_fitter.make_initial_shape_finder() if anywhere else None
+        self.make_shape_guess_finder = self.shape_fitter.make_shape_guess_finder() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
         self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
         # a root to be found needs no recorded joints
@@ -298,7 +298,7 @@ class FrameTracker:
         fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
         fits.sort(key=lambda fit: fit.mean_distance)
         reason = frame_selection.frame_rejection_reason(fits[0], shape, self.options)
-        anywhere = self.make_initial_shape_finder is not None
+        anywhere = self.make_shape_guess_finder is not None
         if anywhere and not reason and frame_selection.is_shape_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
         other = (
@@ -417,10 +417,10 @@ class FrameTracker:
         begun = time.process_time()
         view = OcclusionMap(raw, state.pose, self.sequence.intrinsics, cloud.points)
         given = calibration.camera_position, view, self._removed(q, calibration, background)
-        if self.make_initial_shape_finder is None:
+        if self.make_shape_guess_finder is None:
             look = self._held(work, cloud, q, rng, given)
         else:
-            look = self._anywhere(self.make_initial_shape_finder, work, cloud, rng, given)
+            look = self._anywhere(self.make_shape_guess_finder, work, cloud, rng, given)
         work.say(cpu_seconds=time.process_time() - begun)
         return look
 
@@ -435,7 +435,7 @@ class FrameTracker:
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
     def _anywhere(
-        self, starts: InitialShapeFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
+        self, starts: ShapeGuessFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
     ) -> _Look:
         """Views of an object with an unknown root position, with its possible ends."""
         diameter, options = 2.0 * self._widest, self.options
@@ -444,7 +444,7 @@ class FrameTracker:
         work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):
             raise DataError("the object crosses or touches itself: its cloud closes a loop")
-        found = starts.initial_shapes_along_centerline(course)
+        found = starts.shape_guesses_along_centerline(course)
         if options.approximate_root_position is not None:
             place = np.array(options.approximate_root_position)
             near = min(found, key=lambda start: float(np.linalg.norm(start.root_position - place))).root_position

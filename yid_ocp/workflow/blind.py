@@ -343,7 +343,7 @@ class _ExperimentVariation:
         # settings of the object and its sensors do not apply without it
         bare = ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
         own = (
-            f"model.arms.link_mass_std={arm.max_relative_link_mass_error}",
+            f"model.arms.relative_link_mass_std={arm.max_relative_link_mass_error}",
             *(bare if self.is_without_object else ()),
         )
         return own if arm.friction == "none" else (*own, "model.friction=null")
@@ -402,7 +402,7 @@ class _BlindExperiment:
         varied = EXPERIMENT_VARIATIONS[self.variation]
         arm, step = self._virtual_arm, DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor
         noise = ArmSensorNoise(
-            position_resolution=2 * math.pi / arm.encoder_counts if arm.encoder_counts else 0.0,
+            position_resolution=2 * math.pi / arm.encoder_counts_per_turn if arm.encoder_counts_per_turn else 0.0,
             lost_sample_fraction=arm.lost_sample_fraction,
         )
         if varied.has_torque_noise:
@@ -430,7 +430,7 @@ class _BlindExperiment:
         for attempt in range(blind.MAX_CASE_DRAWS):
             rng = np.random.default_rng([self.seed, blind.ALLOWED_ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:
-                made = blind.simulate_random_motion(system, system, posture, values, values, (), rng, conditions)
+                made = blind.record_random_motion(system, system, posture, values, values, (), rng, conditions)
             except ModelError:
                 continue  # the motion throws the object about; draw another
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)

@@ -17,8 +17,8 @@ from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.effects.bodies import with_link_mass_parameters
-from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, with_sign_smoothing_speed
+from yid_ocp.effects.bodies import add_link_mass_parameters
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, set_sign_smoothing_speed
 from yid_ocp.effects.law import make_torque_law, read_torque_law_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
@@ -182,14 +182,14 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
     """The system with uncertain link masses, the effects, and the parameter values of the settings."""
-    if run.model.arms.link_mass_std > 0:
-        system = with_link_mass_parameters(system, _LINK_MASS_PARAMETER)
+    if run.model.arms.relative_link_mass_std > 0:
+        system = add_link_mass_parameters(system, _LINK_MASS_PARAMETER)
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
     for joint in friction_joint_names(run, system):
         assert run.model.friction is not None
         kinds, speed = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law], run.model.friction.sign_smoothing_speed
         made = [make_effect(kind, joint, system) for kind in kinds if f"{kind}@{joint}" not in named]
-        system = system.with_effects([with_sign_smoothing_speed(effect, speed) for effect in made])
+        system = system.with_effects([set_sign_smoothing_speed(effect, speed) for effect in made])
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
             system = system.with_effects([_stated_effect(said, system)])
@@ -255,7 +255,7 @@ def _matches(name: str, key: str) -> bool:
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """Settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
-    Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.link_mass_std` and the frames'
+    Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.relative_link_mass_std` and the frames'
     `position_std` come first. Raises `ConfigError` if a name or pattern matches nothing.
     """
     sections = _section_parameter_settings(run, parameters)
@@ -320,9 +320,9 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
                 }
     for name in friction_parameter_names(run, parameters):
         found[name] = ParameterSettings(free=True, initial=values.get(name))
-    if run.model.arms.link_mass_std > 0:
+    if run.model.arms.relative_link_mass_std > 0:
         masses = [name for name in parameters.names if name.endswith(f".{_LINK_MASS_PARAMETER}")]
-        found |= dict.fromkeys(masses, ParameterSettings(free=True, prior_std=run.model.arms.link_mass_std))
+        found |= dict.fromkeys(masses, ParameterSettings(free=True, prior_std=run.model.arms.relative_link_mass_std))
     for frame, said in run.model.frames.items():
         if said.position_std > 0:
             names = [f"{frame}.{axis}" for axis in _AXES]

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_closure_error_by_grasp
+from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_frame_distance_by_grasp
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
@@ -24,7 +24,7 @@ from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, Issue, typical
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.integrator.step import Step, copy_of_step_with_time_step
+from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -159,7 +159,7 @@ def build_problem(
     said = replace(options, data_issues=issues)
     problem = EstimationProblem(step, estimate, free, said, None, held_out)
     if run.problem.time_step == "auto":
-        step = copy_of_step_with_time_step(step, longest_accurate_time_step(problem))
+        step = step_with_time_step(step, longest_accurate_time_step(problem))
         log.info("problem.time_step: auto chooses %g s for these recordings", step.time_step)
         problem = EstimationProblem(step, estimate, free, said, None, held_out)
     _check_grasps_close(run, problem)
@@ -170,7 +170,7 @@ def build_problem(
     return problem
 
 
-def min_initial_closure_error_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+def min_initial_frame_distance_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
     """Smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
     system = problem.system
     if not system.grasps:
@@ -180,7 +180,7 @@ def min_initial_closure_error_by_grasp(problem: EstimationProblem, episode: Epis
     theta = problem.theta.copy()
     for name, value in episode.known_parameters.items():
         theta[system.parameters.index(name)] = value
-    return min_closure_error_by_grasp(system, posture, theta)
+    return min_frame_distance_by_grasp(system, posture, theta)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
@@ -188,7 +188,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
         hint = f"first correct these issues: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in min_initial_closure_error_by_grasp(problem, episode).items():
+        for name, gap in min_initial_frame_distance_by_grasp(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
                 where, allowed = run.setting_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"

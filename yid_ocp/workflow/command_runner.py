@@ -177,7 +177,7 @@ class StderrLogLinesProgress(Progress):
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Print a line with the name of the stage and the remaining time."""
-        interruption.raise_if_requested()
+        interruption.raise_if_interrupted()
         self._tenths, self._last = 0, time.monotonic()
         self._left.begin_stage(work, ahead)
         print(f"{text} ...{self._left.of_command().removeprefix(',')}", file=sys.stderr, flush=True)
@@ -203,7 +203,7 @@ class _BarProgress(Progress):
         self._text, self._begun = "", 0.0
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
-        interruption.raise_if_requested()
+        interruption.raise_if_interrupted()
         self.finish_stage()
         self._text, self._begun = text, time.monotonic()
         self._left.begin_stage(work, ahead)

@@ -18,7 +18,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, with_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
@@ -82,7 +82,7 @@ def run_diagnose(
         problem = build_problem(run, reference_recordings=without)
         run_history.require_recordings_not_in_baseline(run, problem, runs, without)
         if runs:
-            problem = with_baseline_prior(problem, pool_estimates_and_chi2(runs)[0])
+            problem = add_baseline_prior(problem, pool_estimates_and_chi2(runs)[0])
         nominal: Solution | None = None
         try:
             if run.diagnosis.noise_fraction_of_std < 1 and problem.held_out:
@@ -200,8 +200,8 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
             weak_prior_geometric_std=options.weak_prior_geometric_std**share
             if options.weak_prior_geometric_std > 0
             else 0.0,
-            initial_configuration_std=share * options.initial_configuration_std,
-            initial_velocity_std=share * options.initial_velocity_std,
+            initial_configuration_prior_std=share * options.initial_configuration_prior_std,
+            initial_velocity_prior_std=share * options.initial_velocity_prior_std,
         )
     )
 

@@ -154,7 +154,7 @@ def _identifiability_result(
     solution: Solution | None,
     information: IdentifiabilityResult | None,
     unknown: IdentifiabilityResult | None,
-    ranking: what_if.ExperimentRanking | None,
+    ranking: what_if.ExperimentChangeRanking | None,
     asked: IdentifiabilityOptions,
 ) -> dict[str, Any]:
     result: dict[str, Any] = {
@@ -221,7 +221,7 @@ class _IdentifiabilityTasks:
     def evaluate_experiment_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
-        """Information gained by sets of experiment changes, one task per changed mechanics; a `ChangeSetEvaluator`."""
+        """Information gained by sets of changes, one task per changed mechanics (an `ExperimentChangeSetEvaluator`)."""
         groups: dict[str, list[int]] = {}
         for i, changes in enumerate(sets):
             mechanics = sorted({change.mechanical_change for change in changes if change.mechanical_change})

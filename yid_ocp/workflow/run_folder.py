@@ -141,7 +141,7 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
         try:
             with _logged(folder):
                 yield folder
-            interruption.raise_if_requested()
+            interruption.raise_if_interrupted()
             with interruption.defer_interruption():
                 _publish(folder, lock)
         except BaseException as error:

@@ -235,7 +235,7 @@ class _Link(NamedTuple):
     tip: int = -1
 
 
-class InitialShapeFinder:
+class ShapeGuessFinder:
     """Finds object shapes along a centerline by bending joints from `rest` (n,); `lengths` are of links [m]."""
 
     def __init__(
@@ -268,7 +268,7 @@ class InitialShapeFinder:
         self._end_distances = to_tips[:, None] + to_tips - 2 * np.pad(np.array(shared), ((1, 0), (1, 0)))
         np.fill_diagonal(self._end_distances, 0.0)
 
-    def initial_shapes_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
+    def shape_guesses_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
         """Find initial shapes that follow a centerline whose path lengths between ends match the lengths of the object.
 
         Raises `DataError` if the number of ends or the lengths do not match, because a part of the object is hidden or
