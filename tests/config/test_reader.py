@@ -103,7 +103,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("sensors:\n  points: {std: 0}\n", ["above 0"]),
         # unknown keys: the nearest one, and the sections that have it
         ("problem: {iteration: 3}", ["did you mean 'duration'?"]),
-        ("problem: {max_iterations: 3}", ["key of `solver` and of `compare.methods.NAME` and of `track"]),
+        ("problem: {max_iterations: 3}", ["key of `solver` and of `compare.methods.NAME`"]),
         (
             "solver: {name: steepest_descent, step_tolerance: 1}",
             ["'step_tolerance' is a key of `solver` with name: gauss_newton, multiple_shooting"],

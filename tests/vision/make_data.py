@@ -40,7 +40,7 @@ def main() -> None:
     for i, q in enumerate(true):
         points = made.sequence.load_world_cloud(i)
         cloud = voxel_averages(points[region.membership_test_at(q, pose[:3, 3])(points)], VOXEL)
-        cloud = cloud.select(statistical_inlier_mask(cloud, 12, 4.0))
+        cloud = cloud.select(statistical_inlier_mask(cloud))
         cloud = cloud.select(~robot.within_surface_distance_mask(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
     vision.write_frame_folder(vision.FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")

@@ -244,7 +244,7 @@ def test_frames_stamped_late_do_not_pull(robot):
             arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance
         )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))
-        assert calibration.is_frame_stamp_delay_significant(own, CameraClockOptions()) is expected
+        assert own.is_significant is expected
 
 
 def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):

@@ -122,7 +122,7 @@ def test_extra_meshes_hang_on_links(system):
 def test_colours_in_light_and_shade_and_clouds_without_any(alone):
     red = [200, 40, 30]
     seen = np.array([[200, 40, 30], [100, 18, 13], [40, 200, 30], [120, 120, 120], [0, 0, 0]])
-    assert wanted_colour_mask(seen, [red], 0.2).tolist() == [True, True, False, False, False]
-    assert wanted_colour_mask(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
+    assert wanted_colour_mask(seen, [red]).tolist() == [True, True, False, False, False]
+    assert wanted_colour_mask(seen, [red, [128, 128, 128]]).tolist() == [True, True, False, True, True]
     with pytest.raises(DataError, match="no colours"):
         measured(alone, *filmed(SmoothY(), 1), filters=CloudFilterOptions(object_colours=((200.0, 40.0, 30.0),)))

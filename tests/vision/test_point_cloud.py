@@ -34,10 +34,10 @@ def test_outliers_go_and_the_surface_stays(share):
     wrong = rng.uniform(-0.6, 0.6, (round(count * share / (1 - share)), 3))
     cloud = voxel_averages(np.concatenate([plane, wrong]), 0.008)
     far = np.abs(cloud.points[:, 2]) > 0.05
-    stays = statistical_inlier_mask(cloud, 12, 4.0)
+    stays = statistical_inlier_mask(cloud)
     assert stays[~far].mean() > 0.85
     assert share == 0 or stays[far].mean() < 0.05
-    assert not statistical_inlier_mask(cloud.select(np.arange(5)), 12, 4.0).any()
+    assert not statistical_inlier_mask(cloud.select(np.arange(5))).any()
 
 
 def test_the_robot_goes_with_its_padding(system, run):
@@ -140,7 +140,7 @@ def test_two_parts_and_a_stray_heap():
     assert weights[0] > weights[1]
 
 
-def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it():
+def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it(monkeypatch):
     few = WeightedCloud(np.random.default_rng(0).uniform(-1, 1, (30, 3)), np.ones(30))
     assert len(extract_skeleton(few, np.random.default_rng(0)).nodes) == 0
     empty = extract_skeleton(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0))
@@ -150,5 +150,6 @@ def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it():
     assert found.points_assigned_to_node_mask.all()
     angle = np.arange(40)
     ring = WeightedCloud(0.069 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), np.ones(40))
-    lonely = SkeletonOptions(neighbour_radius=0.01, min_segment_points=1)
+    lonely = SkeletonOptions(neighbour_radius=0.01)
+    monkeypatch.setattr("yid_ocp.vision.point_cloud._MIN_SEGMENT_POINTS", 1)
     assert len(extract_skeleton(ring, np.random.default_rng(0), lonely).nodes)

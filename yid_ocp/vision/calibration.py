@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
@@ -52,6 +52,10 @@ _ARM_SHIFT_STD = 1e-3  # std of the arm's position in one frame relative to the 
 _CORRELATED_GROUP_SIZE = 3.0  # group size of random points with correlated errors
 _MAD_TO_STD, _MIN_POINT_STD = 1.4826, 1e-3  # median absolute deviation to std; [m]
 _MAX_CLOCK_STEP = 0.05  # largest change of an offset in one iteration [s]
+_MAX_STAMP_DELAY = 0.03  # deviation of a stamp from the common offset that is allowed, as are four stds [s]
+_DRIFT_PRIOR_STD, _MAX_CLOCK_OFFSET_STD = 1e-3, 0.02  # of the camera's clock: std of its drift; largest std [s]
+_DEPTH_SCALE_PRIOR_STD, _DEPTH_OFFSET_PRIOR_STD = 0.03, 0.01  # [-], [m]
+_MIN_ARM_COVERAGE = 0.6  # fraction of the arm's visible, unoccluded surface that must coincide with points
 
 
 @dataclass(frozen=True)
@@ -62,20 +66,6 @@ class CameraClockOptions:
     search_half_width: Annotated[
         float, Ge(0), OptionInfo("half width of the search for the offset around the initial value; 0: no search", "s")
     ] = 0.5
-    drift_prior_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of the drift of the camera's clock, in seconds per second")
-    ] = 1e-3
-    max_offset_std: Annotated[
-        PositiveFloat, OptionInfo("largest standard deviation of an offset that is used", "s")
-    ] = 0.02
-    max_frame_offset_deviation: Annotated[
-        PositiveFloat,
-        OptionInfo(
-            "a frame is dropped if its offset deviates from the common offset by more, and by more than four "
-            "standard deviations",
-            "s",
-        ),
-    ] = 0.03
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "clock options")
@@ -87,6 +77,11 @@ class _StampDelay(NamedTuple):
     delay: float
     std: float
     mean_square_distance: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the stamp is significantly late or early relative to the common offset."""
+        return abs(self.delay) > max(_MAX_STAMP_DELAY, _STAMP_ERROR_STDS * self.std)
 
 
 def stamp_delay_beyond_clock_offset(
@@ -153,11 +148,6 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
     return [i for i, good in zip(known, near, strict=True) if good], float(np.median(square))
 
 
-def is_frame_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
-    """Whether a frame's stamp is significantly late or early relative to the common offset."""
-    return abs(own.delay) > max(options.max_frame_offset_deviation, _STAMP_ERROR_STDS * own.std)
-
-
 _MIN_FRAMES, _MAX_START_FRAMES = 3, 6  # of a calibration, and of the frames that try initial states
 _MAX_STARTS = 4
 _GOOD_START_FRACTION = 0.9  # fraction of the arm that matches: no further initial states are tried
@@ -191,16 +181,6 @@ class CameraCalibrationOptions:
     translation_prior_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of the specified position, along each axis", "m")
     ] = 0.04
-    depth_scale_prior_std: Annotated[PositiveFloat, OptionInfo("standard deviation of the camera's depth scale")] = 0.03
-    depth_offset_prior_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of the camera's depth offset", "m")
-    ] = 0.01
-    min_arm_coverage_over_frames: Annotated[
-        float,
-        Gt(0),
-        Le(1),
-        OptionInfo("fraction of the arm's visible, unoccluded surface that must coincide with points of the clouds"),
-    ] = 0.6
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "calibration options")
@@ -303,7 +283,7 @@ class _Calibrator:
         pose = [*[own.rotation_prior_std] * 3, *[own.translation_prior_std] * 3]
         # uniform distribution over the search range; zero without a search
         offset = max(self.clock.search_half_width / math.sqrt(3.0), 1e-6)
-        std = [*pose, own.depth_scale_prior_std, own.depth_offset_prior_std, offset, self.clock.drift_prior_std]
+        std = [*pose, _DEPTH_SCALE_PRIOR_STD, _DEPTH_OFFSET_PRIOR_STD, offset, _DRIFT_PRIOR_STD]
         return np.diag(np.array(std) ** -2)
 
     def run(self, frames: Sequence[CalibrationFrame]) -> CameraCalibration:
@@ -325,13 +305,13 @@ class _Calibrator:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
         presence = pooled_surface_visibility_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
-        if not presence.there >= self.options.min_arm_coverage_over_frames * free:
+        if not presence.there >= _MIN_ARM_COVERAGE * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
             hint = "check the specified pose, the robot's description and which recording belongs to the frames"
             raise _UntoldError(f"{seen}, for every camera pose and clock offset tried", hint)
         covariance = found.state_covariance(self.precision)
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
-        if self.clock.search_half_width > 0 and not std < self.clock.max_offset_std:
+        if self.clock.search_half_width > 0 and not std < _MAX_CLOCK_OFFSET_STD:
             told = f"it moves too little to determine the clock offset: its std is {1e3 * std:.0f} ms"
             known = "give the clock's offset with track.options.clock.initial_offset and search_half_width: 0"
             raise _UntoldError(told, f"record a livelier motion, or {known}")

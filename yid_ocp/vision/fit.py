@@ -18,7 +18,6 @@ from typing import Annotated, NamedTuple
 
 import casadi as ca
 import numpy as np
-from annotated_types import Ge
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
@@ -27,7 +26,7 @@ from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
+from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision import shape_evidence
 from yid_ocp.vision.shape_evidence import (
     FrameShapeFit,
@@ -49,6 +48,13 @@ _MAX_POINT_DISTANCE_SCALES = 3.0  # in last loss scales; points further away car
 _TOUCHING_DISTANCE = 1e-3  # [m]
 _MIN_STIFFNESS_FRACTION = 1e-2  # lower bound of a bend's stiffness, relative to the mean
 _WEAK_REGULARISATION = 1e-2  # [1/m, 1/rad]; determines what no point shows, such as the roll of a straight rope
+_MAX_ITERATIONS = 25  # of a pass
+_CORRELATED_POINTS = 8.0  # neighbouring points whose errors are correlated; divides the total weight of the points
+_MAX_POINT_WEIGHT = 6.0  # [camera points]
+_GRASP_DIRECTION_STD = 0.05  # between axes that grasps of kind axis and weld align [rad]
+_BEND_PRIOR_STD = 0.3  # bend of a joint of mean stiffness that costs as much as one standard deviation [rad]
+_MIN_LINK_COVERAGE = 0.5  # a link with points along a smaller fraction of its length is hidden or misplaced
+_MIN_TUBE_COVERAGE = 0.75  # a tube with points on a smaller fraction of its visible length is misplaced
 _PASS_TOLERANCE = 1e-4  # change of a bend [rad] and relative change of the cost at which a pass ends
 
 
@@ -70,32 +76,9 @@ class ShapeFitOptions:
     surface_noise_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
     ] = 0.006
-    n_correlated_neighbours: Annotated[
-        PositiveFloat,
-        OptionInfo(
-            "number of neighbouring points whose errors are correlated; the total weight of the points is divided by it"
-        ),
-    ] = 8.0
     grasp_position_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation between a gripper, by joint angles, and the grasped point", "m")
     ] = 0.004
-    grasp_direction_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation between axes aligned by grasps of kind axis and weld", "rad")
-    ] = 0.05
-    bend_prior_std: Annotated[
-        PositiveFloat,
-        OptionInfo("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad"),
-    ] = 0.3
-    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations per pass")] = 25
-    max_point_weight: Annotated[PositiveFloat, OptionInfo("largest weight of a point [camera points]")] = 6.0
-    min_link_coverage: Annotated[
-        UnitIntervalFloat,
-        OptionInfo("a link with points along a smaller fraction of its length counts as hidden or misplaced"),
-    ] = 0.5
-    min_tube_length_coverage: Annotated[
-        UnitIntervalFloat,
-        OptionInfo("a tube with points on a smaller fraction of its visible length counts as misplaced"),
-    ] = 0.75
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "fit options")
@@ -139,7 +122,7 @@ class ShapeFitter:
             self.rest_configuration[tree.joint_index(entry.joint_name)] = number(entry.rest_angle)
         stiffness = np.array([number(entry.stiffness) for entry in bends])
         typical = stiffness.mean() if stiffness.max() > 0 else 1.0
-        held_by = np.sqrt(np.maximum(stiffness / typical, _MIN_STIFFNESS_FRACTION)) / self.options.bend_prior_std
+        held_by = np.sqrt(np.maximum(stiffness / typical, _MIN_STIFFNESS_FRACTION)) / _BEND_PRIOR_STD
         self._prior = np.concatenate([held_by, np.full(len(loose), _WEAK_REGULARISATION)])
         sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
         self.recorded_joint_names = tuple(name for name in tree.joint_names if name not in sought)
@@ -254,7 +237,7 @@ class ShapeFitter:
             name
             for name, mine in own.items()
             if mine @ evidence.visibly_empty_fraction > 0
-            and evidence.covered_fraction_of_visible_links(mine) < self.options.min_tube_length_coverage
+            and evidence.covered_fraction_of_visible_links(mine) < _MIN_TUBE_COVERAGE
         }
 
     def _without(
@@ -295,8 +278,8 @@ class ShapeFitter:
     ) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
         options, camera = self.options, sight.camera_position
-        factor = 1.0 / (options.n_correlated_neighbours * options.surface_noise_std**2)
-        weight = np.minimum(sight.point_weights, options.max_point_weight)[at_points]
+        factor = 1.0 / (_CORRELATED_POINTS * options.surface_noise_std**2)
+        weight = np.minimum(sight.point_weights, _MAX_POINT_WEIGHT)[at_points]
         nodes, points = sight.skeleton_nodes[at_nodes], sight.points[at_points]
         # nodes together weigh as much as the points, whose errors they share
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
@@ -307,7 +290,7 @@ class ShapeFitter:
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
         """Minimum after several passes, each starting at the result of the previous one."""
-        end, most = start, self.options.max_iterations
+        end, most = start, _MAX_ITERATIONS
         for task in tasks:
 
             def about(bends: Array, task: _Task = task, q: Array = end.q) -> LocalQuadraticModel:
@@ -356,7 +339,7 @@ class ShapeFitter:
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING_DISTANCE
                 off_end[at_end] = offset * shape_evidence.link_axes(corners)[k]
         # a point counts as seen if a link that starts or ends there is seen and its tube is not misplaced
-        sure = evidence.covered_fraction >= self.options.min_link_coverage
+        sure = evidence.covered_fraction >= _MIN_LINK_COVERAGE
         sure &= ~self._links_of(self._failed(evidence))
         held = {grasp.held_frame for grasp in self.system.grasps}
         seen = (touching & sure[:, None]).any(axis=0) | np.array([name in held for name in self.system.point_frames])
@@ -502,6 +485,6 @@ def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOption
         gaps.append(residual[:3])
         rows.append(residual[:3] / options.grasp_position_std)
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
-            rows.append(alignment[-3:] / options.grasp_direction_std)
+            rows.append(alignment[-3:] / _GRASP_DIRECTION_STD)
     seen = ca.vertcat(*(kinematics.frame_position(name) for name in system.point_frames))
     return ca.vertcat(*corners), seen, ca.vertcat(*rows), ca.vertcat(*gaps)

@@ -1,4 +1,4 @@
-"""Read frame sequences from a folder, a ROS bag, an MCAP file, or a RealSense or Azure Kinect recording.
+"""Read frame sequences from a folder, a ROS bag, an MCAP file or a RealSense recording.
 
 Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`. They are
 read on demand.
@@ -20,13 +20,11 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, relative_message_time_function
 from yid_ocp.errors import DataError
-from yid_ocp.files import check_input_file
 from yid_ocp.vision.frame_folder import STAMP_FILE, metres_per_unit, read_frame_folder
 from yid_ocp.vision.frames import (
     CameraIntrinsics,
     FrameSequence,
     PointColourArray,
-    import_open3d,
     validated_camera_pose,
 )
 
@@ -217,7 +215,7 @@ def _colours(content: Any, where: str) -> PointColourArray | None:
     return None
 
 
-_BAG_SUFFIXES, _AZURE_KINECT_SUFFIX = (".bag", ".mcap", ".db3"), ".mkv"
+_BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def read_frames(
@@ -225,10 +223,10 @@ def read_frames(
 ) -> FrameSequence:
     """Read a frame sequence from a folder or file of a depth camera, one frame at a time.
 
-    `path` is a folder (`read_frame_folder`), a ROS 1 or ROS 2 bag, an MCAP or RealSense file with clouds or depth
-    images under `topic`, or an Azure Kinect `.mkv` (if the Open3D build reads it). `pose` (4, 4) is the pose of the
-    camera in the world, `unit` the unit of clouds. Both replace the values of a folder and are required for other
-    formats. Raises `DataError` if the input cannot be read, or lacks time stamps, pose or intrinsics.
+    `path` is a folder (`read_frame_folder`), or a ROS 1 or ROS 2 bag, an MCAP or RealSense file with clouds or depth
+    images under `topic`. `pose` (4, 4) is the pose of the camera in the world, `unit` the unit of clouds. Both replace
+    the values of a folder and are required for other formats. Raises `DataError` if the input cannot be read, or lacks
+    time stamps, pose or intrinsics.
     """
     place = Path(path)
     ending = place.suffix.lower()
@@ -238,90 +236,9 @@ def read_frames(
             return read_frame_folder(place, pose=pose, unit=unit)
     if place.is_dir() or (place.is_file() and ending in _BAG_SUFFIXES):
         return _read_bag_frames(place, pose, unit or "m", topic)
-    if place.is_file() and ending == _AZURE_KINECT_SUFFIX:
-        return _read_film(place, pose)
     if place.exists():
-        bags = ", ".join(_BAG_SUFFIXES)
-        allowed = f"a folder with {STAMP_FILE}, a bag ({bags}) or an Azure Kinect's {_AZURE_KINECT_SUFFIX}"
-        raise DataError("this is not a sequence of frames", where=str(place), allowed=allowed, hint="check the path")
-    allowed = "a folder of frames, a bag or a video"
+        allowed = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})"
+        hint = "write the depth images of another camera as 16-bit PNG into a folder with camera.json"
+        raise DataError("this is not a sequence of frames", where=str(place), allowed=allowed, hint=hint)
+    allowed = "a folder of frames, or a bag"
     raise DataError("there is no such file or folder", where=str(place), allowed=allowed, hint="check the path")
-
-
-_FILM_HINT = "write its depth images as 16-bit PNG into a folder with camera.json and timestamps.csv"
-
-
-class _Film:
-    """Video file of an Azure Kinect, read frame by frame; the last frame is cached."""
-
-    reader: Any = None
-    _kind: Any
-
-    def __init__(self, path: Path) -> None:
-        self.path, self._kind = path, getattr(import_open3d().io, "AzureKinectMKVReader", None)
-        what, allowed = "this build of Open3D cannot read the videos of Azure Kinects", "a folder of frames"
-        if self._kind is None:
-            raise DataError(what, where=str(path), allowed=allowed, hint=_FILM_HINT)
-        try:
-            self._rewind()
-        except RuntimeError as error:  # Open3D loads the camera's own library on demand
-            raise DataError(f"{what} ({error})", where=str(path), allowed=allowed, hint=_FILM_HINT) from error
-        if not self.reader.is_opened():
-            allowed = "an Azure Kinect's .mkv"
-            raise DataError("the video cannot be read", where=str(path), allowed=allowed, hint=_FILM_HINT)
-
-    def _rewind(self) -> None:
-        if self.reader is not None:
-            self.reader.close()
-        self.reader = self._kind()
-        self.reader.open(str(check_input_file(self.path)))
-        self._index, self._last = -1, None
-
-    def count(self) -> int:
-        self._rewind()
-        self.reader.next_frame()
-        count = 0
-        while not self.reader.is_eof():
-            count += 1
-            self.reader.next_frame()
-        self._rewind()
-        return count
-
-    def frame(self, index: int) -> Any:
-        if index < self._index:
-            self._rewind()
-        while self._index < index:
-            self._last = self.reader.next_frame()
-            if self.reader.is_eof():
-                what, where = "the video ends before this frame", f"{self.path}, frame {self._index}"
-                raise DataError(what, where=where, allowed="a complete video", hint="copy the video again")
-            self._index += 1
-        if self._last is None:
-            what, where = "the video has no image in this frame", f"{self.path}, frame {index}"
-            raise DataError(what, where=where, allowed="a complete video", hint="copy the video again")
-        return self._last
-
-
-def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
-    """Depth registered to the colour camera, as returned by Open3D."""
-    camera, film = validated_camera_pose(pose, f"{path}: give track.camera_pose"), _Film(path)
-    metadata = film.reader.get_metadata()
-    inner = metadata.intrinsics
-    matrix = np.asarray(inner.intrinsic_matrix, float)
-    lens = CameraIntrinsics(int(inner.width), int(inner.height), matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    count = film.count()
-    if not count:
-        what, allowed = "the video has no frame", "one frame or more"
-        raise DataError(what, where=str(path), allowed=allowed, hint="copy the video again, or record it again")
-    times = 1e-6 * float(metadata.stream_length_usec) * np.arange(count) / count
-
-    def depth(index: int) -> Array:
-        return 1e-3 * np.asarray(film.frame(index).depth, float)
-
-    def colours(index: int) -> PointColourArray | None:
-        image = np.asarray(film.frame(index).color)
-        seen = lens.measured_depth_mask(depth(index))
-        return None if image.shape[:2] != seen.shape else np.asarray(image[seen][:, :3], np.uint8)
-
-    names = tuple(f"frame {i}" for i in range(count))
-    return FrameSequence(times, names, camera, lambda i: lens.points_from_depth(depth(i)), lens, str(path), colours)

@@ -65,20 +65,6 @@ class TrackOptions:
             "in tube radii"
         ),
     ] = 0.5
-    max_frame_bend_angle: Annotated[
-        PositiveFloat, OptionInfo("a frame is dropped if a joint of its shape is bent further", "rad")
-    ] = 1.2
-    max_point_distance_over_median: Annotated[
-        PositiveFloat, OptionInfo("a frame with a larger multiple of the good frames' median distance is dropped")
-    ] = 1.7
-    max_grasp_gap_change: Annotated[
-        PositiveFloat,
-        OptionInfo(
-            "a frame is dropped if an end is further from its gripper than usual by more, because its stamp is then "
-            "wrong",
-            "m",
-        ),
-    ] = 0.008
     min_covered_visible_length_fraction: Annotated[
         UnitIntervalFloat,
         OptionInfo("a frame is dropped if points cover a smaller fraction of the object's visible length"),
@@ -122,6 +108,9 @@ class TrackOptions:
 
 _NO_FIT, _END_ELSEWHERE = "the shape does not fit", "an end is not where its gripper is"
 _MISFIT_REASONS = (_NO_FIT, _END_ELSEWHERE)
+_MAX_BEND_ANGLE = 1.2  # of a joint in a good frame [rad]
+_MAX_DISTANCE_OVER_MEDIAN = 1.7  # of a frame's mean distance, over the median of good frames
+_MAX_GRASP_GAP_CHANGE = 0.008  # distance of an end from its gripper, beyond the usual, of a wrong stamp [m]
 _MAX_NOTES = 4  # notes in a hint
 _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a normal variable, in stds
 
@@ -142,7 +131,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
         off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_point_distance_in_radii"
         return f"{_NO_FIT}: {off} allows {1e3 * limit:.1f} mm"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
-    if bend > options.max_frame_bend_angle:
+    if bend > _MAX_BEND_ANGLE:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
     if fit.visible_length_coverage < options.min_covered_visible_length_fraction:
         return f"{_NO_FIT}: only {100 * fit.visible_length_coverage:.0f} % of its visible length has points of its own"
@@ -160,10 +149,10 @@ def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -
     for k, fit in fits.items():
         reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
-        if fit.mean_distance > options.max_point_distance_over_median * usual:
+        if fit.mean_distance > _MAX_DISTANCE_OVER_MEDIAN * usual:
             off = f"{1e3 * fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
             reason = f"the shape fits worse than in other frames: {off}"
-        elif apart > options.max_grasp_gap_change:
+        elif apart > _MAX_GRASP_GAP_CHANGE:
             reason = f"{_END_ELSEWHERE}: {1e3 * apart:.0f} mm more than usual (a late stamp?)"
         made[k] = replace(frames[k], drop_reason=reason)
     return made
@@ -318,7 +307,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
     if options.root_placement == "fixed" and good:
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
-            if away > options.max_grasp_gap_change + 2 * options.max_seen_point_std:
+            if away > _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std:
                 reason = f"its root is not where it is in other frames: {1e3 * away:.0f} mm away"
                 made[k] = replace(frames[k], drop_reason=reason)
     return made

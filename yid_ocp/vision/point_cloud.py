@@ -9,7 +9,7 @@ from typing import Annotated
 
 import casadi as ca
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
+from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 XyzTuple = tuple[float, float, float]
@@ -26,6 +26,12 @@ _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
 _SPACING_SAMPLE_POINTS = 3000  # smallest number of points that estimate the usual spacing
+_MAX_COLOUR_ANGLE = 0.2  # angle to a colour of the object, as directions of linear light [rad]
+_OUTLIER_NEIGHBOURS, _OUTLIER_Z_MAX = 12, 4.0  # neighbours of an isolated point; robust stds of their mean distance
+_REACH_MARGIN = 0.1  # beyond the longest branch, from the object's root [m]
+_MIN_SEGMENT_POINTS = 15  # a segment of the skeleton with fewer points gives no node
+_NODE_NEIGHBOURS = 4  # of a node in the skeleton's graph
+_MIN_COMPONENT_FRACTION = 0.04  # of the points; a smaller connected part is not part of the object
 _MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
 
 
@@ -66,10 +72,6 @@ class CloudFilterOptions:
         ),
     ] = None
     floor_margin_above_object_foot: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
-    object_reach_margin: Annotated[
-        PositiveFloat,
-        OptionInfo("points further from the object's root than its longest branch plus this margin are removed", "m"),
-    ] = 0.1
     max_depth_behind_robot_base: Annotated[
         float | None,
         OptionInfo(
@@ -85,21 +87,6 @@ class CloudFilterOptions:
             "have colours; empty: all colours"
         ),
     ] = ()
-    max_colour_angle: Annotated[
-        float,
-        Gt(0),
-        Le(math.pi / 2),
-        OptionInfo("largest angle to a colour of the object as directions, independent of brightness", "rad"),
-    ] = 0.2
-    outlier_neighbours: Annotated[
-        int, Ge(1), OptionInfo("number of neighbours whose mean distance identifies isolated points")
-    ] = 12
-    outlier_z_max: Annotated[
-        PositiveFloat,
-        OptionInfo("a point is an outlier if that distance exceeds the median by this many robust standard deviations"),
-    ] = 4.0
-    min_points: Annotated[int, Ge(0), OptionInfo("a frame with fewer remaining points is not used")] = 150
-    max_points: Annotated[int, Ge(1), OptionInfo("limit on remaining points; a random subset is used above it")] = 6000
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "filter options")
@@ -122,7 +109,7 @@ class ReachableObjectRegion:
             reach[segment.name] = float(sizes[segment.name][0].sum()) + reach[segment.parent_segment or ""]
         radius = max(own for _, own in sizes.values())
         first = next(s for s in system.segment_layouts if s.parent_segment is None)
-        self._radius = np.inf if anywhere else max(reach.values()) + radius + options.object_reach_margin
+        self._radius = np.inf if anywhere else max(reach.values()) + radius + _REACH_MARGIN
         base = tree.joint_index(first.link_joints[0][0])
         q = ca.SX.sym("q", system.n_coordinates)
         kinematics = forward_kinematics(tree, q)
@@ -181,21 +168,19 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
     return WeightedCloud(total / count[:, None], count.astype(np.float64))
 
 
-def statistical_inlier_mask(
-    cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None
-) -> BoolArray:
+def statistical_inlier_mask(cloud: WeightedCloud, asked: BoolArray | None = None) -> BoolArray:
     """Find the inliers (N,) of a cloud by statistical outlier removal. False outside the mask `asked`.
 
-    A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + ratio s, where s is
+    A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + 4 s, where s is
     the median absolute deviation scaled to a standard deviation. Median and s are computed from the whole cloud, with
     weights, so that outliers, each alone in its voxel, have little influence.
     """
-    if len(cloud) <= neighbours:
+    if len(cloud) <= _OUTLIER_NEIGHBOURS:
         return np.zeros(len(cloud), bool)
     tree = cKDTree(cloud.points, compact_nodes=False, balanced_tree=False)
 
     def apart(index: IntArray) -> Array:
-        return np.asarray(tree.query(cloud.points[index], k=neighbours + 1)[0][:, 1:].mean(axis=1))
+        return np.asarray(tree.query(cloud.points[index], k=_OUTLIER_NEIGHBOURS + 1)[0][:, 1:].mean(axis=1))
 
     some = np.arange(0, len(cloud), max(1, len(cloud) // _SPACING_SAMPLE_POINTS))
     distance = apart(some)
@@ -203,18 +188,18 @@ def statistical_inlier_mask(
     spread = _MAD_TO_STD * weighted_median(np.abs(distance - middle), cloud.point_weights[some])
     index = np.flatnonzero(np.ones(len(cloud), bool) if asked is None else asked)
     stays = np.zeros(len(cloud), bool)
-    stays[index] = apart(index) <= middle + ratio * spread
+    stays[index] = apart(index) <= middle + _OUTLIER_Z_MAX * spread
     return stays
 
 
-def wanted_colour_mask(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
+def wanted_colour_mask(colours: ArrayLike, wanted: ArrayLike) -> BoolArray:
     """Whether each point has one of the wanted colours, (N,).
 
-    `colours` (N, 3) and `wanted` (C, 3) are red, green and blue, 0 to 255 (sRGB). `angle` [rad] is the largest angle
-    between matching colours as directions of linear light, which do not depend on brightness.
+    `colours` (N, 3) and `wanted` (C, 3) are red, green and blue, 0 to 255 (sRGB). Matching colours are within 0.2 rad
+    as directions of linear light, which do not depend on brightness.
     """
     seen, asked = (_light_directions(np.asarray(entry, float) / 255.0) for entry in (colours, wanted))
-    return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(angle))
+    return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(_MAX_COLOUR_ANGLE))
 
 
 def _light_directions(colours: Array) -> Array:
@@ -240,13 +225,7 @@ class SkeletonOptions:
         PositiveFloat,
         OptionInfo("largest distance of neighbours; somewhat more than the thickest tube's diameter", "m"),
     ] = 0.07
-    min_segment_points: Annotated[int, Ge(1), OptionInfo("a segment with fewer points gives no node")] = 15
-    node_neighbours: Annotated[int, Ge(1), OptionInfo("number of neighbours of a node in the graph")] = 4
     max_edge_length: Annotated[PositiveFloat, OptionInfo("largest distance of connected nodes", "m")] = 0.15
-    min_component_fraction: Annotated[
-        UnitIntervalFloat,
-        OptionInfo("a connected part with a smaller fraction of the points is not part of the object"),
-    ] = 0.04
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "walk options")
@@ -282,7 +261,7 @@ def _thin_to_nodes(
         if not len(centred):  # a ring around its own centre: use the segment itself to continue
             centred = first
         centre = np.average(points[centred], axis=0, weights=weight[centred])
-        if len(centred) >= options.min_segment_points:
+        if len(centred) >= _MIN_SEGMENT_POINTS:
             label[alive[centred]] = len(nodes)
             nodes.append(centre)
             size.append(float(weight[centred].sum()))
@@ -310,7 +289,7 @@ def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, 
     count = len(nodes)
     if count < 2:
         return np.empty((0, 2), dtype=np.int64), np.zeros(count, dtype=np.int64)
-    k = min(options.node_neighbours + 1, count)
+    k = min(_NODE_NEIGHBOURS + 1, count)
     distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=options.max_edge_length)
     rows = np.repeat(np.arange(count), k)
     columns, lengths = index.ravel(), distance.ravel()
@@ -335,7 +314,7 @@ def extract_skeleton(
         return CloudSkeleton(nodes, label, edges, part)
     held = np.bincount(part, size)
     rank = np.argsort(np.argsort(-held, kind="stable"))
-    keep = held[part] >= options.min_component_fraction * size.sum()
+    keep = held[part] >= _MIN_COMPONENT_FRACTION * size.sum()
     renamed = np.full(len(nodes) + 1, -1)
     renamed[:-1][keep] = np.arange(int(keep.sum()))
     edges, _ = _spanning_forest(nodes[keep], options)

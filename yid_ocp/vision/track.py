@@ -24,7 +24,6 @@ from yid_ocp.vision.calibration import (
     CameraCalibration,
     calibrate_camera,
     calibration_without_estimation,
-    is_frame_stamp_delay_significant,
     stamp_delay_beyond_clock_offset,
 )
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
@@ -45,6 +44,7 @@ from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, Trac
 
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
+_MIN_POINTS, _MAX_POINTS = 150, 6000  # of an object in a frame: fewer are too few, of more a random subset is used
 _MAX_SIZED_FRAMES = 8  # largest number of frames used to estimate the object's dimensions
 _DISTANCE_SAMPLE_POINTS = 2000  # points that estimate the distance of a cloud
 _MAX_DISTANCE = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
@@ -282,8 +282,8 @@ class FrameTracker:
             colours = self.sequence.load_colours(index)
             if colours is None:
                 raise DataError("the cloud has no colours")
-            wanted = filters.object_colours, filters.max_colour_angle
-            inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], *wanted)
+            wanted = filters.object_colours
+            inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], wanted)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
@@ -397,7 +397,7 @@ class FrameTracker:
             own = stamp_delay_beyond_clock_offset(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
-                if is_frame_stamp_delay_significant(own, options.clock):
+                if own.is_significant:
                     raise DataError(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
@@ -405,14 +405,13 @@ class FrameTracker:
             kept = ~self.robot_surfaces.within_surface_distance_mask(cloud.points, q, filters.robot_padding)
         kept[kept] = ~background.near_background_mask(cloud.points[kept])
         # relative to the robot's points: among all surfaces, outliers are few
-        alone = filters.outlier_neighbours, filters.outlier_z_max
-        cloud = cloud.select(point_cloud.statistical_inlier_mask(cloud, *alone, kept))
+        cloud = cloud.select(point_cloud.statistical_inlier_mask(cloud, kept))
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
-        if len(cloud) < filters.min_points:
+        if len(cloud) < _MIN_POINTS:
             raise DataError(f"too few points of the object: {len(cloud)} left")
-        if len(cloud) > filters.max_points:
-            cloud = cloud.select(np.sort(rng.choice(len(cloud), filters.max_points, replace=False)))
+        if len(cloud) > _MAX_POINTS:
+            cloud = cloud.select(np.sort(rng.choice(len(cloud), _MAX_POINTS, replace=False)))
             work.say(n_filtered_points=len(cloud))
         begun = time.process_time()
         view = OcclusionMap(raw, state.pose, self.sequence.intrinsics, cloud.points)
