@@ -173,7 +173,8 @@ def test_the_example_runs(text, repository, tmp_path, monkeypatch, capsys):
     assert "clock offset" in capsys.readouterr().out
 
 
-def test_the_settings_exist(text):
+def test_the_settings_exist(repository):
+    text = (repository / "docs" / "explain" / "tracking.md").read_text(encoding="utf-8")
     options = TrackOptions()
     known = {field.name for field in dataclasses.fields(options)}
     for part in ("filters", "skeleton", "shape_fit", "clock", "calibration"):
