@@ -97,7 +97,7 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=8.0,
-        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.unclamped_vertex_names)},
+        sensors={"points": SensorOptions(std=MODEL_ERROR, used_points=cable.unclamped_vertex_names)},
         clamp_pose_definitions_from_points=cable.clamp_pose_definitions_from_points,
         prior_stds=dict.fromkeys(names, 0.2),
         initial_state_fit_window=TIME_STEP,

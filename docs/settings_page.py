@@ -80,7 +80,7 @@ def default(value: Any) -> str:
 
 EXAMPLES: Mapping[str, str] = {
     "virtual_arm": """\
-virtual_arm: {friction: load, max_relative_link_mass_error: 0.03, encoder_counts_per_turn: 4096}
+virtual_arm: {friction_law: load, max_relative_link_mass_error: 0.03, encoder_counts_per_turn: 4096}
 """,
     **{section: text for kind in OBJECT_KINDS for section, text in OBJECT_KINDS[kind].settings_examples.items()},
     "The file": """\
@@ -97,7 +97,7 @@ model:
   grasp:
     left: {holder_frame: left_gripper, held_frame: w_T2}
   damping: {left_s0: 0.2, object: 0.05}    # [N m s/rad]
-  points: [w_T3, T1:40%]
+  measured_points: [w_T3, T1:40%]
   effects:
     - {kind: kelvin_voigt, location: T1, values: {tau: 0.02}}
 """,
@@ -109,7 +109,7 @@ model:
     "model.extra_meshes": """\
 model:
   extra_meshes:
-    - {mesh: gripper.stl, parent_frame: left_hand}
+    - {mesh_file: gripper.stl, parent_frame: left_hand}
     - {box_size: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
 """,
     "model.arms": """\
@@ -167,12 +167,12 @@ recordings:
     "import": """\
 import:
   joint_topics: [/left/joint_states, /right/joint_states]
-  points: {/mocap/tip: cable:100%}
+  point_names: {/mocap/tip: cable:100%}
   units: {position: deg, points: mm}
 """,
     "sensors.NAME": """\
 sensors:
-  points_camera: {std: 0.005, frames: {marker_7: w_T1}}    # [m]
+  points_camera: {std: 0.005, frame_by_recorded_name: {marker_7: w_T1}}    # [m]
   joints.effort: {std: 0.1, bias_std: 0.3, effort_sampling_kind: sample}   # [N m]
 """,
     "parameters.NAME": """\
@@ -191,7 +191,7 @@ problem:
 solver: {name: gauss_newton, max_iterations: 100}
 """,
     "solver, name: multiple_shooting": """\
-solver: {name: multiple_shooting, hessian: exact, ipopt: {max_cpu_time: 600}}
+solver: {name: multiple_shooting, hessian: exact, ipopt_options: {max_cpu_time: 600}}
 """,
     "solver, name: single_shooting": """\
 solver: {name: single_shooting, max_iterations: 400}

@@ -77,7 +77,7 @@ def _printing(parser: argparse.ArgumentParser, path: str) -> None:
 def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     _configured(parser, optional)
     text = "stop with exit code 2 if any recording has an issue"
-    _setting(parser, "--strict", "recordings.strict=true", text)
+    _setting(parser, "--strict", "recordings.stop_on_any_issue=true", text)
 
 
 def _working(parser: argparse.ArgumentParser, absent: str = "one for each processor") -> None:
@@ -181,14 +181,14 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("reading files of other tools")
     listed = (
         ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are merged on one clock"),
-        ("--field", "fields", "CHANNEL=/TOPIC.FIELD", "of a bag: array of any message; joints are named 1, 2, ..."),
+        ("--field", "message_fields", "CHANNEL=/TOPIC.FIELD", "of a bag: array of any message; joints are 1, 2, ..."),
         ("--joints", "joints", "NAME[=NEW]", "joints to keep, in this order, and their names in the URDF"),
-        ("--points", "points", "SOURCE=POINT", "topic, TOPIC:FRAME of /tf, marker or stem, and its point: cable:100%%"),
+        ("--points", "point_names", "SOURCE=POINT", "topic, TOPIC:FRAME, marker or stem, and its point: cable:100%%"),
         ("--columns", "columns", "COLUMN=MEANING", "of a table: t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),
         ("--units", "units", "UNIT", "units that are not SI: deg, mm, ms, or QUANTITY=UNIT"),
         ("--torque-constants", "torque_constants", "JOINT=N_M_PER_A", "where the efforts are currents; * is any text"),
         ("--clock-offset", "clock_offsets", "FILE=SECONDS", "of several files: added to the times of the named one"),
-        ("--gears", "gears", "JOINT=RATIO", "turns of the motor per turn of the joint"),
+        ("--gear-ratios", "gear_ratios", "JOINT=RATIO", "turns of the motor per turn of the joint"),
     )
     for flag, key, shape, text in listed:
         group.add_argument(flag, dest=key, metavar=f"{shape},...", action="append", default=[], help=text)
@@ -197,12 +197,12 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     text = "of a bag: make points at this distance along the axes of every pose [m]"
     group.add_argument("--pose-axis-point-distance", type=float, metavar="METRES", help=text)
     text = "of a table: the first row holds numbers, not names"
-    group.add_argument("--no-header", dest="header", action="store_const", const=False, help=text)
+    group.add_argument("--no-header", dest="has_header", action="store_const", const=False, help=text)
     text = "of a table: skip and count lines that are not numbers"
     group.add_argument("--skip-bad-lines", action="store_const", const=True, help=text)
     group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: character between cells")
     group.add_argument("--episode", type=int, metavar="NUMBER", help="episode of a LeRobot dataset; 0 when absent")
-    group.add_argument("--clock", choices=("recorded", "nominal"), help="of a table: whether its times were measured")
+    group.add_argument("--clock-kind", choices=("recorded", "nominal"), help="of a table: whether times were measured")
     group.add_argument("--point-sensor-name", metavar="TEXT", help="name of the sensor of the points")
     group.add_argument("--frame", metavar="TEXT", help="frame of reference of the points, of a table or C3D file")
 

@@ -80,8 +80,8 @@ def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen
     position = made.position.copy()
     position[1, 1] = np.nan
     sensors = {
-        "points_camera": SensorOptions(frames={"led": "tip"}),
-        "points_arm": SensorOptions(points=("b",)),
+        "points_camera": SensorOptions(frame_by_recorded_name={"led": "tip"}),
+        "points_arm": SensorOptions(used_points=("b",)),
         "points_off": SensorOptions(use=False),
     }
     groups = replace(made, position=position), group("points_arm"), group("points_off")

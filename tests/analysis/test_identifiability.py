@@ -410,7 +410,7 @@ def test_two_springs_in_series_with_the_joint_seen(springs):
     [("[pointer, shaft_end, coupling]", "not_identifiable"), ("[pointer, coupling_marker]", "identifiable")],
 )
 def test_two_torsional_springs_under_a_known_torque(springs, points, verdict):
-    problem = springs("torsion", f"sensors.points_camera.points={points}")
+    problem = springs("torsion", f"sensors.points_camera.used_points={points}")
     info = identifiability(problem, solve(problem, GaussNewton()))
     assert set(verdicts(info)) == {verdict}
     assert bool(info.unidentifiable_directions) == (verdict == "not_identifiable")

@@ -207,7 +207,7 @@ ANY_NUMBER = {
     "import.clock_offsets.NAME",
     "plan.start_joint_positions.NAME",
     "import.torque_constants.NAME",
-    "import.gears.NAME",
+    "import.gear_ratios.NAME",
     "sensors.NAME.constants.NAME",
     "sensors.NAME.constants.NAME.NAME",
     "model.arms.locked_joints.NAME",

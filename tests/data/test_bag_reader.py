@@ -206,7 +206,7 @@ def twelve_topics() -> Messages:
 def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", twelve_topics())
     named = {"/mocap/tip": "cable:100%", "/vrpn/hand/pose": "hand", "/tf:middle": "cable:50%"}
-    recording = read_any(path, points=named)
+    recording = read_any(path, point_names=named)
     assert recording.joint_names == ("a", "b")
     (points,) = recording.points
     assert (points.names, points.frame) == (("cable:100%", "cable:50%", "hand"), "map")
@@ -281,7 +281,7 @@ def test_the_preview_of_a_bag_proposes_what_imports_it(tmp_path: Path) -> None:
     assert by_name["/vrpn/hand/pose"].imported_as == "point hand"
     assert "middle: --points /tf:FRAME" in by_name["/tf"].note
     assert sum(not source.imported_as for source in contents.sources) == 8
-    assert contents.reader_options["points"] == {"/mocap/tip": "tip", "/vrpn/hand/pose": "hand"}
+    assert contents.reader_options["point_names"] == {"/mocap/tip": "tip", "/vrpn/hand/pose": "hand"}
     assert read_any(path, **contents.reader_options).joint_names == ("a", "b")
 
 
@@ -310,7 +310,7 @@ def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
     assert set(joints.names) == {"elbow", "a"}
     assert np.allclose(joints.position[:, joints.names.index("elbow")], joints.t - 0.005)
     efforts = joints_of(read_bag(path)).values_by_channel["effort"]
-    options: dict[str, Any] = {"torque_constants": {"*": 0.1, "b": 0.2}, "gears": {"b": 50.0}}
+    options: dict[str, Any] = {"torque_constants": {"*": 0.1, "b": 0.2}, "gear_ratios": {"b": 50.0}}
     torques = joints_of(read_any(path, units={"effort": "mA"}, **options)).values_by_channel["effort"]
     assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
     current = "effort of 'a' is a current, but its torque constant is not given"
@@ -341,14 +341,14 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
     ]
     path = write_bag(tmp_path, "bag", messages)
     refused(path, "points of the same name")
-    recording = read_any(path, points={"/a/tip": "tip", "/b/tip": "seen_tip"})
+    recording = read_any(path, point_names={"/a/tip": "tip", "/b/tip": "seen_tip"})
     assert recording.joints is None
     assert [(g.name, g.frame, g.names) for g in recording.points] == [
         ("points_base_link", "base/link", ("tip",)),
         ("points_camera", "camera", ("seen_tip",)),
     ]
     assert recording.duration == 1.0
-    refused(path, "no points on the topic '/c'", points={"/c": "tip"})
+    refused(path, "no points on the topic '/c'", point_names={"/c": "tip"})
 
 
 @pytest.mark.parametrize(

@@ -53,9 +53,9 @@ def test_markers_of_a_file(tmp_path: Path) -> None:
 
 def test_markers_are_named_and_chosen_and_keep_subjects_where_names_would_be_the_same(tmp_path: Path) -> None:
     write_c3d(tmp_path / "run.c3d")
-    assert read_c3d(tmp_path / "run.c3d", points={"tip": "cable:100%"}).point_names == ("cable:100%",)
+    assert read_c3d(tmp_path / "run.c3d", point_names={"tip": "cable:100%"}).point_names == ("cable:100%",)
     with pytest.raises(DataError, match="no point 'tp'") as caught:
-        read_c3d(tmp_path / "run.c3d", points={"tp": "a"})
+        read_c3d(tmp_path / "run.c3d", point_names={"tp": "a"})
     assert caught.value.hint == "did you mean 'tip'?"
     write_c3d(tmp_path / "run.c3d", ("A:tip", "B:tip"), "m", 3)
     with pytest.raises(DataError, match="reaches 202 m"):

@@ -26,7 +26,7 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
         "\n"
         "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
     )
-    recording = read_any(path, clock="nominal", point_sensor_name="camera", frame="base", description="two joints")
+    recording = read_any(path, clock_kind="nominal", point_sensor_name="camera", frame="base", description="two joints")
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert joints.clock == "nominal"
@@ -80,7 +80,7 @@ def test_csv_columns_given_chosen_and_renamed(tmp_path: Path) -> None:
     assert recording.joint_names == ("elbow",)
     assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])
     path = table(tmp_path, "t,q_a,q_b,m1_x,m1_y,m1_z,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
-    recording = read_any(path, joints=["b=elbow"], points={"m2": "cable:100%"})
+    recording = read_any(path, joints=["b=elbow"], point_names={"m2": "cable:100%"})
     assert (recording.joint_names, recording.point_names) == (("elbow",), ("cable:100%",))
     assert (joints_of(recording).position[0, 0], recording.points[0].position[0, 0, 0]) == (2, 4)
 
@@ -192,7 +192,7 @@ def test_a_preview_of_what_is_no_table_is_refused_as_reading_it_is(content: byte
 def test_a_table_without_a_header(tmp_path: Path) -> None:
     path = table(tmp_path, "0,0.1,5\n1,0.2,6\n")
     columns = {"1": "t", "2": "position:a", "3": "effort:a"}
-    joints = joints_of(read_any(path, header=False, columns=columns))
+    joints = joints_of(read_any(path, has_header=False, columns=columns))
     assert np.array_equal(joints.position[:, 0], [0.1, 0.2])
     assert np.array_equal(joints.values_by_channel["effort"][:, 0], [5, 6])
     with pytest.raises(DataError, match="no header row") as caught:
@@ -340,7 +340,7 @@ def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are
     assert group.t == pytest.approx([0, 0.01])
     np.testing.assert_allclose(group.position[0], [[1, 2, 3], [0.1, 0.2, 0.3]])
     np.testing.assert_array_equal(np.isnan(group.position[1]).all(axis=1), [False, True])
-    kept = read_any(tmp_path / name, points={"tip": "w_rod"})
+    kept = read_any(tmp_path / name, point_names={"tip": "w_rod"})
     assert kept.points[0].names == ("w_rod",)
     assert [source.name for source in preview_file(tmp_path / name).sources] == list(names)
     (tmp_path / name).write_text(text.splitlines()[0] + "\n")

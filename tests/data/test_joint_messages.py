@@ -195,4 +195,4 @@ def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without
         ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "not a channel of joints"),
     ):
         with pytest.raises(DataError, match=what):
-            read_any(path, fields=fields)
+            read_any(path, message_fields=fields)

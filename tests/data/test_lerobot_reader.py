@@ -78,7 +78,7 @@ def test_names_of_older_datasets(names: Any, tmp_path: Path) -> None:
 def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0", ["a.pos", "a.vel", "a.current"])
     units = {"position": "deg", "position_command": "deg", "effort": "mA"}
-    joints = joints_of(read_lerobot_episode(path, units=units, torque_constants={"a": 2.0}, gears={"a": 100.0}))
+    joints = joints_of(read_lerobot_episode(path, units=units, torque_constants={"a": 2.0}, gear_ratios={"a": 100.0}))
     assert joints.names == ("a",)
     assert np.array_equal(joints.values_by_channel["velocity"][:, 0], [1, 11, 21, 31])
     assert np.allclose(joints.values_by_channel["effort"][:, 0], 0.2 * np.array([2, 12, 22, 32]))

@@ -81,14 +81,14 @@ SYSTEMS = {
 }
 
 
-@pytest.mark.parametrize("constraint_force", list(PULL_MIDDLE))
+@pytest.mark.parametrize("constraint_force_at", list(PULL_MIDDLE))
 @pytest.mark.parametrize("force_split", list(FORCE_LEFT))
 @pytest.mark.parametrize("name", list(SYSTEMS))
 def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
-    parts, urdf_folder, name, force_split, constraint_force
+    parts, urdf_folder, name, force_split, constraint_force_at
 ):
     system = SYSTEMS[name](parts, urdf_folder)
-    e = discrete_equations(system, force_split, constraint_force)
+    e = discrete_equations(system, force_split, constraint_force_at)
     action = discrete_lagrangian(system, e.q0, e.q1, e.h)
     force = system.input_force(e.u, (e.q0 + e.q1) / 2, (e.q1 - e.q0) / e.h) + system.viscous_force((e.q1 - e.q0) / e.h)
     push = FORCE_LEFT[force_split] * e.h * force
@@ -97,7 +97,7 @@ def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
         return system.constraint_residual(forward_kinematics(system.mechanism, q))
 
     # lam times the constraint at node k, its share s moved to the mean of the ends less half of both
-    s, middle = PULL_MIDDLE[constraint_force], (e.q0 + e.q1) / 2
+    s, middle = PULL_MIDDLE[constraint_force_at], (e.q0 + e.q1) / 2
     moved = s * ca.dot(e.lam, 2 * closed(middle) - closed(e.q0) - closed(e.q1))
     pull = ca.gradient(ca.dot(e.lam, closed(e.q0)) + moved, e.q0)
     matrix = ca.jacobian(closed(e.q1), e.q1)

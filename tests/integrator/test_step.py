@@ -250,7 +250,7 @@ def test_a_status_says_what_to_try(single_step, golden, theta_golden):
     [
         *(({"time_step": h}, [f"time_step = {h}", "a number above 0 [s]"]) for h in (0.0, -0.01, math.nan, math.inf)),
         ({"force_split": "right"}, ["force_split = 'right'", "symmetric, left"]),
-        ({"constraint_force": "end"}, ["constraint_force = 'end'", "node, midpoint"]),
+        ({"constraint_force_at": "end"}, ["constraint_force_at = 'end'", "node, midpoint"]),
     ],
 )
 def test_a_step_that_cannot_be_is_refused(hinge, arguments, words):
@@ -321,8 +321,8 @@ def test_tension_makes_no_motion_grow_where_constraints_pull_at_the_midpoint(par
     system = System.build(clamp, objects=objects, grasps=grasps, driven=["clamp_z"], prescribed=held, damping=0.1)
     start = np.concatenate([parts.tip(parts.cable().mechanism, "w_C", bent)[:3, 3], np.zeros(3), bent, np.zeros(15)])
 
-    def roll(h, constraint_force):
-        step, count = compile_step(system, h, "symmetric", constraint_force, use_compiler=False), round(2 / h)
+    def roll(h, constraint_force_at):
+        step, count = compile_step(system, h, "symmetric", constraint_force_at, use_compiler=False), round(2 / h)
         return simulate(step, system.parameters.vector(), start, count, np.full((count, 1), PULL))
 
     assert not roll(0.01, "node").status.is_converged

@@ -12,7 +12,7 @@ model:
     elbow: {{stiffness: 3.0, rest_position: 0.1}}
   arms: {{mode: prescribed, passive_joints: [elbow]}}
   damping: 0.2
-  points: [{points}]
+  measured_points: [{points}]
 parameters:
   elbow.stiffness: {{free: true}}
 """

@@ -52,7 +52,7 @@ def twin_options(real, cable):
     """The benchmark's options for recordings of the twin, whose edges are as long in all of them."""
 
     def make(recordings, options, path_cutoff=np.inf):
-        sharp = {"points": SensorOptions(std=1e-3, points=cable.unclamped_vertex_names)}
+        sharp = {"points": SensorOptions(std=1e-3, used_points=cable.unclamped_vertex_names)}
         changes = {"sensors": sharp, "start_point_noise_std": 1e-6, "parameters_by_recording": {}}
         return replace(real.cable_options(cable, recordings, options), path_cutoff=path_cutoff, **changes)
 

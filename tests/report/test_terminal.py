@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.inference.uncertainty import VERDICT_SENTENCE_TEXTS, VERDICT_TABLE_TEXTS, parameter_verdict
 from yid_ocp.report import diagnosis_summaries, summaries, terminal  # noqa: F401, they register
-from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable, names_by_pattern_text
+from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable, abbreviated_names_text
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
 BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True, "worse_than_guess": []}
@@ -278,4 +278,4 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     ],
 )
 def test_names_with_consecutive_numbers_are_told_by_their_pattern(names, said):
-    assert names_by_pattern_text(names) == said
+    assert abbreviated_names_text(names) == said

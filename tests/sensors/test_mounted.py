@@ -264,7 +264,7 @@ def test_noise_of_encoders_is_noise_of_what_the_sensor_weighs(urdf: Path, record
     ("options", "changes", "message"),
     [
         ({}, {"names": ("hand",)}, "is on the frame 'hand', which does not exist"),
-        ({"frames": {"lower": "base"}}, {}, "is on the frame 'base', which does not move"),
+        ({"frame_by_recorded_name": {"lower": "base"}}, {}, "is on the frame 'base', which does not move"),
         ({}, {"noise_and_bias_stds_by_attribute": {}}, "noise level of force is neither recorded nor given"),
         ({"constants": {"sign": 2.0}}, {}, "sign of wrist.force"),
     ],

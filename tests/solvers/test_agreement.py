@@ -188,7 +188,7 @@ def test_open_loop_is_for_multiple_shooting(make_problem):
     ("settings", "said"),
     [
         ({"hessian": "bfgs"}, "hessian = 'bfgs'"),
-        ({"ipopt": {"hessian_approximation": "limited-memory"}}, "limited-memory"),
+        ({"ipopt_options": {"hessian_approximation": "limited-memory"}}, "limited-memory"),
         ({"node_interval": 10}, "node_interval = 10 without condensing"),
         ({"condensing": True, "node_interval": 1000}, "fewer than a node interval"),
     ],
@@ -201,7 +201,7 @@ def test_settings_that_do_not_fit_are_refused_with_a_reason(pendulum, settings, 
 def test_iteration_limit_is_a_status_with_the_best_point(make_problem, pendulum):
     arm = make_problem(free=SEEN, duration=0.4)
     few = [(arm, GaussNewton(max_iterations=1)), (arm, MultipleShooting(condensing=True, max_iterations=2))]
-    few += [(pendulum, MultipleShooting(max_iterations=2, ipopt={"acceptable_iter": 0}))]
+    few += [(pendulum, MultipleShooting(max_iterations=2, ipopt_options={"acceptable_iter": 0}))]
     for problem, solver in few:
         solution = solve(problem, solver)
         assert solution.status == Status.ITERATION_LIMIT

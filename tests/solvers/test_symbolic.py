@@ -143,7 +143,7 @@ def test_the_program_and_condensing_have_one_solution(urdf_folder):
     problem = problem_without_input_errors(problem_of(urdf_folder, "driven, proportional", seeds=(1,)))
     tight = {"tol": 1e-12, "acceptable_iter": 0, "mu_init": 1e-12, "mu_target": 1e-15}
     condensed = MultipleShooting(condensing=True, node_interval=5, cost_tolerance=1e-12, step_tolerance=1e-10)
-    solvers = (condensed, MultipleShooting(ipopt=tight), MultipleShooting(hessian="exact", ipopt=tight))
+    solvers = (condensed, MultipleShooting(ipopt_options=tight), MultipleShooting(hessian="exact", ipopt_options=tight))
     found = [one.minimize_cost(problem, problem.initial_unknowns, None) for one in solvers]
     assert [one.status for one in found] == [Status.CONVERGED] * 3, [one.message for one in found]
     std = np.sqrt(np.diag(solve(problem, GaussNewton(), initial_unknowns=found[0].x, restarts=False).covariance))
@@ -175,7 +175,7 @@ def test_internal_coordinates_are_among_the_states(paper_systems, recording, one
 def test_it_solves_what_gauss_newton_solves(urdf_folder, case):
     """Efforts of prescribed joints, which depend on whole steps, need no elimination here."""
     problem = problem_of(urdf_folder, case)
-    solution = solve(problem, MultipleShooting(hessian="exact", ipopt={"acceptable_iter": 0}), restarts=False)
+    solution = solve(problem, MultipleShooting(hessian="exact", ipopt_options={"acceptable_iter": 0}), restarts=False)
     assert solution.status == Status.CONVERGED, solution.message
     single = solve(problem, GaussNewton(cost_tolerance=1e-12), initial_unknowns=solution.x, restarts=False)
     assert single.cost == pytest.approx(solution.cost, rel=1e-7)

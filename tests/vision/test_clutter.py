@@ -113,7 +113,7 @@ def test_extra_meshes_hang_on_links(system):
     for wrong, error, message in (
         (ExtraMesh(parent_frame="left_griper", sphere_radius=0.1), ConfigError, "no link 'left_griper'"),
         (ExtraMesh(box_size=(1, 1, 1), sphere_radius=0.1), ConfigError, "box_size and sphere_radius"),
-        (ExtraMesh(mesh="nowhere.stl"), ModelError, "no mesh"),
+        (ExtraMesh(mesh_file="nowhere.stl"), ModelError, "no mesh"),
     ):
         with pytest.raises(error, match=message):
             extra_meshes_by_joint([wrong], tree)

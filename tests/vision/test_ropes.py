@@ -27,7 +27,7 @@ model:
   object:
     kind: segments
     segments: {rope: {length: 1.0, mass: 0.1, radius: 0.006, links: 16}}
-  points: ["rope:0%", w_rope]
+  measured_points: ["rope:0%", w_rope]
 track:
   frames_path: FRAMES
   n_drawn_frames: 1

@@ -40,7 +40,7 @@ model:
     mount: {{parent_frame: hub}}
     segments:
 {segments}
-  points: [{points}]
+  measured_points: [{points}]
 recordings:
   estimate: [{recording}]
 parameters:

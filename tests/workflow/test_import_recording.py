@@ -48,7 +48,7 @@ def test_flags_say_what_columns_and_units_mean(odd: Path) -> None:
 
 def test_a_section_of_a_configuration_does_the_same_and_flags_go_before_it(odd: Path) -> None:
     columns = '{stamp: t, j1: "position:shoulder", j2: "position:elbow", mx: "x:tip", my: "y:tip", mz: "z:tip"}'
-    more = '  units: {t: ms, position: deg, points: mm}\n  points: {tip: "cable:100%"}\n'
+    more = '  units: {t: ms, position: deg, points: mm}\n  point_names: {tip: "cable:100%"}\n'
     (odd / "run.yaml").write_text(f"import:\n  columns: {columns}\n{more}")
     assert main(["import", "run.csv", "--out", "run.h5", "--config", "run.yaml"]) == 0
     check_odd(odd / "run.h5", odd / "run.csv")
@@ -98,7 +98,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "a unit that is none": ("run.csv", GOOD, "--units furlong", "the unit 'furlong' is unknown"),
     "a joint that is not there": ("run.csv", GOOD, "--joints b", "no joint 'b'"),
     "a pair that is none": ("run.csv", GOOD, "--points tip", "'tip' is not NAME=VALUE"),
-    "a number that is none": ("run.csv", GOOD, "--gears a=fast", "'fast' is not a number"),
+    "a number that is none": ("run.csv", GOOD, "--gear-ratios a=fast", "'fast' is not a number"),
     "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "not that of a"),
     "an option of another format": ("run.csv", GOOD, "--joint-topic /j", "no option 'joint_topics'"),
     "a long delimiter": ("run.csv", GOOD, "--delimiter ::", "the delimiter is '::'"),

@@ -98,7 +98,7 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     assert (run.model.arms.mode, run.model.arms.joints) == ("prescribed", ("roll", "pitch"))
     assert (run.problem.time_step, run.problem.initial_state) == (pytest.approx(0.008), "equilibrium")
     assert {name: said.parent_frame for name, said in run.model.frames.items()} == {"m1": "cable:50%", "m2": "w_cable"}
-    assert not run.sensors["points"].frames, "a point has the name of its frame"
+    assert not run.sensors["points"].frame_by_recorded_name, "a point has the name of its frame"
     # white noise from differences of a smooth motion, within a fifth
     assert run.sensors["points"].std == pytest.approx(2e-4, rel=0.2)
     assert run.sensors["joints.position"].std == pytest.approx(1e-4, rel=0.2)
@@ -128,12 +128,12 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
     model, measured = scene["scenes"][0]["motions"]
     assert set(measured["points"]) == {"m1", "m2"}
-    assert set(measured["points"]) <= set(model["points"])
+    assert set(measured["points"]) <= set(model["measured_points"])
     # a straight stick that is seen where it is: points and frames meet all the time
     for name, at in measured["points"].items():
         seen, told = (
             np.array([row[3 * k : 3 * k + 3] for row in own["places"]], float)
-            for own, k in ((measured, at), (model, model["points"][name]))
+            for own, k in ((measured, at), (model, model["measured_points"][name]))
         )
         assert np.nanmax(np.abs(seen - told)) < 30  # tenths of a millimetre
     # a page that already exists is not written over
@@ -206,7 +206,11 @@ def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> Non
     assert run.sensors["joints.effort"].use is False
     assert run.sensors["wrist.force"].std == pytest.approx(0.1, rel=0.2)
     assert run.sensors["wrist.torque"].std is None
-    assert run.sensors["wrist.force"].frames == run.sensors["wrist.torque"].frames == {"ft": "hub"}
+    assert (
+        run.sensors["wrist.force"].frame_by_recorded_name
+        == run.sensors["wrist.torque"].frame_by_recorded_name
+        == {"ft": "hub"}
+    )
     assert run.sensors["imu.angular_velocity"].use is False
 
 
@@ -322,7 +326,7 @@ def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsy
 def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
     tree = ("--object", "tree", "--branch", "up=0.5,0.05,0.004", "--branch", "side=0.3,0.03,0.004,0,1.57,0")
     run = proposed(moved(SHORT, parts=(0.4, 1.0)), *tree)
-    assert run.sensors["points"].frames == {"m1": "up:40%", "m2": "w_up"}
+    assert run.sensors["points"].frame_by_recorded_name == {"m1": "up:40%", "m2": "w_up"}
     assert {"w_up", "w_side", "up:40%"} == set(build_system(run).point_frames)
 
 
@@ -439,7 +443,7 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
     assert "is it in the same frame?" in capsys.readouterr().out
-    assert not run.sensors["points"].frames
+    assert not run.sensors["points"].frame_by_recorded_name
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2
     assert "no point of the group is a frame of the model" in capsys.readouterr().err

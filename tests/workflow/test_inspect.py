@@ -13,7 +13,7 @@ ROD = "segments: {T1: {length: LENGTH, mass: 0.1, radius: 0.02, links: 2}}"
 HANGING = f"""\
 model:
   object: {{kind: segments, mount: {{rpy: [3.141592653589793, 0, 0]}}, {ROD.replace("LENGTH", "0.6")}}}
-  points: [T1_0_tip, w_T1]
+  measured_points: [T1_0_tip, w_T1]
 recordings: {{estimate: [aside.h5]}}
 parameters: {{T1.bend: {{free: true, initial: 4}}, T1.twist: {{initial: 3}}}}
 problem: {{use_compiler: false, initial_state: fitted_to_points}}

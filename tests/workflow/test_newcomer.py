@@ -37,7 +37,7 @@ model:
     segments:
 {segments}
   damping: {damping}
-  points: [{points}]
+  measured_points: [{points}]
   effects: [{effects}]
 parameters: {{{parameters}}}
 """

@@ -130,7 +130,9 @@ def test_times_since_1970_give_the_same_problem(damaged):
     assert late.episodes[0].measurements[0].n_residuals == usual.episodes[0].measurements[0].n_residuals
 
 
-@pytest.mark.parametrize(("setting", "name"), [("points: [w_T1, w_T4]", "'w_T4'"), ("frames: {w_T1: w_Tl}", "'w_Tl'")])
+@pytest.mark.parametrize(
+    ("setting", "name"), [("used_points: [w_T1, w_T4]", "'w_T4'"), ("frame_by_recorded_name: {w_T1: w_Tl}", "'w_Tl'")]
+)
 def test_points_listed_by_name_that_are_not_there_are_an_error(repository, setting, name):
     file = repository / "configs" / "single_arm_vision.yaml"
     quick = ("problem.use_compiler=false", "model.object.links=1")

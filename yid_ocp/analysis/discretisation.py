@@ -308,21 +308,21 @@ def step_map_natural_frequencies(
     theta: Array,
     time_step: float,
     force_split: ForceSplit = "symmetric",
-    constraint_force: ConstraintForcePlacement = "midpoint",
+    constraint_force_at: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
 ) -> NaturalFrequencies:
     """Compute the natural frequencies of a system about an equilibrium, as one integration step reproduces them.
 
     The frequencies follow from the eigenvalues of the linearised step without damping. The driven and prescribed
     coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts at `guess` (n,).
-    `force_split` and `constraint_force` are as in `compile_step`: the midpoint rule lowers a frequency f to atan(pi f
-    h)/(pi h), with the time step h, and the force split affects only the growth of modes.
+    `force_split` and `constraint_force_at` are as in `compile_step`: the midpoint rule lowers a frequency f to
+    atan(pi f h)/(pi h), with the time step h, and the force split affects only the growth of modes.
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: with these held still nothing can swing"
         return NaturalFrequencies(np.zeros(0), message=held)
-    step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
+    step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
     known = np.array([configuration[name] for name in still.prescribed])
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
     if not rest.is_converged:

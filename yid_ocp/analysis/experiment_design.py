@@ -97,8 +97,8 @@ class RecordedExperiment:
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
             choice = self.problem.options.sensors.get(group.name, SensorOptions())
-            for point in choice.points if choice.points is not None else group.names:
-                frame = choice.frames.get(point, point)
+            for point in choice.used_points if choice.used_points is not None else group.names:
+                frame = choice.frame_by_recorded_name.get(point, point)
                 if self.problem.system.mechanism.has_frame(frame):
                     at = group.names.index(point)
                     seen = np.all(np.isfinite(group.position[:, at]), axis=1)

@@ -52,8 +52,8 @@ class _Change(NamedTuple):
 
 
 def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> dict[str, str]:
-    wanted = group.names if choice.points is None else choice.points
-    frames = {name: choice.frames.get(name, name) for name in wanted if name in group.names}
+    wanted = group.names if choice.used_points is None else choice.used_points
+    frames = {name: choice.frame_by_recorded_name.get(name, name) for name in wanted if name in group.names}
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
 
 

@@ -210,7 +210,7 @@ class ModelSettings:
         FrictionLawSettings | None, OptionInfo("nominal friction law of the joints, with free amplitudes and damping")
     ] = None
     gravity: Annotated[_Vector3, OptionInfo("gravity in the world frame", "m/s^2")] = (0.0, 0.0, -9.81)
-    points: Annotated[_Names | None, OptionInfo("frames for sensors, such as T1:40%; default: segment tips")] = None
+    measured_points: Annotated[_Names | None, OptionInfo("sensor frames such as T1:40%; default: segment tips")] = None
     extra_meshes: Annotated[
         tuple[ExtraMesh, ...],
         OptionInfo("bodies that a camera sees and the URDF lacks, such as a table; `track` removes their points"),
@@ -228,7 +228,7 @@ class RecordingsSettings:
         _Recordings,
         OptionInfo("recordings made without the diagnosed effect, predicted as a test; default: those of the baseline"),
     ] = ()
-    strict: Annotated[
+    stop_on_any_issue: Annotated[
         bool, OptionInfo("whether any issue of a recording stops the run (--strict on the command line)")
     ] = False
 
@@ -243,11 +243,11 @@ class ImportSettings:
     command_topic: Annotated[
         str | None, OptionInfo("bag: topic of joint states whose positions are commands, not measurements")
     ] = None
-    fields: Annotated[_Texts, OptionInfo("bag: /TOPIC.FIELD of an array in any message, by joint channel")] = None
+    message_fields: Annotated[_Texts, OptionInfo("bag: /TOPIC.FIELD of an array in a message, by joint channel")] = None
     joints: Annotated[
         _Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; default: all")
     ] = None
-    points: Annotated[
+    point_names: Annotated[
         _Texts, OptionInfo("point, such as cable:40%, by its source: topic, TOPIC:FRAME of /tf, marker or column stem")
     ] = None
     pose_axis_point_distance: Annotated[
@@ -259,7 +259,7 @@ class ImportSettings:
     columns: Annotated[
         _Texts, OptionInfo("table: t, CHANNEL:JOINT, AXIS:POINT or skip, by column or pattern such as *_pos")
     ] = None
-    header: Annotated[bool | None, OptionInfo("table: whether the first row has names (else 1, 2, ...)")] = None
+    has_header: Annotated[bool | None, OptionInfo("table: whether the first row has names (else 1, 2, ...)")] = None
     skip_bad_lines: Annotated[bool | None, OptionInfo("table: whether lines that are not numbers are skipped")] = None
     delimiter: Annotated[
         str | None, OptionInfo("table: character between cells; default: detected in the first line")
@@ -274,12 +274,12 @@ class ImportSettings:
     torque_constants: Annotated[
         _Numbers, OptionInfo("torque per current by joint or pattern, if efforts are motor currents", "N m/A")
     ] = None
-    gears: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
+    gear_ratios: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
     clock_offsets: Annotated[
         _Numbers, OptionInfo("several files: time added to the times of each, by file stem", "s")
     ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
-    clock: Annotated[ClockKind | None, OptionInfo("table: whether its times were measured")] = None
+    clock_kind: Annotated[ClockKind | None, OptionInfo("table: whether its times were measured")] = None
     point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None
     frame: Annotated[str | None, OptionInfo("table or C3D file: reference frame of the points")] = None
 
@@ -306,7 +306,7 @@ class ProblemSettings(ProblemOptions):
         OptionInfo("time step; auto halves 20 ms until halving it again hardly changes the prediction", "s"),
     ] = 0.01
     force_split: Annotated[ForceSplit, OptionInfo("split of a step's forces; left: Caldwell et al.")] = "symmetric"
-    constraint_force: Annotated[
+    constraint_force_at: Annotated[
         ConstraintForcePlacement, OptionInfo("where grasp forces act; node: Caldwell et al.")
     ] = "midpoint"
     use_compiler: Annotated[bool, OptionInfo("whether to compile the step if there is a C compiler")] = True

@@ -80,7 +80,7 @@ class DiscreteEquations:
 
     system: System
     force_split: ForceSplit
-    constraint_force: ConstraintForcePlacement
+    constraint_force_at: ConstraintForcePlacement
     q0: ca.SX
     q1: ca.SX
     z0: ca.SX
@@ -143,7 +143,7 @@ class DiscreteEquations:
 
 
 def discrete_equations(
-    system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForcePlacement = "midpoint"
+    system: System, force_split: ForceSplit = "symmetric", constraint_force_at: ConstraintForcePlacement = "midpoint"
 ) -> DiscreteEquations:
     """Build the discrete Euler-Lagrange equations of one step. Arguments are as in `compile_step`.
 
@@ -154,8 +154,8 @@ def discrete_equations(
     Marsden and West (2001), Acta Numerica 10:357, section 3, doi:10.1017/S096249290100006X.
     Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
     """
-    rules = (("force_split", force_split, ForceSplit), ("constraint_force", constraint_force, ConstraintForcePlacement))
-    for name, said, known in rules:
+    places = "constraint_force_at", constraint_force_at, ConstraintForcePlacement
+    for name, said, known in (("force_split", force_split, ForceSplit), places):
         if said not in get_args(known):
             raise ModelError(f"{name} = '{said}'", where=name, **unknown_name_error_arguments(said, get_args(known)))
     at = _Symbols.from_system(system)
@@ -168,7 +168,7 @@ def discrete_equations(
     share = 1.0 if force_split == "left" else 0.5
     push = h * force
     scale, spring = _row_scale(system, at)
-    pulls = _constraint_pulls(system, at, kinematics, 0.0 if constraint_force == "node" else 0.5)
+    pulls = _constraint_pulls(system, at, kinematics, 0.0 if constraint_force_at == "node" else 0.5)
     constraint, gain = _constraint(system, at, kinematics)
     balance_rest = scale * (h / 2 * extra_q - extra_v + share * push) - spring
     p1_rest = scale * (h / 2 * extra_q + extra_v + (1 - share) * push) - spring
@@ -184,7 +184,7 @@ def discrete_equations(
     return DiscreteEquations(
         system=system,
         force_split=force_split,
-        constraint_force=constraint_force,
+        constraint_force_at=constraint_force_at,
         **symbols,
         theta=system.parameters.symbols,
         momentum_balance=at.placed(balance),

@@ -170,7 +170,7 @@ def compile_step(
     system: System,
     time_step: float,
     force_split: ForceSplit = "symmetric",
-    constraint_force: ConstraintForcePlacement = "midpoint",
+    constraint_force_at: ConstraintForcePlacement = "midpoint",
     *,
     use_compiler: bool = True,
     tolerance: float | None = None,
@@ -185,7 +185,7 @@ def compile_step(
         h [s], positive.
     force_split : "symmetric" or "left"
         "symmetric" has order two; "left" is the rule of Caldwell et al. (2014).
-    constraint_force : "node" or "midpoint"
+    constraint_force_at : "node" or "midpoint"
         Where the constraint forces act. "node" is the rule of that paper; "midpoint" is stable under any tension (see
         the module `discrete`).
     use_compiler : bool
@@ -193,7 +193,7 @@ def compile_step(
     tolerance : float, optional
         Correction of the coordinates at which Newton's method stops [rad or m]; default: from the time step.
     """
-    model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
+    model = build_step_model(system, _positive(time_step), force_split, constraint_force_at, tolerance)
     library = None
     if use_compiler:
         parts = model.functions, model.index_tables
@@ -213,7 +213,7 @@ def step_with_time_step(step: Step, time_step: float) -> Step:
 def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
     """Build the step of another system with the time step, rules and (by default) kernel type of `step`."""
     compiled = step.is_compiled if use_compiler is None else use_compiler
-    rules = (step.force_split, step.equations.constraint_force)
+    rules = (step.force_split, step.equations.constraint_force_at)
     return compile_step(system, step.time_step, *rules, use_compiler=compiled)
 
 

@@ -48,11 +48,11 @@ def build_step_model(
     system: System,
     time_step: float,
     force_split: ForceSplit,
-    constraint_force: ConstraintForcePlacement,
+    constraint_force_at: ConstraintForcePlacement,
     tolerance: float | None = None,
 ) -> StepModel:
     """Build the `StepModel` of a system. Arguments are as in `compile_step`."""
-    e = discrete_equations(system, force_split, constraint_force)
+    e = discrete_equations(system, force_split, constraint_force_at)
     functions = codegen.step_functions(e)
     n, nz = system.n_coordinates, e.z0.numel()
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}

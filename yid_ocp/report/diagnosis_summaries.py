@@ -18,10 +18,10 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
+    abbreviated_names_text,
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
-    names_by_pattern_text,
     p_value_text,
     register_summary,
     scale_and_unit_with_metres_as_mm,
@@ -426,7 +426,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         texts = [" ".join(format_error_value_and_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
         text = f"{group}, {where}: error {texts[0]} by {first}, {texts[1]} by {second} (rms)"
         yield SummaryStatement(f"{text}; their predictions differ by {texts[2]}", "conclusion")
-    none, names = f"no parameter differs by more than {_MAX_RUN_DIFFERENCE} std", names_by_pattern_text(differing)
+    none, names = f"no parameter differs by more than {_MAX_RUN_DIFFERENCE} std", abbreviated_names_text(differing)
     text = f"different by more than {_MAX_RUN_DIFFERENCE} std: {names}"
     yield SummaryStatement(text if differing else none, "verdict")
     yield "std is the larger of the two; both runs have the same data, so this is no test of significance"

@@ -22,11 +22,11 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
+    abbreviated_names_text,
     discretisation_shift_sentences,
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
-    names_by_pattern_text,
     parameter_bounds_text,
     register_summary,
     scale_and_unit_with_metres_as_mm,
@@ -198,12 +198,12 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     if found:
         yield (
             f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value or, near zero, of "
-            f"their usual size: {names_by_pattern_text(found)}"
+            f"their usual size: {abbreviated_names_text(found)}"
         )
     if lost:
-        yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {names_by_pattern_text(lost)}"
+        yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {abbreviated_names_text(lost)}"
     if weak:
-        yield f"only {VERDICT_TABLE_TEXTS['weak']}: {names_by_pattern_text(weak)}"
+        yield f"only {VERDICT_TABLE_TEXTS['weak']}: {abbreviated_names_text(weak)}"
         if any(free[name]["interval"] is None for name in weak):
             yield "`yid-ocp identifiability` gives intervals that need not be symmetric"
     for name, entry in free.items():
@@ -468,7 +468,7 @@ def _change_in_std_text(change: float) -> str:
 
 def _row_names_text(names: Sequence[str]) -> str:
     """Names of rows in one line, or counts by kind if the line would be too long."""
-    text, kinds = names_by_pattern_text(names), [name.partition("[")[0] for name in names]
+    text, kinds = abbreviated_names_text(names), [name.partition("[")[0] for name in names]
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else counts
 

@@ -255,7 +255,7 @@ def aligned_table_lines(rows: TableRows) -> list[str]:
     return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
 
 
-def names_by_pattern_text(names: Sequence[str]) -> str:
+def abbreviated_names_text(names: Sequence[str]) -> str:
     """Join names in one line. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
 
     A long line is cut, with the number of omitted names.

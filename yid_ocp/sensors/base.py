@@ -44,13 +44,13 @@ class SensorOptions:
             "m, rad, N m, ...",
         ),
     ] = None
-    frames: Annotated[
+    frame_by_recorded_name: Annotated[
         Mapping[str, str],
         OptionInfo(
             "model frame of a point, or T1:40%, or of a wrist sensor or IMU, if its name differs from the recorded name"
         ),
     ] = field(default_factory=dict)
-    points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; default: all points of the model")] = None
+    used_points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; default: all points of the model")] = None
     bias_std: Annotated[
         _NonNegative | Mapping[str, _NonNegative] | None,
         OptionInfo(

@@ -72,7 +72,7 @@ def _read_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[S
 def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: RecordedChannelGroup, key: str) -> SensorData:
     choice, tree = around.sensor_usage(key), around.system.mechanism
     where, channel, names = f"{around.recording.name}: {group.name}", kind.channel, group.names
-    frames = tuple(choice.frames.get(name, name) for name in names)
+    frames = tuple(choice.frame_by_recorded_name.get(name, name) for name in names)
     for name, frame in zip(names, frames, strict=True):
         if not tree.has_frame(frame) or tree.frame(frame).joint_index < 0:
             is_known = tree.has_frame(frame)
@@ -80,7 +80,7 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
             what = (
                 f"sensor '{name}' is on the frame '{frame}', which {'does not move' if is_known else 'does not exist'}"
             )
-            hint = f"set sensors.{key}.frames: {{{name}: FRAME}}, or sensors.{key}.use: false"
+            hint = f"set sensors.{key}.frame_by_recorded_name: {{{name}: FRAME}}, or sensors.{key}.use: false"
             raise DataError(what, where=where, **(unknown_name_error_arguments(frame, moving) | {"hint": hint}))
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in channel.std_attribute_names]
     std = stated[0] if choice.std is None else choice.std

@@ -58,19 +58,19 @@ def _read_point_groups(around: SensorDataInputs) -> list[SensorData]:
 
 def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorOptions) -> SensorData:
     where = f"recording '{around.recording.name}': {group.name}"
-    wanted = choice.points if choice.points is not None else group.names
-    frames = {p: choice.frames.get(p, p) for p in wanted}
+    wanted = choice.used_points if choice.used_points is not None else group.names
+    frames = {p: choice.frame_by_recorded_name.get(p, p) for p in wanted}
     mechanism = around.system.mechanism
     known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
     for point in wanted:
         # points listed by name are used
-        if point not in known and (choice.points is not None or point in choice.frames):
+        if point not in known and (choice.used_points is not None or point in choice.frame_by_recorded_name):
             what = f"point '{point}' marks the frame '{frames[point]}', which the model does not have"
             said = unknown_name_error_arguments(frames[point], mechanism.frames)
             raise DataError(what, where=f"sensors.{group.name}", **said)
     if not known:
         what = f"no point of the group is a frame of the model: {', '.join(wanted)}"
-        hint = f"set sensors.{group.name}.frames: {{POINT: FRAME}}, or sensors.{group.name}.use: false"
+        hint = f"set sensors.{group.name}.frame_by_recorded_name: {{POINT: FRAME}}, or sensors.{group.name}.use: false"
         listed = unknown_name_error_arguments("", around.system.point_frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)

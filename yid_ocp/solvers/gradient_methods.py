@@ -231,7 +231,7 @@ class SteepestDescent(SolverWithCheckedSettings):
         Gt(0),
         OptionInfo("converged if the projected gradient times the unknowns' size is below this fraction of the cost"),
     ] = 1e-5
-    sufficient_decrease: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo constant of sufficient decrease")] = 1e-4
+    armijo_constant: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo constant of sufficient decrease")] = 1e-4
     backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("factor on a rejected step")] = 0.5
     first_trial_step_rule: Annotated[
         Literal["last", "spectral"], OptionInfo("first trial step length of an iteration; last: Caldwell et al. (2014)")
@@ -268,7 +268,7 @@ class SteepestDescent(SolverWithCheckedSettings):
                 trial = np.clip(x - length * gradient, lower, upper)
                 attempt = problem.evaluate(trial, False, evaluation.equilibrium_guesses)
                 recorder.n_evaluations += 1
-                needed = self.sufficient_decrease * float(gradient @ (x - trial))
+                needed = self.armijo_constant * float(gradient @ (x - trial))
                 if attempt.ok and attempt.cost <= reference - needed:
                     break
                 length *= self.backtracking_factor

@@ -104,8 +104,8 @@ class MultipleShooting(SolverWithCheckedSettings):
     cost_tolerance: Annotated[
         float, Gt(0), OptionInfo("condensing: converged if the predicted relative decrease of the cost is below this")
     ] = 1e-5
-    mu_init: Annotated[float, Gt(0), OptionInfo("initial barrier parameter, in units of the initial cost")] = 1e-7
-    ipopt: Annotated[dict[str, Any], OptionInfo("further IPOPT options; they prevail")] = field(default_factory=dict)
+    relative_mu_init: Annotated[float, Gt(0), OptionInfo("initial barrier parameter, over the initial cost")] = 1e-7
+    ipopt_options: Annotated[dict[str, Any], OptionInfo("IPOPT options that prevail")] = field(default_factory=dict)
     name: ClassVar[str] = "multiple_shooting"
     needs_rollout: ClassVar[bool] = False
 
@@ -124,11 +124,11 @@ class MultipleShooting(SolverWithCheckedSettings):
         if self.hessian not in ("gauss_newton", "exact"):
             hint = "use hessian: gauss_newton"
             told = f"hessian = '{self.hessian}'", "hessian", "gauss_newton, exact", hint
-        elif str(self.ipopt.get("hessian_approximation", "exact")) != "exact":
+        elif str(self.ipopt_options.get("hessian_approximation", "exact")) != "exact":
             hint = "leave the option out, and use hessian: gauss_newton"
             told = (
                 "a limited-memory Hessian is too slow for thousands of node states",
-                "ipopt.hessian_approximation",
+                "ipopt_options.hessian_approximation",
                 "exact",
                 hint,
             )
@@ -168,7 +168,7 @@ class MultipleShooting(SolverWithCheckedSettings):
         return SolverResult(status, message, x, tuple(recorder.history), int(stats["n_call_nlp_g"]), warm)
 
     def _solver_options(self, cost_factor: float) -> dict[str, Any]:
-        told = {"max_iter": self.max_iterations, "tol": self.ipopt_tolerance, "mu_init": self.mu_init}
+        told = {"max_iter": self.max_iterations, "tol": self.ipopt_tolerance, "mu_init": self.relative_mu_init}
         acceptable = {"tol": 1e-3, "iter": 4, "constr_viol_tol": 1e-6, "obj_change_tol": 1e-5}
         ipopt = {
             **{"obj_scaling_factor": cost_factor, "nlp_scaling_method": "none", "print_level": 0, "sb": "yes"},
@@ -180,7 +180,7 @@ class MultipleShooting(SolverWithCheckedSettings):
             **{"bound_relax_factor": 0.0, "fixed_variable_treatment": "make_parameter"},
             **{f"acceptable_{name}": value for name, value in acceptable.items()},
         }
-        return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt}}
+        return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt_options}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[Status, str]:
         closed = f"largest defect {defect:.1e}"

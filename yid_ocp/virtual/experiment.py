@@ -87,7 +87,7 @@ class VirtualArmOptions:
     The nominal model contains the friction law, with free amplitudes, and uncertain link masses.
     """
 
-    friction: Annotated[
+    friction_law: Annotated[
         Literal["none", "varied", "coulomb", "stribeck", "load", "load_stribeck"],
         OptionInfo("law of the joints' dry friction, which MuJoCo's solver simulates; varied: one law per experiment"),
     ] = "varied"

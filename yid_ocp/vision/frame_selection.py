@@ -76,7 +76,7 @@ class TrackOptions:
         PositiveFloat,
         OptionInfo("lower bound of a point's standard deviation, for straight links in place of a curve", "m"),
     ] = 0.002
-    stamp_std: Annotated[
+    frame_stamp_std: Annotated[
         float, Ge(0), OptionInfo("standard deviation of a frame's time stamp, beyond the common offset", "s")
     ] = 0.003
     exposure_time: Annotated[
@@ -186,7 +186,7 @@ def tracked_states_and_points(
     std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), options.min_point_std), by_sizes)
     velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
     # a point is measured at a uniformly distributed time within the exposure
-    std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure_time / math.sqrt(12.0)))
+    std = np.hypot(std, np.abs(velocity) * math.hypot(options.frame_stamp_std, options.exposure_time / math.sqrt(12.0)))
     flat = position.reshape(-1, 3), velocity.reshape(-1, 3), np.repeat([frames[k].stamp for k in good], len(of))
     shared = calibration.point_std_from_calibration(*flat).reshape(std.shape)
     std = np.hypot(std, shared)

@@ -55,7 +55,7 @@ class ExtraMesh:
     """A mesh missing from the robot's URDF, such as a gripper's body, a table or a camera stand."""
 
     parent_frame: Annotated[str | None, OptionInfo("link of the robot that carries it; null for the world")] = None
-    mesh: Annotated[str | None, OptionInfo("file that trimesh reads, in metres: STL, OBJ, DAE", is_path=True)] = None
+    mesh_file: Annotated[str | None, OptionInfo("file for trimesh, in metres: STL, OBJ, DAE", is_path=True)] = None
     box_size: Annotated[
         tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None,
         OptionInfo("instead of a file, a box: edges along x, y, z", "m"),
@@ -342,19 +342,19 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
         where = f"model: extra_meshes: {number}"
         given = [
             kind
-            for kind in ("mesh", "box_size", "cylinder_radius_and_length", "sphere_radius")
+            for kind in ("mesh_file", "box_size", "cylinder_radius_and_length", "sphere_radius")
             if getattr(entry, kind) is not None
         ]
         if len(given) != 1:
             what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "keep or add one shape"
-            allowed = "one of mesh, box_size, cylinder_radius_and_length, sphere_radius"
+            allowed = "one of mesh_file, box_size, cylinder_radius_and_length, sphere_radius"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         mesh = _solid(entry.box_size, entry.cylinder_radius_and_length, entry.sphere_radius)
-        if entry.mesh is not None:
-            if not is_file(Path(entry.mesh)):
-                what, allowed = f"there is no mesh file '{entry.mesh}'", "an STL, OBJ or DAE file"
+        if entry.mesh_file is not None:
+            if not is_file(Path(entry.mesh_file)):
+                what, allowed = f"there is no mesh file '{entry.mesh_file}'", "an STL, OBJ or DAE file"
                 raise ModelError(what, where=where, allowed=allowed, hint="check the path")
-            mesh = _load_mesh_file(Path(entry.mesh))
+            mesh = _load_mesh_file(Path(entry.mesh_file))
         assert mesh is not None
         joint, placement = -1, np.eye(4)
         if entry.parent_frame is not None:

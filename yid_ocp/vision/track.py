@@ -73,7 +73,7 @@ def track_object(
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_sequence_calibration()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
-    return tracker.track_result_from_frame_reports(*tracker.mark_outlying_frames_and_root_end(frames), common)
+    return tracker.track_result_from_frame_reports(*tracker.drop_outlying_frames_and_choose_root_end(frames), common)
 
 
 @dataclass(eq=False)
@@ -325,7 +325,7 @@ class FrameTracker:
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def mark_outlying_frames_and_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+    def drop_outlying_frames_and_choose_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Drop outlying frames and choose the root end, with a note on how it was chosen."""
         rooted, note = frame_selection.frames_with_consistent_root_end(frames, self.options)
         return frame_selection.mark_outlying_frames(rooted, self.options), note

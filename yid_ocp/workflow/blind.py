@@ -341,17 +341,17 @@ class _ExperimentVariation:
 
     def simulation_overrides(self, arm: VirtualArmOptions) -> tuple[str, ...]:
         # settings of the object and its sensors do not apply without it
-        bare = ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
+        bare = ("model.object=null", "model.grasp={}", "model.measured_points=null", "sensors={}", "parameters={}")
         own = (
             f"model.arms.relative_link_mass_std={arm.max_relative_link_mass_error}",
             *(bare if self.is_without_object else ()),
         )
-        return own if arm.friction == "none" else (*own, "model.friction=null")
+        return own if arm.friction_law == "none" else (*own, "model.friction=null")
 
     def diagnosis_overrides(self, driven: Sequence[str], arm: VirtualArmOptions) -> list[str]:
         own = [text for text in self.simulation_overrides(arm) if text != "model.friction=null"]
-        if arm.friction != "none":
-            law = self.friction if arm.friction == "varied" else arm.friction
+        if arm.friction_law != "none":
+            law = self.friction if arm.friction_law == "varied" else arm.friction_law
             # because these joints stand still at the start and at every reversal
             own.append(f"model.friction={{law: {law}, sign_smoothing_speed: {_SIGN_SMOOTHING_SPEED}}}")
             own += ['parameters={"*.v_stribeck": {free: false}}'] if "stribeck" in law else []
@@ -412,7 +412,7 @@ class _BlindExperiment:
             noise,
             SimulationOptions(time_step=step, period_jitter_std=arm.period_jitter_std),
             purpose=self.purpose,
-            ordinary_friction=None if arm.friction == "none" else (),
+            ordinary_friction=None if arm.friction_law == "none" else (),
         )
 
     def _write_first_recording(self, file: Path) -> None:

@@ -86,7 +86,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             prescribed=clamps.joint_names if clamps is not None else moved if mode == "prescribed" else (),
             damping=damping,
             gravity=model.gravity,
-            point_frames=model.points,
+            point_frames=model.measured_points,
             springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.springs.items()},
             servos=arms.servo if mode == "servo" else None,
         )
@@ -108,7 +108,7 @@ def build_step(run: RunSettings, system: System | None = None) -> Step:
     said = run.problem
     system = build_system(run) if system is None else system
     return compile_step(
-        system, said.time_step_or_default, said.force_split, said.constraint_force, use_compiler=said.use_compiler
+        system, said.time_step_or_default, said.force_split, said.constraint_force_at, use_compiler=said.use_compiler
     )
 
 

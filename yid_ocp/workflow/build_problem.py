@@ -86,8 +86,9 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     if cable is not None and isinstance(run.model.object, ClampedObject):
         clamps = cable.clamp_pose_definitions_from_points
         for name in {group.name for group in groups}:
-            said = sensors.get(name, SensorOptions())
-            sensors[name] = said if said.points is not None else replace(said, points=cable.unclamped_vertex_names)
+            said = sensors.setdefault(name, SensorOptions())
+            if said.used_points is None:
+                sensors[name] = replace(said, used_points=cable.unclamped_vertex_names)
         for recording in recordings:
             lengths = typical_point_pair_distances(cable.edges, [recording], _START_FRAMES)
             if values := run.model.object.recording_parameter_values(lengths):
@@ -137,7 +138,7 @@ def build_problem(
     """Build the estimation problem of a run, with the marker positions of `reference_recordings`.
 
     Raises `ConfigError`, `DataError` or `ModelError` if settings, recordings or names are inconsistent, a grasp cannot
-    be closed, or a recording is unusable. With `recordings.strict`, any issue of a recording raises an error.
+    be closed, or a recording is unusable. With `recordings.stop_on_any_issue`, any issue raises an error.
     """
     system = build_system(run) if step is None else step.system
     free = free_parameter_names(run, system.parameters)
@@ -357,8 +358,8 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
 
 
 def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
-    """Raise `DataError` for issues that forbid a run; with `recordings.strict`, for any issue."""
-    grave = [doubt for doubt in doubts if run.recordings.strict or doubt.weight == "refused"]
+    """Raise `DataError` for issues that forbid a run; with `recordings.stop_on_any_issue`, for any issue."""
+    grave = [doubt for doubt in doubts if run.recordings.stop_on_any_issue or doubt.weight == "refused"]
     if not grave:
         return
     first, *others = grave

@@ -78,7 +78,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    return CommandOutcome(folder.path, written, None, not (run.recordings.strict and warnings))
+    return CommandOutcome(folder.path, written, None, not (run.recordings.stop_on_any_issue and warnings))
 
 
 def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -214,7 +214,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
             "message": "joint positions are unknown: the configuration names no recording",
         }
     theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
-    rule = (run.problem.force_split, run.problem.constraint_force)
+    rule = (run.problem.force_split, run.problem.constraint_force_at)
     if problem is not None:
         first = problem.episodes[0]
         posture = dict(zip(names, map(float, first.initial_known_coordinates), strict=True)) if names else {}
@@ -225,7 +225,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
     if own.n_unstable_modes:
-        remedy = "problem.constraint_force: midpoint, " if rule[1] == "node" and system.grasps else ""
+        remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
         grow = f"{own.n_unstable_modes} modes grow from step to step about the first posture"
         warnings.append(f"{grow}: take a shorter problem.time_step, {remedy}or more damping")
     steps = [_row(h, own)]

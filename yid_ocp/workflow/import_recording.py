@@ -33,30 +33,31 @@ from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result,
 _RESULT_FORMAT = "yid-import/1"
 _LISTS = ("joint_topics", "joints")
 _MAPPINGS: Mapping[str, type] = {
-    "points": str,
+    "point_names": str,
     "columns": str,
     "torque_constants": float,
-    "gears": float,
+    "gear_ratios": float,
     "clock_offsets": float,
-    "fields": str,
+    "message_fields": str,
 }
 _SINGLE = (
     "command_topic",
     "pose_axis_point_distance",
-    "header",
+    "has_header",
     "skip_bad_lines",
     "delimiter",
     "episode",
-    "clock",
+    "clock_kind",
     "point_sensor_name",
     "frame",
 )
 _FLAGS = {
     "joint_topics": "--joint-topic",
     "clock_offsets": "--clock-offset",
-    "fields": "--field",
+    "message_fields": "--field",
+    "point_names": "--points",
 }  # options whose flag has another name
-_SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
+_SWITCHES = {("has_header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
@@ -165,7 +166,7 @@ def _merged(
             what = f"no file has a format with the option '{name}'"
             allowed = ", ".join(sorted(set().union(*known.values())))
             raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint="leave it out")
-    late = {name: options[name] for name in ("joints", "points", "torque_constants", "gears") if name in options}
+    late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
     units = dict(options.get("units") or {})
     if units.get("effort") in MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}

@@ -18,7 +18,7 @@ from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitCommandObject, comma_separated_numbers, init_command_object_factories
+from yid_ocp.model.objects.base import InitCommandObject, init_command_object_factories, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
@@ -106,7 +106,7 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject |
             allowed = ", ".join(f"{key}=NUMBER, {words}" for key, words in template.further_numbers.items())
             what = f"'{text}' is not an additional number of a {word}"
             raise ConfigError(what, where="--number", allowed=allowed or "none", hint="leave it out")
-        numbers[name] = comma_separated_numbers(value, 1, "--number")[0]
+        numbers[name] = parse_comma_separated_numbers(value, 1, "--number")[0]
     for name, number in numbers.items():
         if number is not None and not 0 < number < float("inf"):
             unit = "kg" if name == "mass" else "m" if name in ("length", "radius") else "SI unit"
@@ -367,7 +367,7 @@ def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterato
         there = {"parent_frame": place.frame, "position_std": float(f"{place.position_std:.2g}")}
         yield f"    {_text(name)}: {_value(there)}"
     if set(wanted) > set(tips):
-        yield from _listed("  ", "points", wanted, "frames for sensors; NAME:40% along a segment")
+        yield from _listed("  ", "measured_points", wanted, "frames for sensors; NAME:40% along a segment")
 
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
@@ -444,7 +444,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
             entries, said = [f"std: {_number(noise.std)}"], f"{noise.std:.2g} {noise.unit}, {noise.reason}"
         elsewhere = (place for place in places if place.model_frame not in ("", place.point))
         if frames := {place.point: place.frame for place in elsewhere}:
-            entries.append(f"frames: {_value(frames)}")
+            entries.append(f"frame_by_recorded_name: {_value(frames)}")
         told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts
         if group == "joints.effort":
             if proposal.torque_bias_std and not proposal.is_identified_from_efforts:

@@ -77,7 +77,7 @@ def _run_track(
                 common = tasks.estimate_sequence_calibration()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
-                frames, note = tracker.mark_outlying_frames_and_root_end(done)
+                frames, note = tracker.drop_outlying_frames_and_choose_root_end(done)
                 try:
                     found = tracker.track_result_from_frame_reports(frames, note, common)
                 except DataError as error:

@@ -158,7 +158,7 @@ class BagOptions(base.SelectionAndUnitOptions):
     # topic of joint states whose positions are commands: `position_command`, held until the next command
     command_topic: str | None = None
     # path of an array by joint channel, `/topic.field.field`, in messages of any type; joints are then named 1, 2, ...
-    fields: Mapping[str, str] | None = None
+    message_fields: Mapping[str, str] | None = None
     # distance from a pose's origin of the additional points NAME_x, NAME_y and NAME_z on its axes [m]
     pose_axis_point_distance: float | None = None
     point_sensor_name: str = "unknown"  # sensor of the points
@@ -189,9 +189,9 @@ def read_bag(
     if distance is not None and not 0 < distance < float("inf"):
         what, allowed = f"pose_axis_point_distance is {distance:g} m", "a distance above 0 [m]"
         raise DataError(what, where=f"--pose-axis-point-distance, for {path}", allowed=allowed)
-    bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress, options.fields)
+    bag = _contents(path, tuple(at for at in options.point_names or () if ":" in at), progress, options.message_fields)
     groups, notes = _joints(bag, options, str(path))
-    seen = _named_places(bag, options.points, str(path))
+    seen = _named_places(bag, options.point_names, str(path))
     if not groups and not seen and not bag.mounted:
         allowed = (
             f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}, or fields of any: --field position=/TOPIC.FIELD"
@@ -218,7 +218,7 @@ def read_bag(
     left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
-    return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
+    return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, point_names=None))
 
 
 def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> base.FilePreview:
@@ -241,7 +241,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
         notes.append("poses have orientations: --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
     units, why = base.guess_units(_for_guess(bag))
-    options |= {key: found for key, found in (("points", names), ("units", units)) if found}
+    options |= {key: found for key, found in (("point_names", names), ("units", units)) if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
 

@@ -129,12 +129,12 @@ class SelectionAndUnitOptions:
     """Options that readers share: selection and names of joints and points, and the file's units."""
 
     joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
-    points: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
+    point_names: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
     units: Mapping[str, str] | None = None  # unit of `t`, a joint channel or `points`, if not SI
     # if `effort` is a motor current, by joint or pattern: torque per current [N m/A], and motor turns per joint turn
     # (default 1)
     torque_constants: Mapping[str, float] | None = None
-    gears: Mapping[str, float] | None = None
+    gear_ratios: Mapping[str, float] | None = None
 
 
 def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
@@ -158,7 +158,8 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
     seen = []
-    for entry in raw.points if options.points is None else _chosen_points(raw.points, options.points, where):
+    chosen = options.point_names
+    for entry in raw.points if chosen is None else _chosen_points(raw.points, chosen, where):
         std = None if entry.std is None else factors["points"] * entry.std
         t, position = factors["t"] * entry.t, factors["points"] * entry.position
         seen.append(replace(entry, t=t, position=position, std=std))
@@ -198,8 +199,8 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
 
 def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, where: str) -> Array:
     """N m per recorded unit of every joint, shape (nj,)."""
-    constants, gears = options.torque_constants or {}, options.gears or {}
-    for word, given in (("torque_constants", constants), ("gears", gears)):
+    constants, gear_ratios = options.torque_constants or {}, options.gear_ratios or {}
+    for word, given in (("torque_constants", constants), ("gear_ratios", gear_ratios)):
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
                 what = f"{word} has a value for '{pattern}', but no joint has this name"
@@ -208,9 +209,9 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
                 allowed = "a finite number that is not zero"
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed=allowed)
     if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
-        if constants or gears:
-            what = "torque constants or gears are given, but the unit of the efforts is not that of a current"
-            allowed = "torque constants and gears with --units effort=A or effort=mA"
+        if constants or gear_ratios:
+            what = "torque constants or gear ratios are given, but the unit of the efforts is not that of a current"
+            allowed = "torque constants and gear ratios with --units effort=A or effort=mA"
             raise DataError(what, where=where, allowed=allowed, hint="add --units effort=A, or leave them out")
         return np.ones(len(names))
     factors = np.ones(len(names))
@@ -220,7 +221,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
             what = f"the effort of '{name}' is a current, but its torque constant is not given"
             hint = f"add --torque-constants {name}=0.1, or '*=0.1' for all joints"
             raise DataError(what, where=where, allowed="a torque constant for every joint [N m/A]", hint=hint)
-        ratio = [value for pattern, value in gears.items() if fnmatch.fnmatchcase(name, pattern)]
+        ratio = [value for pattern, value in gear_ratios.items() if fnmatch.fnmatchcase(name, pattern)]
         factors[j] = own[-1] * (ratio[-1] if ratio else 1.0)
     return factors
 

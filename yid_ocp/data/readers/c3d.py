@@ -38,7 +38,7 @@ class _Markers(NamedTuple):
 def read_c3d(
     path: str | os.PathLike[str],
     *,
-    points: Mapping[str, str] | None = None,
+    point_names: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     point_sensor_name: str = "motion capture",
     frame: str = "world",
@@ -61,7 +61,7 @@ def read_c3d(
     group = PointGroup("points", found.names, found.t, found.position, None, point_sensor_name, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
-    options = base.SelectionAndUnitOptions(points=points, units={**own, **(units or {})})
+    options = base.SelectionAndUnitOptions(point_names=point_names, units={**own, **(units or {})})
     return base.convert_to_si_and_validate(raw, str(path), options)
 
 
@@ -77,7 +77,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
         sources.append(base.TopicOrColumnSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
     notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
-    return base.FilePreview((*sources, *found.others), {"points": {name: name for name in found.names}}, tuple(notes))
+    return base.FilePreview((*sources, *found.others), {"point_names": {n: n for n in found.names}}, tuple(notes))
 
 
 def _markers(path: Path) -> _Markers:

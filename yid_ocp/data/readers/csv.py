@@ -55,10 +55,10 @@ class CsvOptions(base.SelectionAndUnitOptions):
     """
 
     columns: Mapping[str, str] | None = None
-    header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
+    has_header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # omit lines that are not rows of numbers, and count them in `notes`
     delimiter: str = ""  # one character between cells; found in the first line where empty
-    clock: ClockKind = "recorded"  # whether the times were measured
+    clock_kind: ClockKind = "recorded"  # whether the times were measured
     point_sensor_name: str = "unknown"  # sensor of the points
     frame: str = "world"  # reference frame of the points
     description: str = ""  # what was recorded
@@ -136,14 +136,14 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     if joint_names:
         rows = measured(list(channels.values()))
         own: dict[str, Any] = {name: values[rows] for name, values in channels.items()}
-        joints = JointGroup(joint_names, t[rows], clock=options.clock, **own)
+        joints = JointGroup(joint_names, t[rows], clock=options.clock_kind, **own)
     if point_names:
-        rows, said = measured([position]), (options.point_sensor_name, options.frame, None, options.clock)
+        rows, said = measured([position]), (options.point_sensor_name, options.frame, None, options.clock_kind)
         points.append(PointGroup("points", point_names, t[rows], position[rows], None, *said))
     for name, (names, parts) in mounted.items():
         rows = measured(list(parts.values()))
         kept = {quantity: values[rows] for quantity, values in parts.items()}
-        sensors.append(SensorChannelGroup(name, names, t[rows], kept, clock=options.clock))
+        sensors.append(SensorChannelGroup(name, names, t[rows], kept, clock=options.clock_kind))
     return Recording(joints, tuple(points), channel_groups=tuple(sensors))
 
 
@@ -278,7 +278,7 @@ def _read_table(
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
     numbers, bad = array("d"), list[int]()
-    if not options.header:
+    if not options.has_header:
         names = [str(i + 1) for i in range(len(first))]
         lines = chain([(number, first)], lines)
     meanings, units = _meanings(names, options.columns or {}, f"{path}, line {number}")
@@ -309,7 +309,7 @@ def _read_table(
 def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> None:
     if not any(header):
         raise DataError("the table is empty", where=str(path), allowed=_ALLOWED, hint="export it again")
-    if options.header and all(_is_number(cell) for cell in header):
+    if options.has_header and all(_is_number(cell) for cell in header):
         hint = "add --no-header --columns t,position:JOINT,... with one meaning for every column"
         raise DataError("the table has no header row", where=f"{path}, line 1", allowed=_ALLOWED, hint=hint)
     if len(header) == 1:
@@ -317,7 +317,7 @@ def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> Non
         hint = f"set --delimiter {others[0]}" if others else "export the times and the measurements as columns"
         raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=_ALLOWED, hint=hint)
     name, count = Counter(header).most_common(1)[0]
-    if options.header and count > 1:
+    if options.has_header and count > 1:
         allowed, hint = "a name of its own for every column", "rename one of them, or read the table with --no-header"
         raise DataError(f"two columns are called '{name}'", where=f"{path}, line 1", allowed=allowed, hint=hint)
 

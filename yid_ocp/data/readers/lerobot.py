@@ -65,7 +65,7 @@ def read_lerobot_episode(
     joints: Sequence[str] | None = None,
     units: Mapping[str, str] | None = None,
     torque_constants: Mapping[str, float] | None = None,
-    gears: Mapping[str, float] | None = None,
+    gear_ratios: Mapping[str, float] | None = None,
     description: str = "",
 ) -> Recording:
     """Read one episode, counted from zero, from the folder of a LeRobot dataset.
@@ -89,7 +89,7 @@ def read_lerobot_episode(
     if "position" not in (units or {}):
         _check_are_radians(group, dataset, where)
     return base.convert_to_si_and_validate(
-        raw, where, base.SelectionAndUnitOptions(joints, None, units, torque_constants, gears)
+        raw, where, base.SelectionAndUnitOptions(joints, None, units, torque_constants, gear_ratios)
     )
 
 

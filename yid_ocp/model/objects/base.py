@@ -162,7 +162,7 @@ def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Map
     return [float(numbers[name]) for name in meanings]
 
 
-def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
+def parse_comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
     """Parse the comma-separated numbers of a flag. Raises `ConfigError` unless there are `count` finite numbers."""
     try:
         values = [float(part) for part in text.split(",")]

@@ -140,7 +140,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
     if not numbers.get("section"):
         return None
-    x, y = base.comma_separated_numbers(numbers["section"], 2, "--section")
+    x, y = base.parse_comma_separated_numbers(numbers["section"], 2, "--section")
     return x, y
 
 
@@ -166,7 +166,7 @@ def _branch(text: str, links: int) -> tuple[str, FlexibleSegmentSettings]:
     if not (name and equals) or (at and not parent) or count not in (3, 6):
         what, hint = f"'{text}' does not describe a branch", "write for example --branch left=0.4,0.03,0.008"
         raise ConfigError(what, where="--branch", allowed=_BRANCH_SHAPE, hint=hint)
-    values = base.comma_separated_numbers(numbers, count, "--branch")
+    values = base.parse_comma_separated_numbers(numbers, count, "--branch")
     if min(values[:3]) <= 0:
         what, allowed = f"'{text}' has a size that is not above 0", "length [m], mass [kg] and radius [m] above 0"
         raise ConfigError(what, where="--branch", allowed=allowed)
