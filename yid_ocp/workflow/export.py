@@ -291,7 +291,7 @@ def _fall(pairs: Sequence[tuple[ReplayErrorAgainstRecording, ReplayErrorAgainstR
 
 
 def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
-    """Write `OUT/RECORDING.mcap` for every recording of a run; docs/howto/reports.md lists its topics."""
+    """Write `OUT/RECORDING.mcap` for every recording of a run; docs/howto/signals.md lists its topics."""
     source, files, notes = folder / "trajectories.h5", [], []
     run_history.read_estimation_result(folder)
     with open_hdf5_after_read_check(source) as file:
