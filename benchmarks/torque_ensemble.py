@@ -1,18 +1,25 @@
 """What errors of the torques do to the paper's own method: an ensemble beside each of its published values.
 
     python benchmarks/torque_ensemble.py --out FOLDER [EXPERIMENT ...] [--errors offsets both] [--members 8] [--jobs 2]
+    python benchmarks/torque_ensemble.py --explain RUN_FOLDER_OF_COMPARE ...
 
 The paper's four experiments in MuJoCo, rough as those of `make_recordings.py --torques rough`; only the errors of the
 torques, and all other noise, are drawn anew for every member. Steepest descent with the paper's cost and step lengths
 solves each. Where a published value lies within what members find, an error of the torques is enough to explain it;
-where it does not, it is not. The package's `data/defaults/torque_ensemble.json` is what `--errors none offsets
---members 4` leaves there, in four digits; of `none` the first member is enough. Recordings and solutions are kept in
-FOLDER as those of `coverage.py` are.
+where it does not, it is not. `torque_ensemble.json` beside this file is what `--errors none offsets --members 4`
+leaves there, in four digits; of `none` the first member is enough. Recordings and solutions are kept in FOLDER as those
+of `coverage.py` are.
+
+`--explain` gives one sentence for each published value of the experiment that a run of `compare` is about, the first of
+these that holds for its synthetic recordings: they do not determine the parameter, or so weakly that its interval
+contains the value; the value is near the chosen truth; the published method was on its way to where it stops without
+errors of the torques; constant errors of the torques lead it there; none of these.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,10 +29,11 @@ import numpy as np
 from coverage import CONFIGS, PACKAGE, print_progress, solve_twin, working
 from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
-from yid_ocp.analysis.compare import PAPER_ESTIMATES, is_within_ensemble_range
+from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_strict_json
+from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, VERDICT_SENTENCE_TEXTS, interval_text
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import folder_source_hash
@@ -49,6 +57,11 @@ METHOD = (
     "problem.weighting=paper",
     "compare.reference_paper_experiment_name=null",
 )
+
+
+ENSEMBLE = Path(__file__).with_suffix(".json")
+CHOSEN_FROM = "single_arm_vision"  # its published values, rounded, are the truth of the embedded recordings
+START, ITERATIONS, OFFSET_STD = 3.0, 200, 0.3  # of the published method [N m/rad]; of the torques' offsets [N m]
 
 
 def make_member(experiment: str, errors: Sequence[Sequence[float]], number: int, folder: str, code: str) -> str:
@@ -139,7 +152,67 @@ def _range(values: Sequence[float], published: float) -> str:
     if not values:
         return "-"
     low, middle, high = np.quantile(values, [0.0, 0.5, 1.0])
-    return f"{low:.3g} .. {middle:.3g} .. {high:.3g}{'*' if is_within_ensemble_range(published, values) else ''}"
+    return f"{low:.3g} .. {middle:.3g} .. {high:.3g}{'*' if is_within_range(published, values) else ''}"
+
+
+def explain(result: Mapping[str, Any]) -> list[str]:
+    """One sentence for each published value of the experiment that a result of `compare` is about."""
+    experiment = next(name for name, values in PAPER_ESTIMATES.items() if values == result["published"])
+    judged = {name: own for name, own in result["judged"]["parameters"].items() if own["free"] and name in TRUTH}
+    if any(own["verdict"] == "not_trusted" for own in judged.values()):
+        return []
+    ensemble = json.loads(ENSEMBLE.read_text(encoding="utf-8"))[experiment]
+    found = []
+    for name, own in judged.items():
+        published, truth = PAPER_ESTIMATES[experiment][name], result["truth"].get(name)
+        said = _reason(experiment, published, own, truth, ensemble["none"][name][0], ensemble["offsets"][name])
+        found.append(f"{name} = {published:.4g} of Caldwell et al.: {said}")
+    return found
+
+
+def _reason(
+    experiment: str,
+    published: float,
+    own: Mapping[str, Any],
+    truth: float | None,
+    stopped: float,
+    offsets: Sequence[float],
+) -> str:
+    interval = None if own["verdict"] != "weak" or own["interval"] in (None, [None, None]) else own["interval"]
+    if own["interval"] is not None:
+        lower, upper = own["interval"]
+    elif own["std"] is not None:
+        lower, upper = own["value"] - 2 * own["std"], own["value"] + 2 * own["std"]
+    else:
+        lower = upper = None
+    holds = (lower is None or lower <= published) and (upper is None or published <= upper)
+    if own["verdict"] == "not_identifiable" or (own["verdict"] != "identifiable" and holds):
+        known = f"in such an experiment it {VERDICT_SENTENCE_TEXTS[own['verdict']]}"
+        if interval is not None:
+            return f"hardly informed; {known}, {interval_text(*interval)}, where the value lies"
+        return f"not informed; {known}"
+    if truth is not None and _near(published, truth):
+        chosen = experiment == CHOSEN_FROM and abs(published - truth) <= 0.02 * abs(truth)
+        return f"near the truth of these recordings, {truth:.4g}" + (", which was chosen from it" if chosen else "")
+    low, high = sorted((START, stopped))
+    if truth is not None and not _near(stopped, truth) and (low <= published <= high or _near(published, stopped)):
+        goes = f"goes from {START:.3g} to {stopped:.3g} in {ITERATIONS} iterations"
+        return f"slow; without torque errors the published method {goes}"
+    many = f"{min(offsets):.3g} to {max(offsets):.3g} in {len(offsets)} synthetic recordings"
+    led = f"constant torque errors of {OFFSET_STD:g} N m lead the published method to {many}"
+    if is_within_range(published, offsets):
+        return f"torque error; {led}"
+    open_interval = "inform it" if interval is None else f"leave {interval_text(*interval)} open and not this"
+    return f"unexplained; such recordings {open_interval}, it is not slow, and {led}"
+
+
+def is_within_range(published: float, values: Sequence[float]) -> bool:
+    """Whether a published value lies among an ensemble's, with a margin for a bound at zero."""
+    return min(values) - 0.01 * max(values) <= published <= max(values)
+
+
+def _near(value: float, truth: float) -> bool:
+    return abs(value - truth) <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth)
 
 
 def main() -> None:
@@ -150,8 +223,15 @@ def main() -> None:
     parser.add_argument("--errors", nargs="+", choices=list(ERRORS), default=list(ERRORS), help="of the torques")
     parser.add_argument("--members", type=int, default=8, help="of each ensemble")
     working(parser)
-    parser.add_argument("--out", type=Path, required=True, help="folder of recordings and solutions")
+    parser.add_argument("--out", type=Path, help="folder of recordings and solutions")
+    parser.add_argument("--explain", nargs="+", type=Path, help="run folders of `compare`, instead of an ensemble")
     chosen = parser.parse_args()
+    for folder in chosen.explain or ():
+        print("\n".join(explain(json.loads((folder / "result.json").read_text(encoding="utf-8")))))
+    if chosen.explain:
+        return
+    if chosen.out is None:
+        parser.error("the following arguments are required: --out")
     unknown = sorted(set(chosen.experiments) - set(PAPER_ESTIMATES))
     if unknown:
         parser.error(f"there is no experiment '{unknown[0]}'; choose from {', '.join(PAPER_ESTIMATES)}")

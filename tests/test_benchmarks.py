@@ -237,3 +237,41 @@ def test_changes_shrink_as_those_of_a_rule_of_order_two_and_do_not_show_beside_n
     estimates = {step: bench.estimated(system, recording, step) for step in bench.STEPS[:2]}
     assert max(bench.moved(estimates).values()) < 0.3
     assert np.max(np.abs(estimates[0.01].values - truth) / estimates[0.01].std) < 3.0
+
+
+FOUND = {"value": 10.0, "std": 0.1, "interval": None, "verdict": "identifiable", "free": True}
+LOST = FOUND | {"std": None, "verdict": "not_identifiable"}
+WEAK = FOUND | {"std": 2.0, "verdict": "weak"}
+OPEN = WEAK | {"interval": [8.0, None]}
+# published value and our estimate by reason, where the truth is 10 and a descent without torque errors stops at 5
+REASONS = {
+    "not informed": [(99.0, LOST), (10.0, LOST), (13.9, WEAK)],
+    "hardly informed": [(99.0, OPEN)],
+    "near the truth": [(9.0, FOUND), (11.0, FOUND)],
+    "slow": [(3.0, FOUND), (5.5, FOUND), (6.0, FOUND, 10.0, 8.0), (2.5, FOUND, 1.0, 2.0)],
+    "torque error": [(13.9, FOUND), (7.9, OPEN), (8.9, FOUND), (10.0, FOUND, None)],
+    "unexplained": [(14.1, WEAK), (5.6, FOUND), (2.9, FOUND), (4.0, FOUND, 10.0, 9.1), (4.0, FOUND, None)],
+}
+
+
+@pytest.mark.parametrize(("expected", "case"), [(reason, case) for reason, many in REASONS.items() for case in many])
+def test_why_a_published_value_is_what_it_is(benchmark_module, expected, case):
+    """Of descents that start at 3, stop where it says, and end between 6 and 14 with errors of the torques."""
+    published, entry, truth, stopped = (*case, *(10.0, 5.0)[len(case) - 2 :])
+    said = benchmark_module("torque_ensemble")._reason("one", published, entry, truth, stopped, [6.0, 14.0])
+    assert said.startswith(expected)
+
+
+def test_each_published_value_of_a_comparison_has_one_sentence(benchmark_module):
+    module = benchmark_module("torque_ensemble")
+    for experiment, published in module.PAPER_ESTIMATES.items():
+        parameters = {name: FOUND | {"value": value} for name, value in module.TRUTH.items()} | {"T2.twist": LOST}
+        result = {"published": published, "truth": module.TRUTH, "judged": {"parameters": parameters}}
+        said = module.explain(result)
+        assert [text.split(" = ")[0] for text in said] == list(published)
+        assert ": not informed; in such an experiment it cannot be found" in said[3]
+        assert ("which was chosen from it" in said[0]) == (experiment == module.CHOSEN_FROM)
+        parameters["T1.bend"] = FOUND | {"verdict": "not_trusted"}
+        assert module.explain(result) == []
+    assert module.is_within_range(0.0, [0.04, 5.0])
+    assert not module.is_within_range(0.0, [0.06, 5.0])

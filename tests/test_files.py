@@ -134,7 +134,6 @@ OPENED_ELSEWHERE = {
     "cli._reliable_streams": "/dev/null",
     "config.reader._loaded": "a text that was read",
     "analysis.compare._resident": "/proc",
-    "analysis.compare._load_torque_ensemble": "a table that comes with the package",
     "data.recording_hdf5.create_hdf5_atomically": "writes",
     "data.recording_hdf5._complaint": "in the process that is tried first",
     "data.readers.c3d._complaint": "in the process that is tried first",

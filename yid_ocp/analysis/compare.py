@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib import resources
 from pathlib import Path
 
 from yid_ocp.analysis import estimation
@@ -22,7 +19,6 @@ from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     ParameterEstimate,
     free_estimates_marked_not_trusted,
-    interval_text,
 )
 from yid_ocp.inference.whitening import problem_without_input_errors
 from yid_ocp.problem import EstimationProblem
@@ -194,6 +190,10 @@ def _descent_errors(
     return text
 
 
+def _near(value: float, truth: float) -> bool:
+    return abs(value - truth) <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth)
+
+
 class _Memory:
     """Largest resident memory of this process during a block, sampled by a thread [MiB]."""
 
@@ -223,10 +223,6 @@ def _resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
-# The recordings of the paper are not public. Statements rest on synthetic recordings of these experiments in MuJoCo
-# with a chosen truth: what they determine, where steepest descent with the published cost and step lengths is after 200
-# iterations, and how constant torque errors change that (`benchmarks/torque_ensemble.py`).
-
 _PAPER_PARAMETERS = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 PAPER_ESTIMATES: dict[str, dict[str, float]] = {
     "single_arm_no_vision": dict(zip(_PAPER_PARAMETERS, (23.780, 0.000, 18.357, 11.103, 3.200, 3.059), strict=True)),
@@ -235,78 +231,3 @@ PAPER_ESTIMATES: dict[str, dict[str, float]] = {
     "dual_arm_vision": dict(zip(_PAPER_PARAMETERS, (24.840, 0.000, 12.373, 30.775, 1.406, 24.900), strict=True)),
 }
 """Estimates of Caldwell et al. (2014) for their four experiments [N m/rad]; the data are not public."""
-_TRUTH_EXPERIMENT = "single_arm_vision"
-"""Experiment whose rounded estimates are the truth of the embedded recordings (the only one without a zero)."""
-
-_TORQUE_BIAS_STD = 0.3  # standard deviation of the constant error of a joint's torque in the ensemble [N m]
-_DESCENT_INITIAL_VALUE, _DESCENT_ITERATIONS = 3.0, 200  # of steepest descent: start [N m/rad], iterations
-_ROUNDING_RTOL = 0.02  # a truth so near a published value, relatively, was made of it by rounding
-_ZERO_BOUND_FRACTION = 0.01  # a bound at zero is reached within this fraction of the largest of an ensemble's values
-
-
-@cache
-def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]:
-    """Estimates of all ensemble members [N m/rad] by experiment, torque errors (none, offsets) and parameter."""
-    text = (resources.files("yid_ocp.data") / "defaults" / "torque_ensemble.json").read_text(encoding="utf-8")
-    found: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]] = json.loads(text)
-    return found
-
-
-def explain_paper_differences(
-    experiment: str, estimates: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
-) -> tuple[str, ...]:
-    """Explain why each published estimate (`PAPER_ESTIMATES`) of an experiment differs from ours, one sentence each.
-
-    `estimates` come from recordings of this experiment, `truth` holds known values. The result is empty if the model
-    does not explain the recordings. The explanation is the first of these that applies to synthetic recordings:
-
-    - not informed: the recordings do not determine the parameter, or so weakly that its interval contains the published
-      value
-    - near the truth: the published value is within 10 % of the truth
-    - slow: the published value is far from the truth, and lies between the start and the point where the published
-      method stops without torque errors, or within 10 % of that point
-    - torque error: constant torque errors lead the published method to such values
-    - unexplained: none of these
-    """
-    judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}
-    if any(entry.verdict == "not_trusted" for entry in judged.values()):
-        return ()
-    words = {name: _discrepancy(experiment, name, entry, truth.get(name)) for name, entry in judged.items()}
-    return tuple(
-        f"{name} = {PAPER_ESTIMATES[experiment][name]:.4g} of Caldwell et al.: {said}" for name, said in words.items()
-    )
-
-
-def _discrepancy(experiment: str, name: str, entry: ParameterEstimate, truth: float | None) -> str:
-    value, ensemble = PAPER_ESTIMATES[experiment][name], _load_torque_ensemble()[experiment]
-    stopped, offsets = ensemble["none"][name][0], ensemble["offsets"][name]
-    interval = None if entry.verdict != "weak" or entry.interval in (None, (None, None)) else entry.interval
-    lower, upper = entry.interval or (entry.value - 2 * entry.std, entry.value + 2 * entry.std)
-    holds = (lower is None or lower <= value) and (upper is None or value <= upper)
-    if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and holds):
-        known = f"in such an experiment it {VERDICT_SENTENCE_TEXTS[entry.verdict]}"
-        if interval is not None:
-            return f"hardly informed; {known}, {interval_text(*interval)}, where the value lies"
-        return f"not informed; {known}"
-    if truth is not None and _near(value, truth):
-        chosen = experiment == _TRUTH_EXPERIMENT and abs(value - truth) <= _ROUNDING_RTOL * abs(truth)
-        return f"near the truth of these recordings, {truth:.4g}" + (", which was chosen from it" if chosen else "")
-    low, high = sorted((_DESCENT_INITIAL_VALUE, stopped))
-    if truth is not None and not _near(stopped, truth) and (low <= value <= high or _near(value, stopped)):
-        goes = f"goes from {_DESCENT_INITIAL_VALUE:.3g} to {stopped:.3g} in {_DESCENT_ITERATIONS} iterations"
-        return f"slow; without torque errors the published method {goes}"
-    many = f"{min(offsets):.3g} to {max(offsets):.3g} in {len(offsets)} synthetic recordings"
-    led = f"constant torque errors of {_TORQUE_BIAS_STD:g} N m lead the published method to {many}"
-    if is_within_ensemble_range(value, offsets):
-        return f"torque error; {led}"
-    open_interval = "" if interval is None else f"leave {interval_text(*interval)} open and not this"
-    return f"unexplained; such recordings {open_interval or 'inform it'}, it is not slow, and {led}"
-
-
-def is_within_ensemble_range(published: float, values: Sequence[float]) -> bool:
-    """Whether a published estimate lies in an ensemble's range of estimates, with a margin for a bound at zero."""
-    return min(values) - _ZERO_BOUND_FRACTION * max(values) <= published <= max(values)
-
-
-def _near(value: float, truth: float) -> bool:
-    return abs(value - truth) <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth)

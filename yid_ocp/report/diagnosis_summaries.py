@@ -289,7 +289,6 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs: {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
-    yield from result["published_explained"]
     if not [*_objections_to_agreement(result)]:
         agree = "all methods agree within their uncertainty on the parameters that are found"
         yield SummaryStatement(agree, "conclusion")

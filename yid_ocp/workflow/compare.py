@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods, explain_paper_differences
+from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import Progress
 from yid_ocp.problem import EstimationProblem
@@ -48,11 +48,9 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
         judged = comparison.verdict_solution
         own, checks = judged.problem or problem, judged.checks or EstimateChecks()
         held_out = checks.held_out_predictions
-        explained = explain_paper_differences(experiment, judged.parameters, truth) if experiment else ()
         about = {
             "doubts": issues_to_plain_data(checks.data_issues),
             "published": PAPER_ESTIMATES[experiment] if experiment else {},
-            "published_explained": list(explained),
             "truth": truth,
             "judged": solution_to_result_dict(own, judged, held_out),
         }
