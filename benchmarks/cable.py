@@ -90,7 +90,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
 def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
     known = {
-        r.name: edge_length_parameter_values(cable, typical_point_pair_distances(cable.edges, [r], 2))
+        r.name: edge_length_parameter_values(cable, typical_point_pair_distances(cable.edge_vertex_names, [r], 2))
         for r in recordings
     }
     names = [name for name in identifiable_cable_parameter_names(cable, options) if name.endswith(".rest")]
@@ -150,7 +150,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     recordings = {name: read_recording(folder / f"bdlo1_train_{name}.h5") for name in (*ESTIMATE, *HELD_OUT)}
     estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
     clock = time.perf_counter()
-    system = clamped_cable_system(typical_point_pair_distances(cable.edges, estimate), cable, OPTIONS)
+    system = clamped_cable_system(typical_point_pair_distances(cable.edge_vertex_names, estimate), cable, OPTIONS)
     step = yid.compile_step(system, TIME_STEP)
     seconds = {"build_and_compile": time.perf_counter() - clock}
     options = cable_options(cable, estimate + held_out, OPTIONS)

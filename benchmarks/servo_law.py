@@ -75,14 +75,16 @@ def left_out_errors(
     nominal = dict(zip(base.system.parameters.names, map(float, base.theta), strict=True))
     recordings = [episode.recording for episode in base.episodes]
     problem = EstimationProblem(step, recordings, (*base.free, *names), base.options, nominal)
-    evaluation = problem.evaluate(problem.vector(known))
+    evaluation = problem.evaluate(problem.unknown_vector(known))
     residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     at = [problem.unknown_names.index(name) for name in names]
     basis, _ = np.linalg.qr(np.delete(jacobian, at, axis=1))
     rest, slopes = (x - basis @ (basis.T @ x) for x in (residual, jacobian[:, at]))
     family = gap_law._family(law, rest, slopes)
     whole = with_prior(problem, law, family.precision)
-    fitted = GaussNewton(max_iterations=MAX_ITERATIONS).minimize_cost(whole, whole.vector(known | family.values), None)
+    fitted = GaussNewton(max_iterations=MAX_ITERATIONS).minimize_cost(
+        whole, whole.unknown_vector(known | family.values), None
+    )
     errors = dict[str, float]()
     for kind, own in kinds.items():
         others = np.concatenate([x for name, x in values.items() if name not in own])

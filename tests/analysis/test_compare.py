@@ -362,7 +362,7 @@ class Means:
         assert values == {"a.memory": 0.0}
         return self
 
-    def vector(self, values):
+    def unknown_vector(self, values):
         return np.array([values[name] for name in self.unknown_names])
 
 

@@ -51,8 +51,8 @@ def swing(folder, name, seed, effects="[]"):
     run = load_config(folder / "beam.yaml", (f"model.effects={effects}",))
     problem = build_problem(run)
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
-    values = problem.named_values(problem.vector({**TRUTH, **start}))
-    theta, offset = problem.theta_and_initial_state_deviation(problem.vector(values), 0)
+    values = problem.named_values(problem.unknown_vector({**TRUTH, **start}))
+    theta, offset = problem.theta_and_initial_state_deviation(problem.unknown_vector(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
     made = recording_from_prediction(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)

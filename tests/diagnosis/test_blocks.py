@@ -54,7 +54,7 @@ class Problem:
     tried: list = field(default_factory=list)
     has_process_noise: bool = False
 
-    def vector(self, values):
+    def unknown_vector(self, values):
         return values
 
     def with_episodes(self, episodes, held_out):

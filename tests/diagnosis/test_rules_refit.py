@@ -52,7 +52,7 @@ class Problem:
         return self
 
     def with_effects_and_relinearized_filters(self, effects, at):
-        self.at.append(self.named_values(self.vector(at)))
+        self.at.append(self.named_values(self.unknown_vector(at)))
         return self.with_nominal_and_effects_free(effects)
 
     def with_relinearized_held_out_filters(self, own, effects, at):
@@ -60,7 +60,7 @@ class Problem:
         self.foreseen.append(dict(at))
         return self
 
-    def vector(self, values):
+    def unknown_vector(self, values):
         return np.array([values.get(name, 1.0) for name in self.unknown_names])
 
     def named_values(self, x):

@@ -93,7 +93,7 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     held = zip(own.held_out_whitening_filters, extended.held_out_whitening_filters, strict=True)
     assert all(x is y is not None for x, y in held)
     assert made.problem.whitening_filters == made.problem.held_out_whitening_filters == (None,)
-    x = own.vector({"elbow.stiffness": 2.5})
+    x = own.unknown_vector({"elbow.stiffness": 2.5})
     assert own.evaluate(x, False).cost == pytest.approx(
         problem_with_whitening_at(own, x).evaluate(x, False).cost, rel=0.02
     )
@@ -105,7 +105,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     made = composed(step, held_out, "effort_offset", "joint_viscous").whitened_at({"elbow.stiffness": 2.5})
     wide = made.with_nominal_and_effects_free(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
-    x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
+    x, frozen = (wide.unknown_vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
     moved = problem_with_relinearized_held_out_whitening(
         problem_relinearized_at_torque_bias(wide, x, frozen), x, frozen
     )
@@ -142,7 +142,7 @@ def test_candidates_of_other_places_are_left_out_of_a_refit(step):
     for hypotheses in (all_places, one_place):
         own = hypotheses.with_effects_and_relinearized_filters([friction], at)
         own = hypotheses.with_relinearized_held_out_filters(own, [friction], at)
-        x = own.vector(at)
+        x = own.unknown_vector(at)
         evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
         rows = own.whitened_held_out_prediction_residual(0, *held).residual
         found.append((own.unknown_names, evaluation.residual, evaluation.jacobian, rows))
@@ -170,7 +170,7 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     made = composed(step, True)
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
     bare = problem_without_input_errors(made.problem)
-    plain = bare.evaluate(bare.vector(fit.values), False)
+    plain = bare.evaluate(bare.unknown_vector(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
     test = _held_out_null_test(fit)
     assert 0.8 < test.chi2_per_dof < 1.2
@@ -182,7 +182,7 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     made = composed(step, True)
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
     spread = unknowns_covariance_factor(fit.problem, fit.evaluation)
-    off = fit.problem.vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
+    off = fit.problem.unknown_vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     moved = replace(fit, values=fit.problem.named_values(off))
     assert _held_out_null_test(moved).p_value < 1e-12
     less = replace(fit.evaluation, jacobian=fit.evaluation.jacobian / 50)

@@ -172,7 +172,7 @@ def prescribed(benches) -> Bench:
 @pytest.fixture(scope="session")
 def cable() -> tuple[CableTopology, Recording, System]:
     layout, recording = made_cable()
-    lengths = typical_point_pair_distances(layout.edges, [recording])
+    lengths = typical_point_pair_distances(layout.edge_vertex_names, [recording])
     return layout, recording, clamped_cable_system(lengths, layout, CableOptions())
 
 

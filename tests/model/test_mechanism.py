@@ -90,7 +90,7 @@ def test_a_cable_is_counted_from_clamp_to_clamp():
     parent = ("a", "b", "c", "d", "e")
     shape = {name: [0.1 * i, 0.0, 0.0] for i, name in enumerate(parent)} | {"f": [0.2, 0.0, 0.1]}
     cable = CableTopology(parent, {"child": ("c", "f")}, shape)
-    tree = clamped_cable_system(dict.fromkeys(cable.edges, 0.1), cable).mechanism
+    tree = clamped_cable_system(dict.fromkeys(cable.edge_vertex_names, 0.1), cable).mechanism
     along = places(tree, ["parent:0%", "parent:12.5%", "parent:25%", "parent:50%", "parent:100%", "child:50%"])
     a, b, c, e, f = places(tree, ["a", "b", "c", "e", "f"])
     for found, place in zip(along, (a, (a + b) / 2, b, c, e, (c + f) / 2), strict=True):

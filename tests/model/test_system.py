@@ -189,7 +189,7 @@ def test_changed_sets_keep_order_and_symbols(three):
     assert ca.is_equal(changed["T1.bend"].symbol, three["T1.bend"].symbol)
     more = three.with_added([Parameter("a", 1.0, "1")], [Parameter("b", 2.0, "1")])
     assert more.names == (*three.names, "a", "b")
-    lower, upper = three.bounds(["T1.mass", "wind@object.speed"])
+    lower, upper = three.lower_and_upper_bounds(["T1.mass", "wind@object.speed"])
     assert (lower.tolist(), upper.tolist()) == ([0.0, -math.inf], [1.0, math.inf])
 
 
@@ -201,7 +201,7 @@ def test_changed_sets_keep_order_and_symbols(three):
         (lambda p: p.vector({"T1.bend": math.nan}), ["T1.bend = nan", "finite"]),
         (lambda p: p.with_nominal_values({"T1.mass": 2.0}), ["T1.mass = 2 kg", "0 to 1 kg"]),
         (lambda p: p.with_nominal_values({"T1.mas": 2.0}), ["did you mean 'T1.mass'?"]),
-        (lambda p: p.bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
+        (lambda p: p.lower_and_upper_bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
         (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["two parameters are called", "T1.bend"]),
         (lambda p: Parameter("x", math.inf, "1"), ["x = inf"]),
         (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "2 to inf"]),

@@ -99,7 +99,7 @@ def twin(cable, clamps):
     )
     stub = as_recording(cable, t, held)
     system = clamped_cable_system(
-        typical_point_pair_distances(cable.edges, [as_recording(cable, t, {})]), cable, options
+        typical_point_pair_distances(cable.edge_vertex_names, [as_recording(cable, t, {})]), cable, options
     )
     step = compile_step(system, PERIOD)
     path = prescribed_coordinates_at_nodes(
@@ -206,13 +206,13 @@ def test_edges_are_as_long_as_measured(cable):
     t = PERIOD * np.arange(4)
     seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertex_names}
     recording = as_recording(cable, t, seen)
-    lengths = typical_point_pair_distances(cable.edges, [recording])
+    lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
     assert lengths["c1", "c2"] == pytest.approx(expected)
-    values = edge_length_parameter_values(cable, typical_point_pair_distances(cable.edges, [recording], 2))
+    values = edge_length_parameter_values(cable, typical_point_pair_distances(cable.edge_vertex_names, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
     assert set(values) <= set(
-        clamped_cable_system(typical_point_pair_distances(cable.edges, [recording]), cable).parameters.names
+        clamped_cable_system(typical_point_pair_distances(cable.edge_vertex_names, [recording]), cable).parameters.names
     )
     np.testing.assert_array_equal(_measured_positions(recording, "c1"), seen["c1"])
 
@@ -249,7 +249,7 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, 
     cable, recording = real.branched_cable(folder), read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(shape_memory_fraction=0.75)
     step = compile_step(
-        clamped_cable_system(typical_point_pair_distances(cable.edges, [recording]), cable, options),
+        clamped_cable_system(typical_point_pair_distances(cable.edge_vertex_names, [recording]), cable, options),
         PERIOD,
         use_compiler=False,
     )

@@ -38,7 +38,7 @@ def test_what_is_simulated_is_what_is_found(problem):
     assert np.array_equal(made.points[0].t, problem.episodes[0].recording.points[0].t)
     again = EstimationProblem(problem.step, [made], FREE, problem.options)
     solution = yid.solve(again)
-    at_truth = again.evaluate(again.vector(truth), derivatives=False)
+    at_truth = again.evaluate(again.unknown_vector(truth), derivatives=False)
     assert np.abs(at_truth.residual[again.residual_rows.data]).max() < 1e-9
     for name, value in truth.items():
         # but for the weak prior

@@ -122,7 +122,11 @@ def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
 
 
 def predicted(problem, values, group=0):
-    return problem.evaluate(problem.vector(values), derivatives=False).episode_predictions[0].predicted_outputs[group]
+    return (
+        problem.evaluate(problem.unknown_vector(values), derivatives=False)
+        .episode_predictions[0]
+        .predicted_outputs[group]
+    )
 
 
 def test_a_late_camera_sees_what_was_before(urdf_folder):
@@ -130,7 +134,11 @@ def test_a_late_camera_sees_what_was_before(urdf_folder):
     camera = problem.episodes[0].measurements[1]
     delay = "camera_latency@camera.delay"
     neutral = {"clock_scale@clock.scale": 1.0}
-    whole = problem.evaluate(problem.vector({**neutral, delay: 0.0}), False).episode_predictions[0].predicted_outputs[0]
+    whole = (
+        problem.evaluate(problem.unknown_vector({**neutral, delay: 0.0}), False)
+        .episode_predictions[0]
+        .predicted_outputs[0]
+    )
     t = H * (camera.node + camera.fraction)
     late = predicted(problem, {**neutral, delay: 0.02}, group=1)
     for i in range(3):
@@ -156,7 +164,7 @@ def test_an_encoder_that_is_offset_moves_the_path(urdf_folder):
     episode = problem.episodes[0]
     inputs = problem.predictor.corrected_inputs(episode, problem.system.parameters.vector(values), ())
     np.testing.assert_allclose(inputs.prescribed_path - episode.prescribed_path, -0.05, atol=1e-12)
-    rollout = problem.evaluate(problem.vector(values), False).episode_predictions[0].rollout
+    rollout = problem.evaluate(problem.unknown_vector(values), False).episode_predictions[0].rollout
     np.testing.assert_allclose(rollout.state[:, 0], inputs.prescribed_path[:, 0], atol=1e-12)
 
 

@@ -80,7 +80,7 @@ def test_start_bounds_and_values_by_name(make):
     assert upper[0] == math.inf
     np.testing.assert_array_equal(lower[3:], -np.inf)
     np.testing.assert_array_equal(upper[3:], np.inf)
-    found = problem.vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
+    found = problem.unknown_vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
     changed = {"elbow.stiffness": 9.0, "shoulder.stiffness": 0.0, "start.q.elbow[run_1]": 0.5}
     assert problem.named_values(found) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0), **changed}
 
@@ -200,7 +200,7 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
 def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
     """Readings of the tip, interpolated between nodes, in the camera's frame: nothing else enters the residual."""
     problem = make(seeds=(1,))
-    x = problem.vector({"elbow.stiffness": 4.0})
+    x = problem.unknown_vector({"elbow.stiffness": 4.0})
     evaluation = problem.evaluate(x, derivatives=False)
     assert evaluation.jacobian is None
     result = evaluation.episode_predictions[0]
@@ -290,7 +290,7 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
 
 def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, held):
     problem = make(held_out=held, local_parameters=("elbow.rest",), initial_state="estimated")
-    x = problem.vector({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
+    x = problem.unknown_vector({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
     found = problem.predict_held_out(x)
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
     for i, (episode, result) in enumerate(found):
@@ -304,7 +304,7 @@ def test_a_held_out_part_of_a_recording_shares_its_start(make):
     problem = make(initial_state="estimated")
     part = replace(problem.episodes[1], initial_state_shared_with=1)
     split = problem.with_episodes(problem.episodes, [part])
-    x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
+    x = problem.unknown_vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
     assert (
         split.held_out_prediction_inputs(x)[0][2].tolist()
         == problem.theta_and_initial_state_deviation(x, 1)[1].tolist()

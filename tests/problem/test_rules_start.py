@@ -144,7 +144,7 @@ def test_parameters_are_fitted_along_with_the_start(urdf_folder):
     """The camera is turned: an arm that sees the same points tells by how much, up to the bounds."""
     step = pendulum_step(urdf_folder, (("camera_rotation", "camera", {}),))
     q, pose = np.array([0.6, -0.9]), tuple(map(tuple, np.eye(4).tolist()))
-    lower, upper = step.system.parameters.bounds((TURN,))
+    lower, upper = step.system.parameters.lower_and_upper_bounds((TURN,))
     assert np.all(np.isfinite([*lower, *upper]))
     sharp = np.full((1, 6), 1e3)
     here = at(0, q)

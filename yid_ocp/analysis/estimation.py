@@ -204,7 +204,7 @@ def choose_cable_memory_fit(
         return ChosenCableMemoryFit(problem, solution)
     without = problem_without_cable_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
-    other = solvers.solve(without, solver, without.vector(known).tolist(), limits=limits)
+    other = solvers.solve(without, solver, without.unknown_vector(known).tolist(), limits=limits)
     if other.evaluation is None:
         return ChosenCableMemoryFit(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:

@@ -64,7 +64,7 @@ def cross_validate_friction_law(
         inside, outside = ([pair for pair in pairs if (pair[0].name in own) == out] for out in (False, True))
         (episodes, filters), (left, left_filters) = zip(*inside, strict=True), zip(*outside, strict=True)
         fold = problem.with_episodes(episodes, left, filters, left_filters)
-        start = fold.vector({name: known[name] for name in fold.unknown_names})
+        start = fold.unknown_vector({name: known[name] for name in fold.unknown_names})
         found = GaussNewton(max_iterations=_MAX_FOLD_ITERATIONS).minimize_cost(fold, start, None)
         for episode, outcome in fold.predict_held_out(found.x):
             if isinstance(outcome, str):

@@ -312,7 +312,7 @@ def cable_point_geometry_issues(cable: CableTopology, recording: Recording, grav
     """Yield issues about cable points above the clamps, or with edge lengths unlike the undeformed shape."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertex_names if name in group.names}
-        edges = [edge for edge in cable.edges if edge[0] in at and edge[1] in at]
+        edges = [edge for edge in cable.edge_vertex_names if edge[0] in at and edge[1] in at]
         if len(edges) < 3:
             continue
         rest = {name: np.asarray(cable.undeformed_positions[name], float) for name in at}
@@ -369,7 +369,7 @@ def _upside_down(
         chord = 0.5 * (where[ends[0]] + where[ends[1]])
         return float(np.nanmean([np.nanmean((where[name] - chord) @ up) for name in free]))
 
-    span = sum(float(np.linalg.norm(rest[a] - rest[b])) for a, b in cable.edges if a in rest and b in rest)
+    span = sum(float(np.linalg.norm(rest[a] - rest[b])) for a, b in cable.edge_vertex_names if a in rest and b in rest)
     height, allowed = rise(at) / span, 0.05 + abs(rise(rest)) / span
     if not height > allowed:
         return None

@@ -129,7 +129,7 @@ _MAX_LISTED_SYMBOLS = 6  # names of one block that are still listed one by one
 
 
 @dataclass(frozen=True)
-class SymbolBlock:
+class _SymbolBlock:
     """A named block of equations or variables of one kind, as a symbolic column (k, 1).
 
     `labels` has one entry per row: the name of a joint, grasp equation, internal coordinate or parameter.
@@ -190,8 +190,8 @@ class NamedStepEquations(ReprMixin):
     """
 
     equations: DiscreteEquations
-    row_blocks: tuple[SymbolBlock, ...]
-    column_blocks: tuple[SymbolBlock, ...]
+    row_blocks: tuple[_SymbolBlock, ...]
+    column_blocks: tuple[_SymbolBlock, ...]
 
     def _summary(self) -> ReprLineAndTableRows:
         blocks = (*self.row_blocks, *self.column_blocks)
@@ -206,21 +206,21 @@ class NamedStepEquations(ReprMixin):
         joints, internal = system.mechanism.joint_names, tuple(system.effect_internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
         rows = (
-            SymbolBlock("del", joints, e.momentum_balance, "DEL equation, balance of momentum"),
-            SymbolBlock("internal", internal, e.internal_residual, "equation of an internal coordinate"),
-            SymbolBlock("constraint", closed, e.constraint_residual, "equation of a grasp"),
-            SymbolBlock("p1", joints, e.p1, "momentum after the step"),
+            _SymbolBlock("del", joints, e.momentum_balance, "DEL equation, balance of momentum"),
+            _SymbolBlock("internal", internal, e.internal_residual, "equation of an internal coordinate"),
+            _SymbolBlock("constraint", closed, e.constraint_residual, "equation of a grasp"),
+            _SymbolBlock("p1", joints, e.p1, "momentum after the step"),
         )
         columns = (
-            SymbolBlock("q0", joints, e.q0, "coordinates before the step"),
-            SymbolBlock("p0", joints, e.p0, "momenta before the step"),
-            SymbolBlock("z0", internal, e.z0, "internal coordinates before the step"),
-            SymbolBlock("u", system.driven, e.u, "commands of servos" if system.servos else "motor torques"),
-            SymbolBlock("theta", system.parameters.names, e.theta, "parameters"),
-            SymbolBlock("time_step", ("h",), e.time_step, "time step"),
-            SymbolBlock("q1", joints, e.q1, "coordinates after the step"),
-            SymbolBlock("z1", internal, e.z1, "internal coordinates after the step"),
-            SymbolBlock("lam", closed, e.lam, "multipliers of the grasps"),
+            _SymbolBlock("q0", joints, e.q0, "coordinates before the step"),
+            _SymbolBlock("p0", joints, e.p0, "momenta before the step"),
+            _SymbolBlock("z0", internal, e.z0, "internal coordinates before the step"),
+            _SymbolBlock("u", system.driven, e.u, "commands of servos" if system.servos else "motor torques"),
+            _SymbolBlock("theta", system.parameters.names, e.theta, "parameters"),
+            _SymbolBlock("time_step", ("h",), e.time_step, "time step"),
+            _SymbolBlock("q1", joints, e.q1, "coordinates after the step"),
+            _SymbolBlock("z1", internal, e.z1, "internal coordinates after the step"),
+            _SymbolBlock("lam", closed, e.lam, "multipliers of the grasps"),
         )
         return NamedStepEquations(equations, rows, columns)
 
@@ -313,7 +313,7 @@ def _headline(title: str, count: int, variables: Sequence[str]) -> str:
     return f"{title}: {count} operations, depends on {', '.join(variables) or 'nothing'}"
 
 
-def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[SymbolBlock, ...]) -> int:
+def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[_SymbolBlock, ...]) -> int:
     """Index of a row or column by its full name. Raises `ConfigError`, with the nearest name, if there is none."""
     if name in known:
         return known.index(name)

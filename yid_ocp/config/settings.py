@@ -112,7 +112,7 @@ class EffectSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointActuationSettings:
+class _JointActuationSettings:
     """Moving joints of the robot, and how each is driven."""
 
     joints: Annotated[_Names | None, OptionInfo("moving joints, in order; default: all movable")] = None
@@ -169,7 +169,7 @@ class FrictionLawSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelSettings:
+class _ModelSettings:
     """Mechanical model of robot and flexible object: grasps, clamps, frames and effects."""
 
     robot: Annotated[
@@ -183,8 +183,8 @@ class ModelSettings:
         Mapping[str, _MeasuredClampSettings],
         OptionInfo("clamps that move an object without a robot, by name; a cable has its own clamps at both ends"),
     ] = field(default_factory=dict)
-    arms: Annotated[JointActuationSettings, OptionInfo("joints of the robot and their drive")] = (
-        JointActuationSettings()
+    arms: Annotated[_JointActuationSettings, OptionInfo("joints of the robot and their drive")] = (
+        _JointActuationSettings()
     )
     frames: Annotated[
         Mapping[str, _FrameSettings],
@@ -454,7 +454,7 @@ class RunSettings:
     plugins: Annotated[
         tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are executed")
     ] = ()
-    model: Annotated[ModelSettings, OptionInfo("the mechanical model")] = ModelSettings()
+    model: Annotated[_ModelSettings, OptionInfo("the mechanical model")] = _ModelSettings()
     recordings: Annotated[RecordingsSettings, OptionInfo("recordings for estimation and test")] = RecordingsSettings()
     import_: Annotated[ImportSettings, OptionInfo("conversion of other tools' files to recordings")] = ImportSettings()
     sensors: Annotated[

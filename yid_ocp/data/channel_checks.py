@@ -324,7 +324,7 @@ class Issue:
         return "perhaps" if self.evidence_ratio < 1.5 else "likely" if self.evidence_ratio < 3 else "certain"
 
     @property
-    def where(self) -> str:
+    def location_text(self) -> str:
         """Location of the issue as text: recording, group, channel and time."""
         place = "/".join(part for part in (self.recording, self.group, self.channel) if part)
         span = "" if self.begin is None or self.end is None else f", {self.begin:.4g} to {self.end:.4g} s"

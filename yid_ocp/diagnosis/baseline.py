@@ -268,7 +268,7 @@ def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProbl
 def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Sequence[EffectBase]) -> _ChannelErrors:
     if problem.has_process_noise:
         problem = problem_with_sensor_noise_only(problem)
-    found = problem.predict_held_out(problem.vector({**neutral_effect_parameter_values(effects), **values}))
+    found = problem.predict_held_out(problem.unknown_vector({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:
         raise failed_rollout_error(failed[0], "held-out recordings")

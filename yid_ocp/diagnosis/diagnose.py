@@ -289,9 +289,9 @@ def _finer_step_that_explains_gap(
     """All hypotheses at half the time step, if it explains over half of the predicted decrease; else None."""
     h = fit.problem.step.time_step / 2
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
-    finer = search.problem.with_time_step(h)
+    finer, x = search.problem.with_time_step(h), fit.problem.unknown_vector(fit.values)
     fine = problem_corrected_for_events(finer.problem, events)
-    left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.problem.vector(fit.values), fit.evaluation)
+    left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
     if left is None:
         return None
     excess, rest = (float(r @ r) - np.count_nonzero(r) for r in (fit.evaluation.residual, left))
@@ -313,7 +313,7 @@ def _happened(
     whole: EstimationProblem, fit: RefittedModel, limits: Thresholds, weighted: EstimationProblem | None = None
 ) -> tuple[EventSet, SmoothedUnknownsResult | None]:
     """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
-    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
+    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.unknown_vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
     if own.system.unprescribed_coordinate_indices:
         judged = weighted or problem_with_whitening_at(own, x, guesses)
@@ -336,7 +336,7 @@ def _happened(
 
 def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     """r'r of a fit minus the number of used samples, over all recordings that can be predicted."""
-    x, guesses = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
+    x, guesses = problem.unknown_vector(fit.values), fit.evaluation.equilibrium_guesses
     judged = problem_with_whitening_at(problem, x, guesses)
     evaluation = judged.evaluate(x, False, guesses)
     if not evaluation.ok:
@@ -446,7 +446,8 @@ def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> Ref
         composed = composed.whitened_at(start)
         first = refit_with_effects(composed, (), start, limits=limits)
         if first is not None:
-            slopes, moved = first.evaluation.jacobian, first.problem.vector(first.values) - first.problem.vector(start)
+            slopes, vector = first.evaluation.jacobian, first.problem.unknown_vector
+            moved = vector(first.values) - vector(start)
             if slopes is not None and float(np.linalg.norm(slopes @ moved)) < _SAME_WEIGHTS_STDS:
                 if search.store is not None:
                     known = StoredFit(first.values, first.std, first.p_values, first.solver_message)
@@ -543,7 +544,7 @@ def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits:
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
-    spread = residual_spread_from_encoder_noise(fit.problem, fit.problem.vector(fit.values))
+    spread = residual_spread_from_encoder_noise(fit.problem, fit.problem.unknown_vector(fit.values))
     residual = whiten_with_extra_errors(fit.evaluation.residual, spread)
     return _null_test(fit.problem, residual, len(fit.values), limits)
 
@@ -552,7 +553,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
     """The null test of a model on the held-out recordings."""
     problem, shared = fit.problem, len(fit.problem.shared_parameters)
     residuals, slopes = [], []
-    for i, (episode, result) in enumerate(problem.predict_held_out(problem.vector(fit.values), True)):
+    for i, (episode, result) in enumerate(problem.predict_held_out(problem.unknown_vector(fit.values), True)):
         if isinstance(result, str):
             what, allowed = (
                 f"the held-out recording cannot be predicted: {result}",
@@ -564,7 +565,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
         assert rows.jacobian is not None
         residuals.append(rows.residual)
         slopes.append(rows.jacobian[:, :shared])
-    x, own = problem.vector(fit.values), problem.with_episodes(problem.held_out, ())
+    x, own = problem.unknown_vector(fit.values), problem.with_episodes(problem.held_out, ())
 
     def predicted(moved: EstimationProblem) -> Array | None:
         other = problem.with_episodes(problem.episodes, moved.episodes)
@@ -584,7 +585,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
 
 def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnknownsResult:
     """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns."""
-    problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
+    problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.unknown_vector(fit.values)
     if problem.has_process_noise:
         problem = problem_with_sensor_noise_only(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)

@@ -118,7 +118,7 @@ class EventSet:
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 
-    def for_recording(self, recording: str) -> tuple[ForceOrFaultEvent, ...]:
+    def events_of_recording(self, recording: str) -> tuple[ForceOrFaultEvent, ...]:
         """Events of one recording."""
         return tuple(event for event in self.disturbances if event.recording == recording)
 
@@ -420,7 +420,7 @@ def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -
     system, cutoff = problem.system, problem.options.path_cutoff
 
     def cleaned(episode: Episode) -> Episode:
-        own, end = events.for_recording(episode.name), events._end_of(episode.name)
+        own, end = events.events_of_recording(episode.name), events._end_of(episode.name)
         if not own and not math.isfinite(end):
             return episode
         torque = episode.torque.copy()

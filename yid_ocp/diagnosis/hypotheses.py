@@ -165,7 +165,7 @@ class AllCandidatesProblem:
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
         """Problem whitened by sensor and torque noise, with filters linearised at `values`."""
         # filters are linearised about the estimated torques, so these must be known first
-        x, errors = self.problem.vector(values), (episode.input_errors for episode in self.problem.episodes)
+        x, errors = self.problem.unknown_vector(values), (episode.input_errors for episode in self.problem.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
         made = problem_with_whitening_at(self.problem, x, rounds=1 if known else 2)
         return replace(self, problem=problem_with_held_out_kalman_whitening(made, x))
@@ -194,7 +194,7 @@ class AllCandidatesProblem:
         `margin` is the fraction kept of the duration that the model follows. If too little of every recording remains,
         estimation recordings are split in blocks instead. Residuals are whitened by sensor noise; see `whitened_at`.
         """
-        problem, x = self.problem, self.problem.vector(values)
+        problem, x = self.problem, self.problem.unknown_vector(values)
         kept, cuts = [], []
         for episode in problem.held_out:
             whole, h = episode.grid.steps, episode.grid.time_step
@@ -281,7 +281,7 @@ def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFuncti
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
     """Unknowns at some values, and with neutral effects, for the linearisation of filters."""
-    return own.vector(at), own.vector({**at, **neutral_effect_parameter_values(effects)})
+    return own.unknown_vector(at), own.unknown_vector({**at, **neutral_effect_parameter_values(effects)})
 
 
 def _same(a: Recording, b: Recording) -> bool:

@@ -242,7 +242,7 @@ def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:
 
 def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
     """Values of a quantity in all estimation recordings, (samples,)."""
-    problem, x, found = model.problem, model.problem.vector(model.values), []
+    problem, x, found = model.problem, model.problem.unknown_vector(model.values), []
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
         theta = problem.predictor.theta_with_episode_values(episode, problem.theta_and_initial_state_deviation(x, i)[0])
         nodes = _along(result, episode.grid.time_step)
@@ -277,7 +277,7 @@ def _composed_with_laws(
 def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[TorqueLaw]) -> list[_Family]:
     """The families to refit, by the evidence of a fit linearised about the model without a law."""
     own = composed.with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
-    evaluation = own.evaluate(own.vector(before.values), equilibrium_guesses=before.evaluation.equilibrium_guesses)
+    evaluation = own.evaluate(own.unknown_vector(before.values), True, before.evaluation.equilibrium_guesses)
     if not evaluation.ok or evaluation.jacobian is None:
         return []
     residual, jacobian = residual_and_jacobian_without_weak_priors(own, evaluation)

@@ -305,7 +305,7 @@ def load_stored_refit(
     if known is None or not (set(known.values) == set(known.std) == unknowns and set(known.p_values) == labels):
         return None
     own = problem.with_effects_and_relinearized_filters(effects, known.values)
-    x = own.vector(known.values)
+    x = own.unknown_vector(known.values)
     finish = own.evaluate(x)
     if not finish.ok:
         return None
@@ -318,7 +318,7 @@ def model_in_step_of_all_candidates(problem: AllCandidatesProblem, fit: Refitted
     if fit.problem.step is problem.problem.step:
         return fit
     own = problem.with_effects_and_relinearized_filters(fit.effects, fit.values)
-    finish = own.evaluate(own.vector(fit.values))
+    finish = own.evaluate(own.unknown_vector(fit.values))
     own = problem.with_relinearized_held_out_filters(own, fit.effects, fit.values)
     return replace(fit, problem=own, evaluation=finish)
 
@@ -345,7 +345,7 @@ def _half_done(
 ) -> bool:
     """Whether a refit explains much, but by far not all, of the gap left without its effects."""
     own, count = problem.with_nominal_and_effects_free(effects), len(finish.residual)
-    x = own.vector({**start, **neutral_effect_parameter_values(effects)})
+    x = own.unknown_vector({**start, **neutral_effect_parameter_values(effects)})
     before = own.evaluate(x, False, finish.equilibrium_guesses)
     if 2 * finish.cost < (1 + limits.min_excess_chi2_per_dof) * count or not before.ok:
         return False
@@ -372,7 +372,7 @@ def _attempt(
     own = problem.with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
-        outcome = REFIT_SOLVER.minimize_cost(own, own.vector({**start, **drawn}), None)
+        outcome = REFIT_SOLVER.minimize_cost(own, own.unknown_vector({**start, **drawn}), None)
         if outcome.status != Status.FAILED:
             break
     found = _seen(problem, effects, outcome)

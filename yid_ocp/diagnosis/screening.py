@@ -108,7 +108,7 @@ def linearize_candidates(
         amplitudes = [name for effect in chosen for name in effect.amplitude_parameter_names]
         trial = placed.with_free_parameters_without_recompiling((*problem.nominal_free_parameters, *own, *amplitudes))
         trial = trial.with_parameter_values(shape)
-        evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
+        evaluation = trial.evaluate(trial.unknown_vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message, "model with the candidate effects")
         names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
@@ -117,7 +117,7 @@ def linearize_candidates(
         if k == 0:
             basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
             residual = data - basis @ (basis.T @ data)
-            scatter = residual_spread_from_encoder_noise(trial, trial.vector(values))[: len(data)]
+            scatter = residual_spread_from_encoder_noise(trial, trial.unknown_vector(values))[: len(data)]
         moved = jacobian[:, places]
         moved = moved - basis @ (basis.T @ moved)
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect in chosen])[:-1]

@@ -108,7 +108,7 @@ class Parameters(ReprMixin):
         """Return a copy with the parameters of `others` appended."""
         return Parameters([*self._entries, *(entry for other in others for entry in other)])
 
-    def bounds(self, names: Sequence[str]) -> tuple[Array, Array]:
+    def lower_and_upper_bounds(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Lower and upper bounds of the named parameters, two arrays (len(names),)."""
         chosen = [self[name] for name in names]
         return np.array([e.lower for e in chosen], dtype=float), np.array([e.upper for e in chosen], dtype=float)

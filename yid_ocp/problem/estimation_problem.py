@@ -177,7 +177,7 @@ class EstimationProblem(ReprMixin):
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the unknown vector, (nx,) each."""
         parts = (self.shared_parameters, self.local_parameters)
-        (low, high), (own_low, own_high) = (self.system.parameters.bounds(part) for part in parts)
+        (low, high), (own_low, own_high) = (self.system.parameters.lower_and_upper_bounds(part) for part in parts)
         wide = initial_internal_state_offset_bounds(self.system, self.unknowns.initial_state_names)
         pack = self.unknowns.pack_same_for_all_recordings
         return pack(low, own_low, -wide), pack(high, own_high, wide)
@@ -221,7 +221,7 @@ class EstimationProblem(ReprMixin):
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""
         return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
 
-    def vector(self, values: Mapping[str, float]) -> Array:
+    def unknown_vector(self, values: Mapping[str, float]) -> Array:
         """Copy (nx,) of the initial unknown vector, with the named `values` inserted and clipped to the bounds."""
         start = self.named_values(self.initial_unknowns)
         return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)

@@ -194,7 +194,7 @@ class InitialStateFitter:
     def _trials(self, values: Array) -> list[Array]:
         if not self.fitted_parameters:
             return [values]
-        lower, upper = self.step.system.parameters.bounds(self.fitted_parameters)
+        lower, upper = self.step.system.parameters.lower_and_upper_bounds(self.fitted_parameters)
         shares = (np.arange(_TRIALS_PER_PARAMETER) + 0.5) / _TRIALS_PER_PARAMETER
         grids = [low + (high - low) * shares for low, high in zip(lower, upper, strict=True)]
         return [values, *(np.array(entry) for entry in itertools.product(*grids))]
@@ -203,7 +203,7 @@ class InitialStateFitter:
         """Fitted configuration, fitted parameter values and the sum of squares."""
         free = self._free
         index = [self.step.system.parameters.index(name) for name in self.fitted_parameters]
-        lower, upper = self.step.system.parameters.bounds(self.fitted_parameters)
+        lower, upper = self.step.system.parameters.lower_and_upper_bounds(self.fitted_parameters)
         q, theta = guess.copy(), task.theta.copy()
         theta[index] = values
         wanted = index[: task.wanted]

@@ -194,7 +194,7 @@ class ResidualTerm:
         limit = self.huber_threshold
         return r if math.isinf(limit) else ca.fmax(ca.fmin(r, limit), -limit)
 
-    def loss_hessian_residual_weights(self, r: ca.MX, exact: bool) -> ca.MX | None:
+    def _loss_hessian_residual_weights(self, r: ca.MX, exact: bool) -> ca.MX | None:
         """Weight of each residual in the Hessian of the loss. None if all weights are one.
 
         With `exact`, the weight is the second derivative of the Huber loss: one up to the threshold, zero beyond.
@@ -463,7 +463,7 @@ class NonlinearProgram(ReprMixin):
     def _data_curvature(self, exact: bool) -> ca.MX:
         total = ca.MX(self.w.numel(), self.w.numel())
         for residual, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
-            weight = residual.loss_hessian_residual_weights(r, exact)
+            weight = residual._loss_hessian_residual_weights(r, exact)
             weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
             total += self.lam_f * ca.mtimes(slope.T, weighted)
             if exact:

@@ -84,16 +84,16 @@ class CameraIntrinsics:
     def points_from_depth(self, depth: ArrayLike) -> Array:
         """Convert a depth image (height, width) to points (N, 3) [m] in the camera's frame, row by row.
 
-        Zero or NaN marks missing depth. Errors are as in `measured_depth_mask`.
+        Zero or NaN marks missing depth. Errors are as in `_measured_depth_mask`.
         """
         image = np.asarray(depth, float)
-        seen = np.flatnonzero(self.measured_depth_mask(image))
+        seen = np.flatnonzero(self._measured_depth_mask(image))
         # a third of the time that a mask over rows takes
         points = self.pixel_rays_at_unit_depth.reshape(-1, 3).take(seen, axis=0)
         points *= image.ravel().take(seen)[:, None]
         return points
 
-    def measured_depth_mask(self, depth: Array) -> BoolArray:
+    def _measured_depth_mask(self, depth: Array) -> BoolArray:
         """Mask (height, width) of measured pixels in a depth image. Raises `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             allowed = f"({self.height}, {self.width}), as the intrinsics say"

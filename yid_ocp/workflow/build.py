@@ -176,7 +176,7 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
         raise run.config_error(what, "recordings", "estimate", allowed="one or more", hint="add a recording")
     with add_setting_location_to_errors(run, "model", "object"):
         return item.build_system_with_clamps(
-            typical_point_pair_distances(item.topology().edges, recordings), run.model.gravity
+            typical_point_pair_distances(item.topology().edge_vertex_names, recordings), run.model.gravity
         )
 
 

@@ -90,8 +90,8 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
             if said.used_points is None:
                 sensors[name] = replace(said, used_points=cable.unclamped_vertex_names)
         for recording in recordings:
-            lengths = typical_point_pair_distances(cable.edges, [recording], _START_FRAMES)
-            if values := run.model.object.recording_parameter_values(lengths):
+            lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording], _START_FRAMES)
+            if values := run.model.object.parameter_values_for_edge_lengths(lengths):
                 own[recording.name] = values
     return replace(
         run.problem,
@@ -187,7 +187,7 @@ def min_initial_frame_distance_by_grasp(problem: EstimationProblem, episode: Epi
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
-        hint = f"first correct these issues: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
+        hint = f"first correct these issues: {'; '.join(f'{issue.location_text}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_initial_frame_distance_by_grasp(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
@@ -363,10 +363,10 @@ def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
     if not grave:
         return
     first, *others = grave
-    more = [f"{doubt.where}: {doubt.what}" for doubt in others]
+    more = [f"{doubt.location_text}: {doubt.what}" for doubt in others]
     what = "; ".join([f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}", *more])
     hint = first.advice + (f" ({first.setting})" if first.setting else "")
-    raise DataError(what, where=first.where, allowed="recordings without this issue", hint=hint)
+    raise DataError(what, where=first.location_text, allowed="recordings without this issue", hint=hint)
 
 
 def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
@@ -378,5 +378,5 @@ def issues_to_plain_data(doubts: Sequence[Issue]) -> list[dict[str, Any]]:
     found = []
     for doubt in _gravest_first(doubts):
         own = {"evidence" if key == "evidence_ratio" else key: value for key, value in asdict(doubt).items()}
-        found.append(own | {"sure": doubt.certainty_word, "where": doubt.where})
+        found.append(own | {"sure": doubt.certainty_word, "where": doubt.location_text})
     return found

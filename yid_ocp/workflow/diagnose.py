@@ -112,7 +112,7 @@ def run_diagnose(
         moving = not last.problem.options.clamp_pose_definitions_from_points and bool(
             system.driven or system.prescribed
         )
-        x = last.problem.vector(last.values)
+        x = last.problem.unknown_vector(last.values)
         own = {
             "model": _final_model_to_dict(finding),
             "doubts": issues_to_plain_data(problem.options.data_issues),
@@ -134,7 +134,7 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.screening.detectability} - {effect.label for effect in fit.effects}
-    theta, _ = problem.theta_and_initial_state_deviation(problem.vector(fit.values), 0)
+    theta, _ = problem.theta_and_initial_state_deviation(problem.unknown_vector(fit.values), 0)
     found = {}
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
@@ -229,7 +229,7 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
 
 def _held_out_predictions(finding: DiagnosisResult) -> list[EpisodeWithNominalAndEffectPredictions]:
     before, after = (
-        problem_with_sensor_noise_only(fit.problem).predict_held_out(fit.problem.vector(fit.values))
+        problem_with_sensor_noise_only(fit.problem).predict_held_out(fit.problem.unknown_vector(fit.values))
         for fit in (finding.nominal_model, finding.final_model)
     )
     return [
@@ -254,7 +254,7 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[EpisodeWithNominalAndE
 
 
 def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePrediction) -> ConfigurationTrajectory:
-    theta = fit.problem.theta_and_initial_state_deviation(fit.problem.vector(fit.values), 0)[0]
+    theta = fit.problem.theta_and_initial_state_deviation(fit.problem.unknown_vector(fit.values), 0)[0]
     return prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
 
 

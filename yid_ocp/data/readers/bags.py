@@ -150,7 +150,7 @@ class BagOptions(base.SelectionAndUnitOptions):
     """Options of `read_bag`: topics, joints and points, with their names in the recording, and units.
 
     Messages that lack one of the `joints` are skipped. `joints` is required if the messages of a topic differ in their
-    joints. `points` are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`. By default they are all topics of
+    joints. `point_names` has topics as keys, or `TOPIC:CHILD` for a frame of `/tf`. By default, all topics of
     points, poses and transforms except `/tf`, each under the last descriptive part of its name.
     """
 
@@ -176,7 +176,7 @@ def read_bag(
     Joints come from `sensor_msgs/JointState`; several topics are merged on one clock. In files without `JointState`,
     joints come from Franka's `FrankaState` and `FrankaRobotState` (with the estimated wrench as `wrist_estimated`),
     `DynamicJointState` and `JointTrajectoryControllerState` of `control_msgs`, or `RobotStateRTMsg` of `ur_msgs`.
-    `joint_topics` selects these topics even if there are `JointState` messages, and `fields` reads messages of any
+    `joint_topics` selects these topics even if there is a `JointState`, and `message_fields` reads messages of any
     type. Stamped points, poses and transforms of `geometry_msgs` and frames of `/tf` become points, one group per
     reference frame. Each topic of `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
 

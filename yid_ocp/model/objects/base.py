@@ -109,7 +109,7 @@ class CableTopology:
         return {self.parent_segment: self.parent_branch_vertex_names, **self.vertex_names_by_child_branch}
 
     @property
-    def edges(self) -> tuple[tuple[str, str], ...]:
+    def edge_vertex_names(self) -> tuple[tuple[str, str], ...]:
         """Pairs of vertex names, one for each edge, ordered by branch."""
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
@@ -256,7 +256,7 @@ class ClampedObject(Protocol):
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
         """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
 
-    def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    def parameter_values_for_edge_lengths(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         """Parameter values from one recording's edge lengths [m]; empty if all recordings share the lengths."""
 
 

@@ -37,13 +37,13 @@ def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObje
 def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     names = [f"{segment.name}.{quantity}" for segment in foam_y_segments() for quantity in ("bend", "twist")]
     return InitCommandObject(
-        FoamY(links=links), dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]", True
+        _FoamY(links=links), dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]", True
     )
 
 
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
-class FoamY(MountedObjectBuilder):
+class _FoamY(MountedObjectBuilder):
     """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the position of that experiment."""
 
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {

@@ -53,7 +53,7 @@ class FlexibleSegmentSettings:
         False
     )
 
-    def build_segment(self, name: str, damping: float, link_division: int) -> Segment:
+    def _build_segment(self, name: str, damping: float, link_division: int) -> Segment:
         """Build the named `Segment`. Links are divided into `link_division` links at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
             what, where, hint = f"segment '{name}' has no length", f"model.object.segments.{name}", "set one of the two"
@@ -96,7 +96,7 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
 
 
 def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
-    item = SegmentedObject(segments=segments)
+    item = _SegmentedObject(segments=segments)
     return InitCommandObject(item, base.initial_bending_values(item.build_segments(), _RIGIDITY_RATIO[word]))
 
 
@@ -176,7 +176,7 @@ def _branch(text: str, links: int) -> tuple[str, FlexibleSegmentSettings]:
 
 @OBJECT_KINDS.register("segments")
 @dataclass(frozen=True, kw_only=True)
-class SegmentedObject(MountedObjectBuilder):
+class _SegmentedObject(MountedObjectBuilder):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
@@ -212,4 +212,4 @@ stiffness_given_as_rigidity: true, clamped_at_base: true}
     )
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        return [s.build_segment(name, damping, link_division) for name, s in self.segments.items()]
+        return [s._build_segment(name, damping, link_division) for name, s in self.segments.items()]

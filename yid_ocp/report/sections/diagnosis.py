@@ -192,7 +192,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     ]
     by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_estimates:
-        found = [event for event in events.for_recording(force.recording) if event.channel == force.coordinate]
+        found = [event for event in events.events_of_recording(force.recording) if event.channel == force.coordinate]
         pulses = [(e.detected_pulse, e.start_time, e.end_time) for e in found if e.detected_pulse is not None]
         shape = sum((pulse.filtered_force_at(force.t) for pulse, *_ in pulses), np.zeros(len(force.t)))
         courses = (shape, force.assumed_model_error, -force.assumed_model_error)
