@@ -254,13 +254,13 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
 
 
 def joint_excitation_issues(
-    recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorOptions
+    recordings: Sequence[Recording], free_parameters: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
     """Yield an issue for each joint that hardly moves in any recording, although some of its parameters are free.
 
-    `asked` lists these parameters by joint. `position` holds the options of the position sensor.
+    `free_parameters` lists these parameters by joint. `position` holds the options of the position sensor.
     """
-    for joint, parameters in asked.items():
+    for joint, parameters in free_parameters.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:
             joints = recording.joints

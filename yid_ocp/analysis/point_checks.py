@@ -57,15 +57,15 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
 
 
-def robot_held_point_issues(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
-    """Yield issues about points that disagree with forward kinematics; `choice` returns a group's sensor options."""
+def robot_held_point_issues(arm: RecordedJointsModel, recording: Recording, options: _SensorChoices) -> Iterator[Issue]:
+    """Yield issues about points that disagree with forward kinematics; `options` returns a group's sensor options."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
         return
     holders = {grasp.held_frame: grasp.holder_frame for grasp in arm.system.grasps}
     for group in recording.points:
         # for a grasped point, the frame of the arm that holds it
-        marked = _point_frames(arm.system, group, choice(group.name))
+        marked = _point_frames(arm.system, group, options(group.name))
         held = {name: holders.get(frame, frame) for name, frame in marked.items()}
         known = filter(arm.is_frame_determined_by_angles, dict.fromkeys(held.values()))
         moved = {frame for frame in known if tree.ancestor_joint_indices(tree.frame(frame).joint_index)}
@@ -230,12 +230,12 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 
 
 def point_distance_issues(
-    arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, choice: _SensorChoices
+    arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, options: _SensorChoices
 ) -> Iterator[Issue]:
     """Yield issues about points farther apart, or farther from the root, than the object's length allows."""
     mechanism = system.mechanism
     for group in recording.points:
-        frames = _point_frames(system, group, choice(group.name))
+        frames = _point_frames(system, group, options(group.name))
         found = {name: _distances(arm, system, theta, frame) for name, frame in frames.items()}
         ways = {name: way for name, way in found.items() if way is not None}
         noise = _noise(group)

@@ -129,12 +129,12 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
     return float(np.nanmedian(spread)) if np.any(np.isfinite(spread)) else 0.0
 
 
-def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
+def excess_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
     """Find channels whose quantization or noise exceeds the stated noise. Channels below 20 Hz are skipped."""
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) < 100 or median_sample_period(t) > 0.05:
             continue
-        stated = _stated(recording, choice, group, channel)
+        stated = _stated(recording, options, group, channel)
         columns = values.reshape(len(t), -1).T
         step = max(quantization_step(column) for column in columns)
         size, wide = step / math.sqrt(12), float(np.ptp(values))
@@ -160,10 +160,10 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
-def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
+def overstated_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
     """Find channels whose noise is far below the noise that the recording states.
 
-    Channels of equal stated noise are judged together. Noise stated in the settings (`choice`) is not checked, because
+    Channels of equal stated noise are judged together. Noise stated in the settings (`options`) is not checked, because
     it may represent model error. The noise is estimated from all samples, every second sample, and so on up to a period
     of `_MAX_SAMPLE_PERIOD`, because it need not be white; the largest estimate counts, but at least the quantisation
     noise. Computed channels without noise, such as commands, are skipped.
@@ -172,8 +172,8 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
     commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         sensor = f"joints.{channel.partition('.')[0]}" if group == "joints" else group
-        said, step = choice(sensor), median_sample_period(t)
-        stated = _stated(recording, choice, group, channel)
+        said, step = options(sensor), median_sample_period(t)
+        stated = _stated(recording, options, group, channel)
         if stated <= 0 or said.std is not None or said.use is False:
             continue
         if (commanded and sensor == JOINT_EFFORT_GROUP_NAME) or len(t) < 100 or not 0 < step <= _MAX_SAMPLE_PERIOD:

@@ -110,21 +110,21 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
-def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
+def recording_quality_issues(recording: Recording, options: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
     """Find data quality issues of one recording by all checks that need no model.
 
-    `choice` returns the sensor options of a group, such as its stated noise. `driving` states whether joints drive the
+    `options` returns the sensor options of a group, such as its stated noise. `driving` states whether joints drive the
     model, so that gaps between their samples matter.
     """
-    recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_sampling_kind)
+    recording = recording.with_effort_sampling_kind(options("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(
         _common_clock(recording),
         _dropped(recording, driving),
         _velocities(recording),
         channel_checks.stuck_channel_issues(recording),
-        channel_checks.excess_noise_issues(recording, choice),
-        channel_checks.overstated_noise_issues(recording, choice),
+        channel_checks.excess_noise_issues(recording, options),
+        channel_checks.overstated_noise_issues(recording, options),
         channel_checks.saturated_effort_issues(recording),
         _standstill(recording),
     )

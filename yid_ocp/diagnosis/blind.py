@@ -332,26 +332,26 @@ class BlindCaseGenerator:
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
-    def draw_planned_case(self, wanted: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
+    def draw_planned_case(self, planned: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
         """Draw recordings and label of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
-        name = f"case_{wanted.number:03d}"
+        name = f"case_{planned.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_CASE_DRAWS):
-            rng = self._rng(1, wanted.number, attempt)
+            rng = self._rng(1, planned.number, attempt)
             truth = self._draw_true_parameters(rng)
-            injected, multiple = self._injected(wanted, rng)
+            injected, multiple = self._injected(planned, rng)
             try:
                 *estimate, held_out = (
-                    self.simulate_synthetic_recording(truth, injected, rng, f"{name}_{purpose}", wanted)
+                    self.simulate_synthetic_recording(truth, injected, rng, f"{name}_{purpose}", planned)
                     for purpose in (*purposes, "held_out")
                 )
             except ModelError:
                 continue  # the motion throws the object about; draw another
-            left_out = (injected[0].kind,) if wanted.category == "left_out" else self._other_kind(injected, rng)
-            label = CaseGroundTruth(name, wanted.category, injected, multiple, truth, wanted.experiment)
+            left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
+            label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return BlindCase(name, tuple(estimate), held_out, left_out), label
         what, allowed = f"none of {MAX_CASE_DRAWS} motions can be simulated", "a motion that MuJoCo can simulate"
-        where, hint = f"{name} of {wanted.experiment}", "use another --seed: one seed always draws the same motions"
+        where, hint = f"{name} of {planned.experiment}", "use another --seed: one seed always draws the same motions"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:

@@ -432,24 +432,24 @@ _EVIDENCE_FORMAT = "yid-evidence/2"  # 1 had standard deviations of amplitudes i
 _MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of two candidates is recorded
 
 
-def diagnosis_evidence_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
+def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
     """The numbers on which a diagnosis' rules are based; `judge_recorded_case` uses them to judge it again."""
-    record, plain = finding.record, to_lossless_plain_data
+    record, plain = result.record, to_lossless_plain_data
     pairs = {
         name: [[[e.label for e in both], decrease] for both, _, decrease in own] for name, own in record.pairs.items()
     }
-    candidates = {entry.effect.label: entry.effect for entry in finding.screening.detectability}
+    candidates = {entry.effect.label: entry.effect for entry in result.screening.detectability}
     return {
         "format": _EVIDENCE_FORMAT,
         "effects": {label: plain(effect.definitions) for label, effect in candidates.items()},
-        "nominal_model": _refit_to_json(finding.nominal_model),
-        "tests": [plain(test) for test in (finding.nominal_test, finding.nominal_held_out_test)],
-        "screening": _screening_to_json(finding.screening),
-        "are_offsets_stated": finding.are_offsets_stated,
-        "has_left_baseline": finding.has_left_baseline,
-        "thresholds": plain(finding.thresholds),
-        "located_gap": None if finding.located_gap is None else plain(finding.located_gap),
-        "remaining": [plain(place) for place in finding.remaining_gap_locations],
+        "nominal_model": _refit_to_json(result.nominal_model),
+        "tests": [plain(test) for test in (result.nominal_test, result.nominal_held_out_test)],
+        "screening": _screening_to_json(result.screening),
+        "are_offsets_stated": result.are_offsets_stated,
+        "has_left_baseline": result.has_left_baseline,
+        "thresholds": plain(result.thresholds),
+        "located_gap": None if result.located_gap is None else plain(result.located_gap),
+        "remaining": [plain(place) for place in result.remaining_gap_locations],
         "refits": {name: fit and _refit_to_json(fit) for name, fit in sorted(record.refits.items())},
         "screenings": {name: _screening_to_json(own) for name, own in record.screenings.items()},
         "pairs": plain(pairs),

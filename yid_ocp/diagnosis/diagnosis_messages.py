@@ -67,16 +67,16 @@ def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
 
 
 def recommended_experiment_text(
-    judged: Judgement, where: Sequence[GapLocation], seen: Sequence[DetectableAmplitudes]
+    judgement: Judgement, where: Sequence[GapLocation], evidence: Sequence[DetectableAmplitudes]
 ) -> str:
     """Recommend the next recording in a sentence, from verdict, gap location and confusable effects."""
-    verdict = judged.verdict
+    verdict = judgement.verdict
     rivals = next(
-        (entry.equivalent_effects for entry in judged.accepted_selections if len(entry.equivalent_effects) > 1), ()
+        (entry.equivalent_effects for entry in judgement.accepted_selections if len(entry.equivalent_effects) > 1), ()
     )
     if rivals:
         return _separating_experiment(rivals)
-    unseen = [entry.effect.label for entry in seen if not entry.is_detectable]
+    unseen = [entry.effect.label for entry in evidence if not entry.is_detectable]
     place = where[0].location if where and where[0].gap_share > 0 else ""
     case = verdict if verdict in _NEXT_EXPERIMENT_TEXTS else "effect"
     if verdict == "unknown" and place in ("", *_IMMOVABLE_LOCATIONS):
@@ -87,15 +87,15 @@ def recommended_experiment_text(
     return _NEXT_EXPERIMENT_TEXTS[case].format(place=place, unseen=listed)
 
 
-def insufficient_data_message(verdict: str, seen: NominalModelGapEvidence, limits: Thresholds) -> str:
+def insufficient_data_message(verdict: str, evidence: NominalModelGapEvidence, limits: Thresholds) -> str:
     """Explain why the data are insufficient. Empty if they suffice."""
     if verdict != "insufficient_data":
         return ""
-    if not any(entry.is_detectable for entry in seen.screening.detectability):
+    if not any(entry.is_detectable for entry in evidence.screening.detectability):
         return "no candidate of its expected size would be visible in these recordings."
-    unknowns = len(seen.nominal_model.values)
+    unknowns = len(evidence.nominal_model.values)
     needed = f"at least {limits.min_samples_per_unknown * unknowns:.0f} are needed"
-    said = f"{seen.nominal_test.degrees_of_freedom:.0f} effective samples for {unknowns} unknowns, {needed}"
+    said = f"{evidence.nominal_test.degrees_of_freedom:.0f} effective samples for {unknowns} unknowns, {needed}"
     return f"{said}; record longer or free fewer parameters."
 
 
@@ -107,36 +107,36 @@ def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
     return f"The nominal model follows {cut.recording} for {part} only; the rest is ignored."
 
 
-def diagnosis_summary_text(finding: DiagnosisResult) -> str:
+def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in a text on gap, locations, effects, events and the next experiment."""
-    text = [_gap(finding)]
-    if finding.stated_and_finer_time_step is not None:
-        stated, used = (f"{step:.4g}" for step in finding.stated_and_finer_time_step)
+    text = [_gap(result)]
+    if result.stated_and_finer_time_step is not None:
+        stated, used = (f"{step:.4g}" for step in result.stated_and_finer_time_step)
         used = f"this result is for {used} s (set problem.time_step: {used} for other commands)"
         text.append(f"The discretisation error of {stated} s steps looks like a gap: {used}.")
-    if finding.verdict not in ("insufficient_data", "no_gap"):
-        text.append(_places(finding))
-    if finding.accepted_effects:
-        text += _effects(finding)
-    elif finding.verdict == "unknown":
-        tests = (finding.nominal_test, finding.nominal_held_out_test)
-        exceeds = residuals_exceed_noise(tests, finding.thresholds.null_test_limits)
-        size = _model_error(finding) if exceeds else ""
-        text += [_nameless(finding), f"What remains is model error{size}." if size else ""]
-    text.append("" if finding.law is None else finding.law.sentence)
-    if finding.untried:
-        rest = ", ".join(finding.untried[:8]) + (", ..." if len(finding.untried) > 8 else "")
-        text.append(f"The search stopped after {finding.search_seconds:.3g} s; it would go on with {rest}.")
-    text += [held_out_truncation_message(cut) for cut in finding.truncated_recordings]
-    if finding.baseline_comparison is not None:
-        text += _since(finding.baseline_comparison, bool(finding.accepted_effects))
-    if finding.counterfactual is not None:
-        text += _counterfactual(finding.counterfactual)
-    if finding.is_split_in_blocks:
+    if result.verdict not in ("insufficient_data", "no_gap"):
+        text.append(_places(result))
+    if result.accepted_effects:
+        text += _effects(result)
+    elif result.verdict == "unknown":
+        tests = (result.nominal_test, result.nominal_held_out_test)
+        exceeds = residuals_exceed_noise(tests, result.thresholds.null_test_limits)
+        size = _model_error(result) if exceeds else ""
+        text += [_nameless(result), f"What remains is model error{size}." if size else ""]
+    text.append("" if result.law is None else result.law.sentence)
+    if result.untried:
+        rest = ", ".join(result.untried[:8]) + (", ..." if len(result.untried) > 8 else "")
+        text.append(f"The search stopped after {result.search_seconds:.3g} s; it would go on with {rest}.")
+    text += [held_out_truncation_message(cut) for cut in result.truncated_recordings]
+    if result.baseline_comparison is not None:
+        text += _since(result.baseline_comparison, bool(result.accepted_effects))
+    if result.counterfactual is not None:
+        text += _counterfactual(result.counterfactual)
+    if result.is_split_in_blocks:
         cut, whole = "No held-out recording is left", "Only one set of recordings was given"
-        why = cut if finding.truncated_recordings else whole
+        why = cut if result.truncated_recordings else whole
         text.append(f"{why}: alternate blocks of what is estimated on were held out.")
-    text += [_event_sentences(finding.events), f"Next experiment: {finding.next_experiment}"]
+    text += [_event_sentences(result.events), f"Next experiment: {result.next_experiment}"]
     return " ".join(filter(None, text))
 
 

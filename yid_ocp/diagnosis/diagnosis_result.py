@@ -212,7 +212,7 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
     }
 
 
-def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
+def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     """Statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. Steps not reached are None.
 
     - `p_value`, `chi2_per_dof`: null test of the estimation and held-out residuals together
@@ -225,22 +225,22 @@ def diagnosis_decision_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     - `carried`: largest difference between estimation and held-out estimates [standard deviations]
     - `behind`: per single-effect refit, held-out chi2/n (`left`) and BIC difference to the first (`squares`)
     """
-    tests = (finding.nominal_test, finding.nominal_held_out_test)
-    added, seen, before = finding.selected_effects, finding.smoother_result, finding.nominal_model
-    differences = (entry.estimate_difference_and_std for entry in finding.transfer_checks)
-    apart, alone = [distance / std for distance, std in differences if std > 0], finding.single_effect_models
+    tests = (result.nominal_test, result.nominal_held_out_test)
+    added, seen, before = result.selected_effects, result.smoother_result, result.nominal_model
+    differences = (entry.estimate_difference_and_std for entry in result.transfer_checks)
+    apart, alone = [distance / std for distance, std in differences if std > 0], result.single_effect_models
     of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "explained"))
     if added:
-        own = (finding.gap_closure.fraction, finding.gap_closure.ci_low, finding.explained_fraction)
+        own = (result.gap_closure.fraction, result.gap_closure.ci_low, result.explained_fraction)
         of_effects = dict(zip(of_effects, own, strict=True))
     found = {
         "p_value": bonferroni_corrected_min_test_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
-        "candidate": min(1.0, bonferroni_corrected_min_candidate_p_value(finding.screening.candidate_scores)),
+        "candidate": min(1.0, bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores)),
         "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
         **of_effects,
-        "assumptions": finding.assumption_count,
+        "assumptions": result.assumption_count,
         "carried": max(apart, default=None),
         "behind": {
             fit.effects[-1].label: {

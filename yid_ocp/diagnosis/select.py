@@ -221,12 +221,12 @@ def select_effects(
     search: RefitContext,
     nominal: RefitStatistics,
     screened: ScreeningResult,
-    places: Sequence[str] = (),
+    locations: Sequence[str] = (),
     moved: bool = False,
 ) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
     """Select effects by forward selection on the held-out gap, then try replacing and removing each effect.
 
-    `places` are the smoother's locations of the gap. If `moved` (the nominal fit has left the estimates of an earlier
+    `locations` are those of the gap. If `moved` (the nominal fit has left the estimates of an earlier
     run), candidates are also tried from those estimates. Returns the fits of single effects in the first round and the
     selected effects. The fit of the chosen effect comes first (its last fit if no other effect is selected), then all
     other fits by held-out loss.
@@ -248,7 +248,7 @@ def select_effects(
                 break
             if len(base) == 1 and _futile(search, [nominal, current, *first], alone, screened):
                 break
-        shortlist = _refit_shortlist(screened, limits, base, places)
+        shortlist = _refit_shortlist(screened, limits, base, locations)
         fits = refit_with_each_effect(search, base, shortlist, current.values)
         if (
             moved

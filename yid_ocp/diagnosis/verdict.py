@@ -180,7 +180,7 @@ def _with_verdict(said: Judgement, gap: bool, are_data_sufficient: bool, limits:
 
 def judge(
     search: RefitContext,
-    seen: NominalModelGapEvidence,
+    evidence: NominalModelGapEvidence,
     locate: Callable[[], LocatedGap],
     finished: Callable[[str], None] = lambda _: None,
 ) -> Judgement:
@@ -189,17 +189,17 @@ def judge(
     Refits, screenings and the smoother (`locate`) are requested by name and can come from a record, so the verdict
     depends on numbers alone. `finished` is called with the name of each stage.
     """
-    limits, nominal = search.thresholds, seen.nominal_model
-    has_gap, enough = seen.has_gap(limits), seen.has_enough_samples(limits)
+    limits, nominal = search.thresholds, evidence.nominal_model
+    has_gap, enough = evidence.has_gap(limits), evidence.has_enough_samples(limits)
     # a gap closed by shifted parameters counts only if an effect explains it
-    moved = seen.has_left_baseline and not has_gap
+    moved = evidence.has_left_baseline and not has_gap
     located = locate() if enough and (has_gap or moved) else None
     finished("localisation")
     fits: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     if located is not None:
         places = [place.location for place in main_gap_locations(located.locations)]
-        fits, added = select_effects(search, nominal, seen.screening, places, seen.has_left_baseline)
+        fits, added = select_effects(search, nominal, evidence.screening, places, evidence.has_left_baseline)
     finished("refits")
     added, carried = _effects_with_transfer_checks(search, nominal, added)
     total, explained = UNDEFINED_GAP_CLOSURE, 1.0
@@ -208,7 +208,7 @@ def judge(
         explained = _explained_fraction(nominal, added[-1].refitted_model, located)
     finished("carry_over")
     said = Judgement("", "", fits, added, total, explained, carried)
-    is_seen = any(entry.is_detectable for entry in seen.screening.detectability)
+    is_seen = any(entry.is_detectable for entry in evidence.screening.detectability)
     return _with_verdict(said, has_gap or bool(added), enough and is_seen, limits)
 
 

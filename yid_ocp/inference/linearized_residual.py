@@ -68,24 +68,24 @@ class ResidualDerivativesAtNodes:
 
     @staticmethod
     def from_nominal_trajectory(
-        course: NominalTrajectory, *, with_neighbours: bool = False
+        trajectory: NominalTrajectory, *, with_neighbours: bool = False
     ) -> ResidualDerivativesAtNodes:
         """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
 
         `with_neighbours` is required for a sensor of velocities, accelerations or constraint forces, which depends on
         four nodes (the first one is before the sample's node). Raises `DataError` without it.
         """
-        step, theta = course.model_functions.step, course.theta
+        step, theta = trajectory.model_functions.step, trajectory.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
         found: list[IntArray] = []
         parts: list[tuple[Array, ...]] = []
-        functions = [course.model_functions.compiled_sensor_function(s.sensor) for s in course.measurements]
-        pairs = zip(functions, course.measurements, strict=True)
+        functions = [trajectory.model_functions.compiled_sensor_function(s.sensor) for s in trajectory.measurements]
+        pairs = zip(functions, trajectory.measurements, strict=True)
         readings = [
-            function(course.state_values_at_nodes.select_nodes(s.evaluation_nodes), theta) for function, s in pairs
+            function(trajectory.state_values_at_nodes.select_nodes(s.evaluation_nodes), theta) for function, s in pairs
         ]
         n_forces, width = (step.sizes["m"], 4) if any(read.needs_neighbours for read in readings) else (0, 2)
-        for samples, read in zip(course.measurements, readings, strict=True):
+        for samples, read in zip(trajectory.measurements, readings, strict=True):
             used = samples.evaluation_nodes
             if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
@@ -115,7 +115,7 @@ class ResidualDerivativesAtNodes:
                 by_effort[shift + before] = samples.decorrelate(share[:, None] * efforts[k, column])
                 for there, slope in enumerate(slopes):
                     by_state[shift + there] += samples.decorrelate(share[:, None] * slope[k, column])
-            found.append(np.minimum(node, len(course.rollout.torque)) - before)
+            found.append(np.minimum(node, len(trajectory.rollout.torque)) - before)
             parts.append((by_state, by_effort))
         arrays = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
         return ResidualDerivativesAtNodes(np.concatenate(found), *arrays)

@@ -370,7 +370,7 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 
 
 def solve_equilibrium_at_point_target(
-    step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, place: Array, tolerance: float
+    step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, target: Array, tolerance: float
 ) -> Equilibrium:
     """Find an equilibrium within joint limits at which a point is at its target. `start` is the initial guess.
 
@@ -395,7 +395,7 @@ def solve_equilibrium_at_point_target(
             return np.full(3 + len(x), 1e3), np.zeros((3 + len(x), len(x)))
         guess[0] = rest.state[:n]
         where, slope = point_and_slope(rest)
-        value = np.concatenate([(where - place) / tolerance, _TRAVEL_WEIGHT * (x - first)])
+        value = np.concatenate([(where - target) / tolerance, _TRAVEL_WEIGHT * (x - first)])
         return value, np.vstack([slope / tolerance, _TRAVEL_WEIGHT * np.eye(len(x))])
 
     lower, upper = _position_limits(system)
@@ -404,14 +404,14 @@ def solve_equilibrium_at_point_target(
         lambda x: rows(x)[0], begin, jac=lambda x: rows(x)[1], bounds=(lower, upper), x_scale=1.0, max_nfev=100
     )
     rest = statics.solve(found.x, theta, guess=guess[0])
-    distance = float(np.linalg.norm(point_and_slope(rest)[0] - place)) if rest.is_converged else np.inf
+    distance = float(np.linalg.norm(point_and_slope(rest)[0] - target)) if rest.is_converged else np.inf
     if not distance <= TARGET_REACHED_TOLERANCE_FACTOR * tolerance:
         off = f"{1e3 * distance:.3g} mm off" if rest.is_converged else "nowhere, as no posture near it is at rest"
         near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
         names = ", ".join(name for name, one in zip(system.prescribed, near, strict=True) if one)
         limits = f", with {names} at the joint's limit" if names else ""
         what = f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
-        where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)"
+        where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in target)} m in the world)"
         hint = "choose a nearer target, a smaller plan.target_offset_from_start, or other plan.start_joint_positions"
         raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest

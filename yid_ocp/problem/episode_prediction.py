@@ -109,9 +109,9 @@ class EpisodePredictor:
         return own
 
     def initial_state_of_episode(
-        self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
+        self, episode: Episode, theta: Array, offset: Array, names: tuple[str, ...], guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode's rollout, with derivatives with respect to the parameters `wanted` and `offset`.
+        """Initial state of an episode's rollout, with derivatives with respect to the parameters `names` and `offset`.
 
         `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `guess`
         (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy).
@@ -121,18 +121,18 @@ class EpisodePredictor:
         by_offset[rows, np.arange(len(rows))] = 1.0
         rest: Equilibrium | None = None
         if episode.fixed_initial_state is not None:
-            state, by_theta = episode.fixed_initial_state.state.copy(), np.zeros((nx, len(wanted)))
+            state, by_theta = episode.fixed_initial_state.state.copy(), np.zeros((nx, len(names)))
         else:
-            inputs = self.corrected_inputs(episode, theta, wanted)
+            inputs = self.corrected_inputs(episode, theta, names)
             first = inputs.first_torque if self.system.driven else None
             near = episode.equilibrium_guess if guess is None else guess
             known, statics = inputs.initial_known_coordinates, self.model_functions.equilibrium_solver
-            rest = statics.solve(known, theta, first, near, wanted)
+            rest = statics.solve(known, theta, first, near, names)
             if not rest.is_converged:
-                none = np.zeros((nx, len(wanted) + len(rows)))
+                none = np.zeros((nx, len(names) + len(rows)))
                 return InitialStateWithSensitivity(rest.state, none, rest, f"{episode.name}: {rest.message}")
             state = rest.state.copy()
-            by_known = inputs.initial_known_coordinate_derivatives(len(wanted))
+            by_known = inputs.initial_known_coordinate_derivatives(len(names))
             by_theta = rest.state_by_theta + rest.state_by_known_coordinates @ by_known
             if inputs.first_torque_sensitivity is not None:
                 by_theta += rest.state_by_torque @ inputs.first_torque_sensitivity
@@ -160,30 +160,30 @@ class EpisodePredictor:
         return bool(self.system.driven) and not self.system.servos and self.options.arm_tracking_feedback == "lqr"
 
     def inputs_with_effect_momentum_in_tracking_reference(
-        self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
+        self, episode: Episode, theta: Array, names: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
         """Corrected inputs of an episode, with the momentum that effects add to the tracking filter's reference.
 
-        `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative with respect to `wanted` and the
+        `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative with respect to `names` and the
         offset.
         """
-        inputs = self.corrected_inputs(episode, theta, wanted)
+        inputs = self.corrected_inputs(episode, theta, names)
         if not self._follows_momenta:
             return inputs
         rows = slice(2 * self.system.n_coordinates, None)
         recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
         shift, measured = self.model_functions.recorded_momentum_correction, episode.measured_driven_angles
-        return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
+        return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, names, by_internal)
 
-    def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
-        """Correct recorded torques, angles and paths for effects, with derivatives by the parameters `wanted`."""
+    def corrected_inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> CorrectedInputs:
+        """Correct recorded torques, angles and paths for effects, with derivatives by the parameters `names`."""
         corrections = self.model_functions.input_corrections
         torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
         first = torque[0] if nu else np.zeros(0)
         by_torque = by_first = by_arm = by_path = by_recorded = None
-        late = corrections.joint_delay_or_lag("torque_delay", theta, wanted)
+        late = corrections.joint_delay_or_lag("torque_delay", theta, names)
         if late is not None:
             joints, (delay, by_delay) = episode.recording.joints, late
             assert joints is not None
@@ -196,20 +196,20 @@ class EpisodePredictor:
         if nu and (late is not None or corrections.corrects_efforts):
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
             _, true, _, by_theta, by_reading = corrections.true_angles_and_efforts(
-                np.zeros_like(readings), readings, theta, wanted
+                np.zeros_like(readings), readings, theta, names
             )
             by_theta = by_theta[:, :nu].copy()
-            if by_recorded is not None and wanted:
+            if by_recorded is not None and names:
                 by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
-        if (lag := corrections.joint_delay_or_lag("torque_lag", theta, wanted)) is not None:
+        if (lag := corrections.joint_delay_or_lag("torque_lag", theta, names)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
             left = errors.estimated_torque_error_to_subtract
             torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true_angles_and_efforts(
-                np.hstack([arm, path]), episode.joint_loads, theta, wanted
+                np.hstack([arm, path]), episode.joint_loads, theta, names
             )
             arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
         return CorrectedInputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
@@ -221,7 +221,7 @@ class EpisodePredictor:
         return self.predict_episodes([(episode, theta, offset, guess)], derivatives)[0]
 
     def predict_episodes(
-        self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
+        self, queries: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
     ) -> list[EpisodePrediction | str]:
         """Predict several episodes, each given as (episode, theta, offset, guess). A failure gives an error message."""
 
@@ -236,12 +236,12 @@ class EpisodePredictor:
         width = (
             len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices) if derivatives else 0
         )
-        each = [8 * (episode.grid.steps + 1) * self.integrator_step.sizes["nx"] * (width + 1) for episode, *_ in asked]
+        each = [8 * (e.grid.steps + 1) * self.integrator_step.sizes["nx"] * (width + 1) for e, *_ in queries]
         found: list[EpisodePrediction | str] = []
-        while len(found) < len(asked):
+        while len(found) < len(queries):
             held = np.cumsum(each[len(found) :][:_MAX_PARALLEL_ROLLOUTS])
             count = max(int(np.searchsorted(held, _MAX_ROLLOUT_MEMORY, "right")), 1)
-            found += part(asked[len(found) : len(found) + count])
+            found += part(queries[len(found) : len(found) + count])
         return found
 
     def _prepared(

@@ -71,7 +71,7 @@ class CorrectedInputs:
         recorded: JointMotionWithSensitivities,
         measured: Array,
         theta: Array,
-        wanted: Sequence[str],
+        names: Sequence[str],
         by_internal: Array | None,
     ) -> CorrectedInputs:
         """Add the momentum that effects cause to the reference of the tracking filter, in every step.
@@ -81,12 +81,12 @@ class CorrectedInputs:
         """
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
-        if read and not any(np.any(x) for x in slopes) and not shift.is_active(theta, wanted):
+        if read and not any(np.any(x) for x in slopes) and not shift.is_active(theta, names):
             return self
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
         true = JointMotionWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
-        momentum, slope = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, wanted)
+        momentum, slope = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, names)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
     def nominal_torque_derivatives(
@@ -175,33 +175,33 @@ class InputCorrectionFunctions:
         return total / self.system.recorded_time_scale
 
     def true_angles_and_efforts(
-        self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
+        self, angle: Array, effort: Array, theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
         """Compute true angles and efforts (K, nj) of `joint_names` from recorded values, with derivatives.
 
-        Returns angles, efforts, their derivatives (K, nj, d) with respect to the d parameters `wanted`, and the
+        Returns angles, efforts, their derivatives (K, nj, d) with respect to the d parameters `names`, and the
         derivative of the true effort with respect to the recorded effort.
         """
-        a, e, e_reading, *slopes = self._maps(bool(wanted))(angle, effort, theta)
-        at = [self._names.index(name) for name in wanted]
-        a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
+        a, e, e_reading, *slopes = self._maps(bool(names))(angle, effort, theta)
+        at = [self._names.index(name) for name in names]
+        a_theta, e_theta = (x[:, :, at] for x in slopes) if names else (np.zeros((*a.shape[:2], 0)),) * 2
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
     def joint_delay_or_lag(
-        self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, wanted: tuple[str, ...]
+        self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
         """Delays or lag time constants (nj,) [s] of driven joints' torques or of prescribed joints' efforts.
 
-        Also returns their derivatives (nj, d) with respect to the parameters `wanted`. None if no effect has a delay or
+        Also returns their derivatives (nj, d) with respect to the parameters `names`. None if no effect has a delay or
         lag.
         """
-        return self._evaluate(self._times[kind], theta, wanted)
+        return self._evaluate(self._times[kind], theta, names)
 
     def sensor_delays_with_derivatives(
-        self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]
+        self, sensor: Sensor, theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
         """Recorded minus true time (k,) [s] of each sensor output, with derivatives. None without delays."""
-        return self._evaluate(self._sensor_delays(sensor), theta, wanted)
+        return self._evaluate(self._sensor_delays(sensor), theta, names)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
         camera, width = sensor.camera_pose is not None, sensor.outputs_per_channel
@@ -356,14 +356,14 @@ class ModelFunctions:
         return self._momentum(None)
 
     def compiled_sensor_function(
-        self, sensor: Sensor, wanted: tuple[str, ...] = ()
+        self, sensor: Sensor, names: tuple[str, ...] = ()
     ) -> Callable[[TimeGridStateValues, Array], _SensorReadings]:
-        """Compiled function of a sensor's readings at nodes, with derivatives by the parameters `wanted`."""
-        function, columns = self._sensors((sensor, bool(wanted))), [self.parameter_names.index(name) for name in wanted]
+        """Compiled function of a sensor's readings at nodes, with derivatives by the parameters `names`."""
+        function, columns = self._sensors((sensor, bool(names))), [self.parameter_names.index(name) for name in names]
 
         def read(at: TimeGridStateValues, theta: Array) -> _SensorReadings:
             output, *slopes = function(at.q, at.v, at.a, at.z, at.load, at.lam, theta)
-            if wanted not in ((), self.parameter_names):
+            if names not in ((), self.parameter_names):
                 slopes[-1] = slopes[-1][:, :, columns]
             return _SensorReadings._make([output[:, :, 0], *slopes])
 

@@ -195,13 +195,13 @@ def smoothed_joint_efforts(
     return np.stack([np.interp(grid.node_times, joints.t, column) for column in effort.T], axis=1)
 
 
-def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
+def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
     """Remove effort noise from gear loads: the result is the model's loads plus the slow part of measured minus model.
 
-    `measured` and `own` (the model's) are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
+    `measured` and `model` are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
     difference is constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
     """
-    gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
+    gap = (measured - model)[np.clip(np.arange(len(model)), nodes.min(), nodes.max())]
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
 

@@ -277,16 +277,16 @@ def _shown_frames(system: System) -> list[str]:
 
 
 def animation_of_trajectories(
-    title: str, told: Sequence[ConfigurationTrajectory], recording: Recording | None = None
+    title: str, trajectories: Sequence[ConfigurationTrajectory], recording: Recording | None = None
 ) -> Animation:
     """Animate model trajectories and the recorded motion. The first trajectory sets the times and joints.
 
     The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames.
     """
-    t = _frame_times(told[0].t)
-    motions = [_model_motion(entry, t, entry._q_at(t)) for entry in told]
+    t = _frame_times(trajectories[0].t)
+    motions = [_model_motion(entry, t, entry._q_at(t)) for entry in trajectories]
     if recording is not None:
-        motions.append(_measured_motion(told[0], recording, t))
+        motions.append(_measured_motion(trajectories[0], recording, t))
     return Animation(title, t, tuple(motions))
 
 

@@ -103,17 +103,17 @@ def prediction_and_residual_plots(
     measured: Array,
     std: Array,
     lines: Mapping[str, Array],
-    course: tuple[Array, Array] | None = None,
+    dense_line: tuple[Array, Array] | None = None,
 ) -> tuple[TimePlotData, TimePlotData]:
     """Plot measured and predicted values, and their residual with a band of two standard deviations of the noise.
 
-    All arrays have shape (M,). For sparse measurements, `course` (t (K,), value (K,)) draws the first line densely.
+    All arrays have shape (M,). For sparse measurements, `dense_line` (t (K,), value (K,)) draws the first line densely.
     """
     seen = np.isfinite(measured) & np.isfinite(std)
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     drawn = {name: (t, values) for name, values in lines.items()}
-    if course is not None:
-        drawn[next(iter(lines))] = course
+    if dense_line is not None:
+        drawn[next(iter(lines))] = dense_line
     # NaN in long gaps between measurements
     known, steps = t[seen], np.diff(t[seen])
     breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
@@ -464,12 +464,12 @@ def _even(value: Any) -> Any:
 
 
 def candidate_ranking_figure(
-    entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, promised: str
+    entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, predicted: str
 ) -> Figure:
     """Plot each candidate's gap closure after a refit [%], with interval, and the decrease that screening predicts.
 
     `entries` maps each label to (closure, low, high), or None without a refit, and the decrease. `closed` and
-    `promised` are the titles of the two axes.
+    `predicted` are the titles of the two axes.
     """
     from plotly.subplots import make_subplots
 
@@ -479,7 +479,7 @@ def candidate_ranking_figure(
     figure = _styled_figure(100 + 28 * len(entries), "", "", base=figure)
     bars = {"x": [decrease for _, decrease in entries.values()], "y": list(entries), "orientation": "h", "width": 0.55}
     figure.add_bar(**bars, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last)
-    figure.update_xaxes(title_text=promised, rangemode="tozero", row=1, col=last)
+    figure.update_xaxes(title_text=predicted, rangemode="tozero", row=1, col=last)
     if done:
         values, lows, highs = zip(*done.values(), strict=True)
         points = {"x": values, "y": list(done), "error_x": asymmetric_error_bars(values, lows, highs)}

@@ -132,7 +132,7 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
 
 
 def smoothed_effort_data(
-    around: SensorDataInputs,
+    inputs: SensorDataInputs,
     sensor: JointSensor,
     t: Array,
     values: Array,
@@ -147,33 +147,33 @@ def smoothed_effort_data(
     constant error. With `is_sample`, a value is measured at its time, otherwise it is the mean until the next value's
     time. Raises `DataError` if the recording is too short for the filter.
     """
-    period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
+    period, last = float(np.median(np.diff(t))), len(inputs.node_times) - 1
     # the mean of an interval belongs to its centre
     late = 0.0 if is_sample else 0.5 * period
-    kept, measured = nodes_and_decorrelated_values(around, t, values, "efforts", late)
-    times = around.node_times[kept]
+    kept, measured = nodes_and_decorrelated_values(inputs, t, values, "efforts", late)
+    times = inputs.node_times[kept]
     unit = sensor.effort_per_unit_reading
-    total, correlation = _smoothed_effort_noise(around, sensor.joint_names, std * np.abs(unit), period, times)
+    total, correlation = _smoothed_effort_noise(inputs, sensor.joint_names, std * np.abs(unit), period, times)
     if correlation is not None:
         correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
     return SensorData(sensor, times, measured, total / np.abs(unit), (1, last - 1), bias, correlation)
 
 
 def nodes_and_decorrelated_values(
-    around: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
+    inputs: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
 
     `values` (M, k) belong to the times `t` + `late` [s]. `like_path` selects the path filter; the default is the effort
     filter, which is also applied to predictions. Raises `DataError`, which names `noun`, if the recording is too short.
     """
-    low_pass = around.path_filter if like_path else around.effort_filter
-    times, smooth = around.node_times, low_pass(t, values)
+    low_pass = inputs.path_filter if like_path else inputs.effort_filter
+    times, smooth = inputs.node_times, low_pass(t, values)
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
     # Neighbouring smoothed values are correlated: only nearly independent ones at samples are kept. Both ends are
     # omitted: there the filter has data on one side only, and the impulses depend on the motion before or after the
     # recording.
-    step, steps = around.time_step, len(times) - 1
+    step, steps = inputs.time_step, len(times) - 1
     apart = max(1, round(float(np.median(np.diff(t))) / step))
     ends = apart * math.ceil(max(1, math.ceil(low_pass.settling_time / step)) / apart)
     kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride(step) / apart))
@@ -182,7 +182,7 @@ def nodes_and_decorrelated_values(
     if not len(kept):
         what = f"{steps * step:.3g} s of {noun} are too short for a low-pass filter of {low_pass.cutoff:g} Hz"
         allowed, hint = f"more than {2 * ends * step:.3g} s", "use a longer recording, or raise problem.path_cutoff"
-        raise DataError(what, where=f"recording '{around.recording.name}'", allowed=allowed, hint=hint)
+        raise DataError(what, where=f"recording '{inputs.recording.name}'", allowed=allowed, hint=hint)
     return kept, measured[kept]
 
 

@@ -304,9 +304,9 @@ _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[st
 
 
 def recording_with_sensor_error(
-    recording: Recording, system: System, kind: str, place: str, values: Mapping[str, float]
+    recording: Recording, system: System, kind: str, location: str, values: Mapping[str, float]
 ) -> Recording:
-    """Copy of a recording with one sensor error: the sensor effect `kind` at `place` with parameters `values`."""
+    """Copy of a recording with one sensor error: the sensor effect `kind` at `location` with parameters `values`."""
     if kind.startswith("camera") or kind == "surface_offset":
         last = recording.duration
         points = (g if g.pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)
@@ -315,15 +315,15 @@ def recording_with_sensor_error(
     assert joints is not None
     if joints.effort is None:
         allowed, hint = "arms that are driven by torques", "leave the effect out"
-        raise ModelError("the recording has no efforts", where=f"{kind}@{place}", allowed=allowed, hint=hint)
+        raise ModelError("the recording has no efforts", where=f"{kind}@{location}", allowed=allowed, hint=hint)
     if kind == "effort_delay":
         effort = joints.effort.copy()
         # the presently recorded effort acts only after the delay
-        for name in joint_names_by_arm(system)[place]:
+        for name in joint_names_by_arm(system)[location]:
             column = joints.names.index(name)
             effort[:, column] = np.interp(joints.t + values["delay"], joints.t, joints.effort[:, column])
         return replace(recording, joints=replace(joints, effort=effort))
-    at, (channel, read) = joints.names.index(place), _JOINT_SENSOR_ERRORS[kind]
+    at, (channel, read) = joints.names.index(location), _JOINT_SENSOR_ERRORS[kind]
     wrong = {"position": joints.position.copy(), "effort": joints.effort.copy()}
     wrong[channel][:, at] = read(joints.position[:, at], joints.effort[:, at], values)
     return replace(recording, joints=replace(joints, position=wrong["position"], effort=wrong["effort"]))

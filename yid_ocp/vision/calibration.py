@@ -232,7 +232,7 @@ def calibration_without_estimation(pose: Array, options: CameraClockOptions, rea
 
 def calibrate_camera(
     arm: ArmSurface,
-    glimpses: Sequence[CalibrationFrame],
+    frames: Sequence[CalibrationFrame],
     pose: Array,
     rng: np.random.Generator,
     options: CameraCalibrationOptions,
@@ -241,14 +241,14 @@ def calibrate_camera(
 ) -> CameraCalibration:
     """Estimate the pose, depth error and clock offset of a depth camera from frames that show the robot's arm.
 
-    `glimpses` is a subset of the frames, with thinned point clouds of the robot and its surroundings. The search starts
+    `frames` is a subset of the frames, with thinned point clouds of the robot and its surroundings. The search starts
     at the pose `pose` (4, 4). `source` names the data in error messages. Raises `DataError` if the arm is not in view,
     does not match the clouds, or moves too little to determine the clock.
     """
-    about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
+    about = float(np.mean([g.stamp for g in frames])) if frames else 0.0
     told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:
-        return _Calibrator(arm, told, rng, options, clock).run(glimpses)
+        return _Calibrator(arm, told, rng, options, clock).run(frames)
     except _UntoldError as reason:
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_without_estimation(pose, clock, str(reason))

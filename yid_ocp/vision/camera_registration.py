@@ -201,17 +201,17 @@ class ArmSurface:
         return _SurfaceMatches(chosen, error[chosen], normal[chosen], rate, part[chosen], local)
 
     def linearized_surface_distances(
-        self, state: CameraState, glimpse: CalibrationFrame, reach: float, along: bool
+        self, state: CameraState, frame: CalibrationFrame, reach: float, along: bool
     ) -> _CalibrationEquations:
         """Distances of a frame's points from the arm's surface, linearised in the camera state."""
-        points, t = state.measured_to_world_points(glimpse.points), float(state.stamps_to_joint_clock(glimpse.stamp))
+        points, t = state.measured_to_world_points(frame.points), float(state.stamps_to_joint_clock(frame.stamp))
         met = self.match_points_to_surface(points, state.pose[:3, 3], t, reach, along)
         slope = np.empty((len(met.point_indices), CAMERA_STATE_SIZE))
         by_camera = state.world_point_jacobian_by_pose_and_depth(points[met.point_indices])
         slope[:, :CLOCK_OFFSET_INDEX] = np.einsum("ni,nij->nj", met.normal, by_camera)
         # a later offset takes the surface back along its velocity, away from the point
         slope[:, CLOCK_OFFSET_INDEX] = met.normal_velocity
-        slope[:, CLOCK_DRIFT_INDEX] = met.normal_velocity * (glimpse.stamp - state.clock_reference_stamp)
+        slope[:, CLOCK_DRIFT_INDEX] = met.normal_velocity * (frame.stamp - state.clock_reference_stamp)
         patch = np.column_stack([met.part, np.floor(met.part_coordinates / _MESH_ERROR_PATCH_SIZE).astype(np.int64)])
         return _CalibrationEquations(slope, met.normal_distance, patch)
 
@@ -285,33 +285,33 @@ def _at_least(least: Array, matrix: Array) -> Array:
 
 
 def initial_camera_states(
-    arm: ArmSurface, glimpses: Sequence[CalibrationFrame], told: CameraState, search: float, most: int
+    arm: ArmSurface, frames: Sequence[CalibrationFrame], specified: CameraState, search: float, count: int
 ) -> list[CameraState]:
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
-    Returns at most `most` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets are within `search` [s]
-    of the offset of the specified state `told`.
+    Returns at most `count` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets are within `search` [s]
+    of the offset of the specified state `specified`.
     """
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
     sides, ahead = (np.arange(-n, n + 1, _CELL_STRIDE) for n in (_SIDEWAYS_CELLS, _FORWARD_CELLS))
     cells = np.stack(np.meshgrid(sides, sides, ahead, indexing="ij"), axis=-1).reshape(-1, 3)
     total = np.zeros((len(delays), len(cells)))
-    for glimpse in glimpses:
-        _add_costs(total, arm, told, glimpse, delays, cells)
+    for glimpse in frames:
+        _add_costs(total, arm, specified, glimpse, delays, cells)
     result: list[CameraState] = []
     for index in np.argsort(total, axis=None):
         delay, cell = np.unravel_index(index, total.shape)
         change = np.zeros(CAMERA_STATE_SIZE)
         # the cloud moves opposite to the surface's displacement by cells
-        change[TRANSLATION_SLICE] = -told.pose[:3, :3] @ (_GRID_CELL_SIZE * cells[cell])
+        change[TRANSLATION_SLICE] = -specified.pose[:3, :3] @ (_GRID_CELL_SIZE * cells[cell])
         change[CLOCK_OFFSET_INDEX] = delays[delay]
-        trial = told.with_state_increment(change)
+        trial = specified.with_state_increment(change)
         between = [trial.difference_from(other) for other in result]
         apart = [np.linalg.norm(d[TRANSLATION_SLICE]) + 0.5 * abs(d[CLOCK_OFFSET_INDEX]) for d in between]
         if min(apart, default=math.inf) >= _MIN_START_SEPARATION:
             result.append(trial)
-        if len(result) == most:
+        if len(result) == count:
             break
     return result
 
@@ -370,11 +370,11 @@ class SurfaceVisibilityFractions:
 
 
 def pooled_surface_visibility_fractions(
-    arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
+    arm: ArmSurface, frames: Sequence[CalibrationFrame], state: CameraState, within: float
 ) -> SurfaceVisibilityFractions:
     """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)
-    for glimpse in glimpses:
+    for glimpse in frames:
         points, _ = arm.visible_surface_points(state, glimpse.stamp)
         own, (places, rays) = state.world_to_measured_points(points), glimpse._trees
         away, _ = places.query(own, distance_upper_bound=within)

@@ -166,14 +166,14 @@ class ShapeFitter:
     def _links_at(self, q: Array) -> Array:
         return self._corners(q)[0].reshape(-1, 2, 3)
 
-    def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
+    def fit_frame(self, cloud: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
         """Fit the object's shape in one frame, given the robot's configuration `q_known` (n,).
 
         The fit has two stages. Cheap passes on skeleton nodes run from every guess in `starts` (default: the undeformed
-        shape). Passes on points run from the best result. `sight` is the filtered cloud. Raises `DataError` if it has
+        shape). Passes on points run from the best result. `cloud` is the filtered cloud. Raises `DataError` if it has
         no points.
         """
-        if not len(sight.points) or not len(sight.skeleton_nodes):
+        if not len(cloud.points) or not len(cloud.skeleton_nodes):
             what, allowed = "the cloud has no points or no skeleton nodes", "one point and one node or more"
             raise DataError(what, where="sight", allowed=allowed, hint="check the filters, or give another cloud")
         free = list(self.free_joints)
@@ -181,21 +181,21 @@ class ShapeFitter:
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
         q[known] = q_known[known]
         begun = [self._with_free(q, start[free]) for start in starts or (self.rest_configuration,)]
-        everything = np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool)
-        thin = shape_evidence.tube_like_node_and_point_masks(sight, float(self.link_radii.max()))
-        best, evidence = self._attempt(sight, begun, thin if thin[0].any() and thin[1].any() else everything)
-        for left in (self._without(best, evidence, sight, self._links_of(self._failed(evidence))), everything):
+        everything = np.ones(len(cloud.skeleton_nodes), bool), np.ones(len(cloud.points), bool)
+        thin = shape_evidence.tube_like_node_and_point_masks(cloud, float(self.link_radii.max()))
+        best, evidence = self._attempt(cloud, begun, thin if thin[0].any() and thin[1].any() else everything)
+        for left in (self._without(best, evidence, cloud, self._links_of(self._failed(evidence))), everything):
             failed = self._failed(evidence)
             if not failed:
                 break
             # a part of the object is misplaced: something similar was nearer to the initial guess
             if left[0].any() and left[1].any():
-                other = self._attempt(sight, [self._rested(best.q, failed), *begun], left)
+                other = self._attempt(cloud, [self._rested(best.q, failed), *begun], left)
                 if other[1].covered_fraction_of_visible_links(
                     self._lengths
                 ) > evidence.covered_fraction_of_visible_links(self._lengths):
                     best, evidence = other
-        return self._judged(best, evidence, self._rivals(best, evidence, sight), sight)
+        return self._judged(best, evidence, self._rivals(best, evidence, cloud), cloud)
 
     def _with_free(self, q: Array, angles: Array) -> Array:
         trial = q.copy()

@@ -167,7 +167,7 @@ def tracked_states_and_points(
     frames: Sequence[FrameReport],
     columns: Sequence[int],
     common: SequenceCalibration,
-    things: Sequence[ForeignObject],
+    foreign_objects: Sequence[ForeignObject],
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
@@ -178,7 +178,7 @@ def tracked_states_and_points(
     """
     good, sizes, calibration = _good_fits(frames), common.dimensions, common.camera_calibration
     if not good:
-        raise _none_good(frames, sizes, things, source)
+        raise _none_good(frames, sizes, foreign_objects, source)
     fits, of = list(good.values()), list(columns)
     t = np.array([frames[k].joint_time for k in good])
     position = np.array([fit.point_positions[of] for fit in fits])
@@ -199,7 +199,7 @@ def tracked_states_and_points(
         what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
         check = f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame"
         allowed = f"a frame with a point known within {1e3 * options.max_seen_point_std:g} mm"
-        raise DataError(what, where=source, allowed=allowed, hint=_hint(sizes, things, check))
+        raise DataError(what, where=source, allowed=allowed, hint=_hint(sizes, foreign_objects, check))
     position, std, shared = (np.where(unseen[..., None], np.nan, entry) for entry in (position, std, shared))
     return t, np.array([fit.q for fit in fits]), position, std, shared
 

@@ -168,8 +168,8 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
     return WeightedCloud(total / count[:, None], count.astype(np.float64))
 
 
-def statistical_inlier_mask(cloud: WeightedCloud, asked: BoolArray | None = None) -> BoolArray:
-    """Find the inliers (N,) of a cloud by statistical outlier removal. False outside the mask `asked`.
+def statistical_inlier_mask(cloud: WeightedCloud, mask: BoolArray | None = None) -> BoolArray:
+    """Find the inliers (N,) of a cloud by statistical outlier removal. False outside the mask `mask`.
 
     A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + 4 s, where s is
     the median absolute deviation scaled to a standard deviation. Median and s are computed from the whole cloud, with
@@ -186,7 +186,7 @@ def statistical_inlier_mask(cloud: WeightedCloud, asked: BoolArray | None = None
     distance = apart(some)
     middle = weighted_median(distance, cloud.point_weights[some])
     spread = _MAD_TO_STD * weighted_median(np.abs(distance - middle), cloud.point_weights[some])
-    index = np.flatnonzero(np.ones(len(cloud), bool) if asked is None else asked)
+    index = np.flatnonzero(np.ones(len(cloud), bool) if mask is None else mask)
     stays = np.zeros(len(cloud), bool)
     stays[index] = apart(index) <= middle + _OUTLIER_Z_MAX * spread
     return stays

@@ -95,7 +95,7 @@ class ForeignObject:
 
 
 def group_foreign_clusters(
-    things: Sequence[tuple[float, Sequence[ForeignCluster]]],
+    clusters: Sequence[tuple[float, Sequence[ForeignCluster]]],
     noise: float,
     box: tuple[Array, Array],
     links: Callable[[float], Mapping[str, Array]],
@@ -109,13 +109,13 @@ def group_foreign_clusters(
     removed.
     """
     groups: list[list[tuple[float, ForeignCluster]]] = []
-    for t, thing in ((t, thing) for t, seen in things for thing in seen):
+    for t, thing in ((t, thing) for t, seen in clusters for thing in seen):
         home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
         if home is not None and home[-1][0] < t and _apart(home[-1][1], thing) < 1.0:
             home.append((t, thing))
         else:
             groups.append([(t, thing)])
-    groups = [group for group in groups if len(group) >= min(_MIN_REPORTED_FRAMES, len(things))]
+    groups = [group for group in groups if len(group) >= min(_MIN_REPORTED_FRAMES, len(clusters))]
     groups.sort(key=lambda group: -sum(thing.n_points for _, thing in group))
     found = []
     for group in groups:
@@ -131,7 +131,7 @@ def group_foreign_clusters(
         how = f"moving with {link}" if link else "moving" if moving else "still"
         big, where = (mark.join(f"{x:.2f}" for x in of) for mark, of in ((" x ", size), (", ", centre)))
         text = f"something of {big} m at ({where}) m is not the object, {how}, "
-        text += f"in {len(group)} of {len(things)} frames: "
+        text += f"in {len(group)} of {len(clusters)} frames: "
         boxed = "leave it out with track.options.filters.box_lower and box_upper"
         if link:
             text += f"give its shape under model.extra_meshes with parent_frame: {link}"

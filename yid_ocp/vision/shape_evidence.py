@@ -210,21 +210,21 @@ def fit_quality_and_point_classes(
     )
 
 
-def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
+def tube_like_node_and_point_masks(cloud: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
     """Masks of skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube of radius r = `radius`.
 
     Around a tube, points have a large spread in one direction and r/sqrt(3) across. On a table, wall or body they have
     a large spread in two directions.
     """
     within = _SURROUNDING_RADII * radius
-    thin = np.zeros(len(sight.skeleton_nodes), bool)
-    for i, around in enumerate(sight._point_tree.query_ball_point(sight.skeleton_nodes, within)):
+    thin = np.zeros(len(cloud.skeleton_nodes), bool)
+    for i, around in enumerate(cloud._point_tree.query_ball_point(cloud.skeleton_nodes, within)):
         if len(around) > 3:
-            away = sight.points[around] - sight.points[around].mean(axis=0)
+            away = cloud.points[around] - cloud.points[around].mean(axis=0)
             second = float(np.linalg.eigvalsh(away.T @ away / len(around))[1])
             # halfway between a tube, r/sqrt(3), and a disc, within/2
             thin[i] = math.sqrt(max(second, 0.0)) < 0.5 * (radius / math.sqrt(3.0) + 0.5 * within)
-    return thin, thin[cKDTree(sight.skeleton_nodes).query(sight.points)[1]]
+    return thin, thin[cKDTree(cloud.skeleton_nodes).query(cloud.points)[1]]
 
 
 def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> IntArray:

@@ -373,10 +373,10 @@ def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
     return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence_ratio))
 
 
-def issues_to_plain_data(doubts: Sequence[Issue]) -> list[dict[str, Any]]:
-    """Convert data quality issues to JSON-ready dicts, gravest first, for the key `doubts` of a result."""
+def issues_to_plain_data(issues: Sequence[Issue]) -> list[dict[str, Any]]:
+    """Convert data quality issues to JSON-ready dicts, gravest first, for the key `issues` of a result."""
     found = []
-    for doubt in _gravest_first(doubts):
+    for doubt in _gravest_first(issues):
         own = {"evidence" if key == "evidence_ratio" else key: value for key, value in asdict(doubt).items()}
         found.append(own | {"sure": doubt.certainty_word, "where": doubt.location_text})
     return found

@@ -65,21 +65,21 @@ def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progres
 
 
 def print_result(
-    arguments: argparse.Namespace, result: Mapping[str, Any], texts: Callable[[], Sequence[str]], place: str, path: str
+    arguments: argparse.Namespace, result: Mapping[str, Any], texts: Callable[[], Sequence[str]], footer: str, path: str
 ) -> None:
     """Print a command's result in one of three modes: as text, as path or as JSON.
 
-    By default, the lines of `texts` and the line `place` are printed. With `quiet`, only `path` is printed. With
-    `json`, only JSON is printed on standard output, and `place` on standard error.
+    By default, the lines of `texts` and the line `footer` are printed. With `quiet`, only `path` is printed. With
+    `json`, only JSON is printed on standard output, and `footer` on standard error.
     """
     if arguments.json:
         print_json(result)
         if not arguments.quiet:
-            print(place, file=sys.stderr)
+            print(footer, file=sys.stderr)
     elif arguments.quiet:
         print(path)
     else:
-        print("\n".join([*texts(), place]))
+        print("\n".join([*texts(), footer]))
 
 
 def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:

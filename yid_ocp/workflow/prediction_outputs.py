@@ -163,7 +163,7 @@ def write_solve_trajectories(
 
 
 def write_diagnosis_hdf5(
-    path: Path, finding: DiagnosisResult, pairs: Sequence[EpisodeWithNominalAndEffectPredictions]
+    path: Path, result: DiagnosisResult, pairs: Sequence[EpisodeWithNominalAndEffectPredictions]
 ) -> None:
     """Write held-out predictions, smoothed unknowns and event forces as `yid-diagnosis-trajectories/1` (HDF5).
 
@@ -184,10 +184,10 @@ def write_diagnosis_hdf5(
             for k, samples in enumerate(episode.measurements):
                 both = {"before": before.predicted_outputs[k], "after": after.predicted_outputs[k]}
                 _store_sensor(file.require_group(episode.name), episode, samples, both)
-        smoothed = finding.smoother_result
+        smoothed = result.smoother_result
         for trace in () if smoothed is None else smoothed.smoothed_unknowns:
             assert smoothed is not None
-            problem = finding.nominal_model.problem
+            problem = result.nominal_model.problem
             group = file.create_group(f"where/{trace.recording}")
             group.attrs["start"] = next(e.grid.start_time for e in problem.episodes if e.name == trace.recording)
             _store_texts(group, {"unknowns": trace.unknown_names})
@@ -198,7 +198,7 @@ def write_diagnosis_hdf5(
             relative = {"mean": trace.posterior_mean, "std": trace.posterior_std, "prior": np.sqrt(variance)}
             _store(group, {"edges": trace.interval_edges})
             _store(group, {name: array * trace.reference_std for name, array in relative.items()})
-        for force in finding.events.force_estimates:
+        for force in result.events.force_estimates:
             group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit
             _store(group, {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.assumed_model_error})
