@@ -9,7 +9,6 @@ from small_problems import pendulum_step
 
 from yid_ocp.analysis.discretisation import min_frame_distance_by_grasp, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
-    checked_step_linearisation,
     linearise_step_equations,
     parameter_influences,
     step_complexity_summary,
@@ -204,53 +203,6 @@ def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder, 
     assert max(entry["operations"] for entry in found["functions"]) > 100
     sizes = held_pendulum.sizes
     assert step_complexity_summary(held_pendulum)["unknowns"] == sizes["n"] - 2 + sizes["nz"] + sizes["m"]
-
-
-def linearised(step, wrong=None):
-    """The held pendulum near a rest, its hands moved; with a number of one matrix changed."""
-    state = np.zeros(step.sizes["nx"])
-    posture = np.array([0.3, -0.6])
-    state[: step.sizes["n"]] = 0.01
-    state[list(step.system.prescribed_coordinate_indices)] = posture
-    if wrong is not None:
-        inner, place = step.jacobians, ("A", "B_u", "B_theta").index(wrong)
-
-        def jacobians(*arguments):
-            matrices = [np.array(matrix) for matrix in inner(*arguments)]
-            matrices[place][-1, -1] += 0.5 * np.max(np.abs(matrices[place]))
-            return matrices
-
-        step = Changed(step, jacobians)
-    return checked_step_linearisation(step, state, np.zeros(step.sizes["nu"]), step.system.parameters.vector(), posture)
-
-
-class Changed:
-    """A step whose derivatives are other ones."""
-
-    def __init__(self, step, jacobians):
-        self._step, self.jacobians = step, jacobians
-
-    def __getattr__(self, name):
-        return getattr(self._step, name)
-
-    def __call__(self, *arguments):
-        return self._step(*arguments)
-
-
-def test_a_step_agrees_with_its_differences(held_pendulum):
-    found = linearised(held_pendulum)
-    assert found.a.shape == (held_pendulum.sizes["nx"],) * 2
-    assert found.spectral_radius == pytest.approx(np.max(np.abs(np.linalg.eigvals(found.a))))
-    assert set(found.finite_difference_errors) == {"A", "B_u", "B_theta"}
-    assert found.finite_difference_errors["B_u"] == 0.0  # there is no input
-    assert max(found.finite_difference_errors.values()) < 1e-5
-
-
-@pytest.mark.parametrize("name", ["A", "B_theta"])
-def test_a_wrong_entry_is_a_fraction_of_the_largest(held_pendulum, name):
-    errors = linearised(held_pendulum, name).finite_difference_errors
-    assert 0.3 < errors.pop(name) < 0.7
-    assert max(errors.values()) < 1e-5
 
 
 H = 0.02

@@ -266,15 +266,9 @@ def test_inspect(carried_out, pendulum, tmp_path):
     assert result["format"] == "yid-inspect/1"
     assert [entry["role"] for entry in result["variables"]] == ["prescribed", "prescribed"]
     assert result["parameters"]["shoulder.stiffness"]["free"]
-    for picture in ("sparsity.png", "kkt.png"):
-        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+    assert (folder / "sparsity.png").read_bytes().startswith(b"\x89PNG")
     assert [block["names"][0] for block in result["blocks"]["rows"]] == ["del[shoulder]", "p1[shoulder]"]
     assert result["patterns"]["A"]["shape"] == [4, 4]
-    steps = 120
-    assert result["nlp"]["variables"] == 3 + (steps + 1) * 4
-    # efforts belong to steps, not to nodes
-    assert result["nlp"]["left_out"] == ["joints.effort"]
-    assert "the NLP has a node at every step; left out: joints.effort" in done.out
     damping = result["dependence"]["elbow.damping"]
     assert damping["rows"] == damping["seen"] == ["del[elbow]", "p1[elbow]"]
     assert damping["best"] == "joints.effort"
@@ -310,13 +304,14 @@ def test_inspect(carried_out, pendulum, tmp_path):
     assert {"rows.casadi", "equations.c", "names.json"} <= files
 
 
-def test_inspect_agrees_with_finite_differences(carried_out, written, urdf_folder):
+def test_inspect_without_recordings(carried_out, written, urdf_folder):
     file = written(
         f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\n"
         "problem: {use_compiler: false}\n"
     )
     result = carried_out("inspect", file).result
-    assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
+    # no damping and no motor: the two pendulums keep their energy
+    assert result["linearisation"]["spectral_radius"] == pytest.approx(1.0, abs=1e-6)
     assert (result["equations"]["unknowns"], result["equations"]["jacobian_nonzeros"]) == (2, 4)
 
 

@@ -1,8 +1,8 @@
-"""Diagnostics of a compiled step: sizes, sparsity, linearisation errors and observability of parameters."""
+"""Diagnostics of a compiled step: sizes, sparsity and observability of parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -16,22 +16,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.sensors import Sensor, sensor_reading_function
-
-# balances Newton's tolerance and the third derivative, for angles and stiffnesses of order one
-_DIFFERENCE_STEP = 1e-5
-
-
-@dataclass(frozen=True)
-class CheckedStepLinearisation:
-    """Linearisation of a step at one state, with its deviations from finite differences."""
-
-    state: Array
-    a: Array  # A_k, shape (nx, nx)
-    b_input: Array  # B_k, shape (nx, nu)
-    b_theta: Array  # shape (nx, ntheta)
-    spectral_radius: float  # largest absolute eigenvalue of A
-    finite_difference_errors: dict[str, float]  # largest, by matrix, as a fraction of its largest entry
+from yid_ocp.sensors import sensor_reading_function
 
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
@@ -45,32 +30,6 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
     return {"sizes": step.sizes, **counts, "functions": found}
 
 
-def checked_step_linearisation(
-    step: Step, state: Array, torque: Array, theta: Array, path: Array
-) -> CheckedStepLinearisation:
-    """Linearise a step at a state (nx,), and check its Jacobians A_k and B_k by central finite differences.
-
-    The torque (nu,) is in N m. `path` (nc,) are the prescribed coordinates before and after the step.
-    """
-    n, pair = step.sizes["n"], (path, path) if len(path) else None
-    a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
-
-    def after(x: Array, u: Array, values: Array) -> Array:
-        q1, p1, _, status = step(x[:n], x[n : 2 * n], u, values, pair, x[2 * n :])
-        return np.concatenate([q1, p1, status.internal_coordinates])
-
-    by_state = _differences(lambda v: after(v, torque, theta), state)
-    # prescribed coordinates come from the path, so finite differences by the state exclude them
-    keep = np.setdiff1d(np.arange(len(state)), step.system.prescribed_coordinate_indices)
-    errors = {
-        "A": _error(a[:, keep], by_state[:, keep]),
-        "B_u": _error(b_input, _differences(lambda v: after(state, v, theta), torque)),
-        "B_theta": _error(b_theta, _differences(lambda v: after(state, torque, v), theta)),
-    }
-    radius = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
-    return CheckedStepLinearisation(state, a, b_input, b_theta, radius, errors)
-
-
 def linearise_step_equations(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepEquationLinearizations:
@@ -81,22 +40,6 @@ def linearise_step_equations(
     return step.kernel.linearize_step_equations(
         theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True
     )
-
-
-def _differences(function: Callable[[Array], Array], at: Array) -> Array:
-    columns = []
-    for i in range(len(at)):
-        width = _DIFFERENCE_STEP * max(1.0, abs(at[i]))
-        up, down = at.copy(), at.copy()
-        up[i] += width
-        down[i] -= width
-        columns.append((function(up) - function(down)) / (2 * width))
-    return np.stack(columns, axis=1) if columns else np.zeros((len(function(at)), 0))
-
-
-def _error(exact: Array, difference: Array) -> float:
-    largest = float(np.max(np.abs(exact), initial=0.0))
-    return float(np.max(np.abs(exact - difference), initial=0.0)) / largest if largest > 0 else 0.0
 
 
 # A row counts as observed if a reading changes by more than this fraction of the largest such change over all rows:
@@ -358,136 +301,3 @@ def _mask(pattern: ca.Sparsity) -> BoolArray:
     row, column = pattern.get_triplet()
     mask[row, column] = True
     return mask
-
-
-class _NlpStage(NamedTuple):
-    """Sparsity of one stage of the NLP, equal for all stages. The initial state depends on all free parameters."""
-
-    constraint_mask: BoolArray  # one step's constraints by (theta_free, x_k, x_{k+1}, lam_k)
-    hessian_mask: BoolArray  # Hessian of these constraints times their multipliers
-    gauss_newton_mask: BoolArray  # Hessian of priors and one reading of every sensor by (theta_free, x_k)
-    constraint_blocks: Sequence[_Block]
-    state_blocks: Sequence[_Block]
-    multiplier_labels: tuple[str, ...]
-    free: tuple[str, ...]
-    fixed_start_rows: Sequence[int]  # rows of the first node's state that are fixed
-    estimated_start_rows: Sequence[int]  # rows that are estimated with a prior
-
-    @property
-    def sizes(self) -> tuple[int, int, int, int]:
-        """Numbers of free parameters, states, multipliers and constraints of a step."""
-        f, m, height = len(self.free), len(self.multiplier_labels), len(self.constraint_mask)
-        return f, len(self.gauss_newton_mask) - f, m, height
-
-
-def nlp_stage_sparsity(
-    symbols: NamedStepEquations,
-    free: Sequence[str],
-    sensors: Sequence[Sensor],
-    followed: Sequence[int],
-    loose: Sequence[int],
-) -> _NlpStage:
-    """Sparsity of one stage (time step) of the nonlinear program (NLP) that `transcribe` builds.
-
-    The order of rows and columns is as in `solvers.symbolic_transcription`. The parameters `free` are unknowns.
-    `sensors` are evaluated at nodes. `followed` are the state indices that the tracking filter feeds back to the
-    torques. `loose` are the indices of the initial state that are estimated with a prior; the other unprescribed states
-    are fixed.
-    """
-    e, system = symbols.equations, symbols.equations.system
-    kept = list(system.unprescribed_coordinate_indices)
-    rows = ca.vertcat(e.residual, e.p1)
-    chosen = ca.vertcat(*(system.parameters[name].symbol for name in free)) if free else ca.SX(0, 1)
-    local = ca.vertcat(chosen, e.q0, e.p0, e.z0, e.q1, e.z1, e.lam, e.u)
-    weights = ca.SX.sym("weights", rows.numel())
-    by_local = _mask(ca.jacobian_sparsity(rows, local))
-    curved = _mask(ca.jacobian_sparsity(ca.gradient(ca.dot(weights, rows), local), local))
-    f, n, nz, m, nu = len(free), system.n_coordinates, e.z0.numel(), e.lam.numel(), e.u.numel()
-    nx = 2 * n + nz
-    # index of each local variable in the stage; torques are not unknowns, because the filter makes them functions of
-    # the state
-    places = [*range(f + nx), *range(f + nx, f + nx + n), *range(f + nx + 2 * n, f + 2 * nx + m)]
-    placing = np.zeros((local.numel(), f + 2 * nx + m), bool)
-    placing[np.arange(len(places)), places] = True
-    placing[np.ix_(np.arange(len(places), len(places) + nu), f + np.array(followed, int))] = True
-    by_stage = _times(by_local, placing)
-    hessian = _times(_times(placing.T, curved), placing)
-    # the constraint on the momentum after the step contains this momentum
-    at = rows.numel() - n
-    by_stage[at + np.arange(n), f + nx + n + np.arange(n)] = True
-    measured = np.zeros((f + nx, f + nx), bool)
-    measured[np.arange(f), np.arange(f)] = True  # priors
-    for sensor in sensors:
-        function = sensor_reading_function(system, sensor, tuple(free))
-        by_q, by_z, by_theta = (_mask(function.sparsity_out(f"by_{name}")) for name in ("q", "z", "theta"))
-        reading = np.hstack([by_theta, by_q, np.zeros((len(by_q), n), bool), by_z])
-        measured |= _times(reading.T, reading)
-    rows_blocks = _blocks(symbols, "del", "internal", "constraint", "p1", kept=kept)
-    state, labels = _blocks(symbols, "q0", "p0", "z0"), _blocks(symbols, "lam")[0][1]
-    fixed = np.setdiff1d(np.arange(nx), [*system.prescribed_coordinate_indices, *loose]).tolist()
-    return _NlpStage(by_stage, hessian, measured, rows_blocks, state, labels, tuple(free), fixed, loose)
-
-
-def full_nlp_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
-    """Size of the nonlinear program (NLP) for recordings with the given numbers of `steps`.
-
-    `jacobian_nonzeros` counts entries of the constraint Jacobian. `hessian_nonzeros` counts both triangles of the exact
-    Hessian of the step constraints times their multipliers, without entries of measurements. The initial state is
-    linear in the parameters, as in multiple shooting.
-    """
-    (f, nx, m, height), begun = stage.sizes, len(stage.fixed_start_rows)
-    # every step after the first adds the same entries
-    one, two = (int(np.count_nonzero(_nlp_sparsity_masks(stage, k)[1])) for k in (1, 2))
-    shared, each = int(np.count_nonzero(stage.hessian_mask[:f, :f])), int(np.count_nonzero(stage.constraint_mask))
-    return {
-        "variables": f + sum((k + 1) * nx + k * m for k in steps),
-        "constraints": sum(begun + k * height for k in steps),
-        "jacobian_nonzeros": sum(begun * (1 + f) + k * each for k in steps),
-        "hessian_nonzeros": shared + sum(one - shared + (k - 1) * (two - one) for k in steps),
-    }
-
-
-def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Sparsity masks of one recording's constraint Jacobian, constraint Hessian and measurement Hessian."""
-    (f, nx, m, height), fixed = stage.sizes, stage.fixed_start_rows
-    width = f + (steps + 1) * nx + steps * m
-    jacobian = np.zeros((len(fixed) + steps * height, width), bool)
-    hessian, measured = np.zeros((width, width), bool), np.zeros((width, width), bool)
-    jacobian[np.arange(len(fixed)), f + np.array(fixed, int)] = True
-    jacobian[: len(fixed), :f] = True
-    if len(stage.estimated_start_rows):
-        begun = np.concatenate([np.arange(f), f + np.array(stage.estimated_start_rows)])
-        measured[np.ix_(begun, begun)] = True
-    for k in range(steps + 1):
-        # x_0, lam_0, x_1, lam_1, ...
-        node = f + k * (nx + m)
-        here = np.concatenate([np.arange(f), node + np.arange(nx)])
-        measured[np.ix_(here, here)] |= stage.gauss_newton_mask
-        if k == steps:
-            break
-        columns = np.concatenate([here, node + nx + m + np.arange(nx), node + nx + np.arange(m)])
-        top = len(fixed) + k * height
-        jacobian[np.ix_(np.arange(top, top + height), columns)] |= stage.constraint_mask
-        hessian[np.ix_(columns, columns)] |= stage.hessian_mask
-    return jacobian, hessian, measured
-
-
-def kkt_sparsity_pattern(stage: _NlpStage, steps: int) -> SparsityPattern:
-    """Sparsity of the KKT matrix [[H, J'], [J, 0]] of a recording's first steps, with measurements at every node."""
-    jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
-    blank = np.zeros((len(jacobian), len(jacobian)), bool)
-    mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])
-    blocks = [("theta", stage.free)]
-    for k in range(steps + 1):
-        blocks += [(f"{name[0]}{k}", labels) for name, labels in stage.state_blocks]
-        blocks += [(f"lam{k}", stage.multiplier_labels)] if k < steps else []
-    state = [label for _, labels in stage.state_blocks for label in labels]
-    blocks.append(("start", tuple(state[i] for i in stage.fixed_start_rows)))
-    for k in range(steps):
-        blocks += [(f"p{k + 1} rule" if n == "p1" else f"{n}{k}", labels) for n, labels in stage.constraint_blocks]
-    blocks = [block for block in blocks if block[1]]
-    marked = np.zeros_like(mask)
-    marked[: len(measured), : len(measured)] = measured
-    title = f"KKT matrix of the NLP with a node at every step: the first {steps} steps"
-    found = _pattern("kkt", title, mask, blocks, blocks)
-    return replace(found, marked_mask=marked, mark_label="of a reading or a prior, where there is one")

@@ -428,9 +428,8 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         parts = [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
         yield SummaryTable([(head, "number", "first", "meaning"), *parts], head.capitalize())
     yield from _patterns(result)
-    errors = linear["finite_difference_errors"]
-    norms = [(name, f"{norm:.4g}", f"{errors[name]:.1e}") for name, norm in linear["norms"].items()]
-    yield SummaryTable([("matrix", "norm", "largest difference from finite differences"), *norms], "Linearised step")
+    norms = [(name, f"{norm:.4g}") for name, norm in linear["norms"].items()]
+    yield SummaryTable([("matrix", "norm"), *norms], "Linearised step")
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
@@ -480,16 +479,7 @@ def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         if height and width:
             counts = (str(entry["nonzeros"]), str(entry["at_point"]))
             rows.append((name, f"{height} x {width}", *counts, "sparsity.png"))
-    nlp = result["nlp"]
-    if nlp is not None:
-        n, m = nlp["variables"], nlp["constraints"]
-        rows.append(("constraints' Jacobian of the NLP", f"{m} x {n}", str(nlp["jacobian_nonzeros"]), "", ""))
-        rows.append(("Hessian of the NLP", f"{n} x {n}", str(nlp["hessian_nonzeros"]), "", ""))
-        rows.append(("KKT matrix of the NLP", f"{n + m} x {n + m}", "", "", "kkt.png"))
     yield SummaryTable(rows, "Patterns")
-    if nlp is not None:
-        left = f"; left out: {', '.join(nlp['left_out'])}" if nlp["left_out"] else ""
-        yield f"the NLP has a node at every step{left}"
 
 
 @register_summary("yid-simulate/1")

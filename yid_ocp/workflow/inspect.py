@@ -25,14 +25,11 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.png_figures import draw_sparsity_patterns
-from yid_ocp.sensors import Sensor
-from yid_ocp.sensors.mounted import MountedSensor
 from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
-_SHOWN_STEPS = 2  # steps of the NLP in its figure; later steps look the same
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
 _PARAMETER_KEYS = ("value", "unit", "lower", "upper", "description")
 _DEPENDENCE_KEYS = (
@@ -54,7 +51,7 @@ class _LinearisationPoint:
 def _run_inspect(
     run: RunSettings, out: str | Path | None, progress: Progress, entries: Sequence[str], export: str | None
 ) -> CommandOutcome[None]:
-    """Write result.json, equations.txt, sparsity.png, kkt.png and linearisation.h5, and further files on request."""
+    """Write result.json, equations.txt, sparsity.png and linearisation.h5, and further files on request."""
     with atomic_run_folder(run, out, "inspect") as folder:
         folder.record_run_start(run, "inspect", [part for name in entries for part in ("--entry", name)])
         progress.begin_stage("building the model and its compiled step")
@@ -72,15 +69,13 @@ def _run_inspect(
         progress.begin_stage("linearising")
         problem = build_problem(run, step) if run.recordings.estimate and free else None
         point = _point(step, problem)
-        linearisation, rows = _linearised(step, point)
-        matrices = {"A": linearisation.a, "B_u": linearisation.b_input, "B_theta": linearisation.b_theta}
+        matrices, rows = _linearised(step, point)
         _write_matrices(folder.path / "linearisation.h5", step, {**vars(point), **matrices})
         progress.begin_stage("looking for what enters where")
         patterns = _patterns(symbols, matrices, rows, point)
-        pictures = [folder.path / "sparsity.png", folder.path / "kkt.png"]
-        draw_sparsity_patterns(pictures[0], [[patterns[name] for name in row] for row in _PATTERN_LAYOUT])
+        picture = folder.path / "sparsity.png"
+        draw_sparsity_patterns(picture, [[patterns[name] for name in row] for row in _PATTERN_LAYOUT])
         folder.write_text_file("equations.txt", "\n".join(symbols.text_lines()) + "\n")
-        nlp = None if problem is None else _nlp(symbols, problem, pictures[1])
         files: tuple[Path, ...] = ()
         if export is not None:
             files = export_step_functions(symbols, Path(export), point.theta, step.time_step)
@@ -107,19 +102,17 @@ def _run_inspect(
                 for kind, own in blocks.items()
             },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
-            "nlp": nlp,
             "dependence": {entry.parameter: named_attributes(entry, _DEPENDENCE_KEYS) for entry in dependences},
             "linearisation": {
                 "at": point.description,
                 "norms": {name: float(np.linalg.norm(matrix)) for name, matrix in matrices.items()},
-                **{key: getattr(linearisation, key) for key in ("spectral_radius", "finite_difference_errors")},
+                "spectral_radius": float(np.max(np.abs(np.linalg.eigvals(matrices["A"])), initial=0.0)),
             },
             "asked": named,
             "entries": [_entry_result(entry, symbols, at) for entry in chosen],
             "exported": [str(path) for path in files],
         }
-        shown = {"pictures": [path for path in pictures if path.exists()]}
-        written = folder.write_result_and_report(run, progress, result, section_data=shown)
+        written = folder.write_result_and_report(run, progress, result, section_data={"pictures": [picture]})
     return CommandOutcome(folder.path, written, None)
 
 
@@ -149,17 +142,18 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
     return _LinearisationPoint(words, False, np.zeros(sizes["nx"]), np.zeros(sizes["nu"]), theta, np.zeros(sizes["nc"]))
 
 
-def _linearised(
-    step: Step, point: _LinearisationPoint
-) -> tuple[step_diagnostics.CheckedStepLinearisation, StepEquationLinearizations]:
-    at = point.state, point.torque, point.theta, point.prescribed_positions
+def _linearised(step: Step, point: _LinearisationPoint) -> tuple[dict[str, Array], StepEquationLinearizations]:
+    """Jacobians A, B_u and B_theta of the step at a point, and the linearised equations of the step."""
+    n, path = step.sizes["n"], point.prescribed_positions
+    q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
     try:
-        found = step_diagnostics.checked_step_linearisation(step, *at)
+        found = step.jacobians(q, p, point.torque, point.theta, (path, path) if len(path) else None, z)
     except np.linalg.LinAlgError as error:
         what, allowed = "the step cannot be linearised: its equations are singular", "a model with regular equations"
         hint = "give massless links a mass, or remove redundant grasps"
         raise ModelError(what, where=point.description, allowed=allowed, hint=hint) from error
-    return found, step_diagnostics.linearise_step_equations(step, *at)
+    rows = step_diagnostics.linearise_step_equations(step, point.state, point.torque, point.theta, path)
+    return dict(zip(("A", "B_u", "B_theta"), found, strict=True)), rows
 
 
 def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
@@ -186,29 +180,6 @@ def _patterns(
     found = step_diagnostics.step_sparsity_patterns(symbols)
     where = "the rest" if point.is_equilibrium else "this point"
     return {name: entry.with_numerical_nonzeros_marked(values[name], where) for name, entry in found.items()}
-
-
-def _nlp(symbols: NamedStepEquations, problem: EstimationProblem, picture: Path) -> dict[str, Any]:
-    """Size of the NLP with a node at every step, and its omissions; also draws the pattern of its first steps."""
-    episode = problem.episodes[0]
-    sensors, feedback = [samples.sensor for samples in episode.measurements], episode.tracking_feedback
-    followed = () if feedback is None else tuple(map(int, feedback.state_indices))
-    stage = step_diagnostics.nlp_stage_sparsity(
-        symbols,
-        problem.shared_parameters,
-        [sensor for sensor in sensors if not _is_left_out(sensor)],
-        followed,
-        problem.predictor.estimated_initial_state_indices,
-    )
-    steps = [entry.grid.steps for entry in problem.episodes]
-    draw_sparsity_patterns(picture, [[step_diagnostics.kkt_sparsity_pattern(stage, min(_SHOWN_STEPS, *steps))]])
-    left_out = [*(sensor.group_name for sensor in sensors if _is_left_out(sensor)), *problem.local_parameters]
-    return {**step_diagnostics.full_nlp_size(stage, steps), "left_out": left_out}
-
-
-def _is_left_out(sensor: Sensor) -> bool:
-    """Whether a program of node states lacks what the sensor reads."""
-    return bool(sensor.effort_joints) or isinstance(sensor, MountedSensor)
 
 
 def _dependence(
