@@ -310,8 +310,8 @@ def test_inspect_without_recordings(carried_out, written, urdf_folder):
         "problem: {use_compiler: false}\n"
     )
     result = carried_out("inspect", file).result
-    # no damping and no motor: the two pendulums keep their energy
-    assert result["linearisation"]["spectral_radius"] == pytest.approx(1.0, abs=1e-6)
+    # the pendulums hang and are damped: no change of the state grows
+    assert 0.99 < result["linearisation"]["spectral_radius"] < 1.0
     assert (result["equations"]["unknowns"], result["equations"]["jacobian_nonzeros"]) == (2, 4)
 
 
