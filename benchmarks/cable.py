@@ -39,9 +39,9 @@ from yid_ocp.model.objects.cable import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
-    constant_position_baseline_prediction,
-    interpolated_displacement_baseline_prediction,
-    mean_clamp_displacement_baseline_prediction,
+    constant_position_naive_prediction,
+    interpolated_displacement_naive_prediction,
+    mean_clamp_displacement_naive_prediction,
     position_rmse,
     recorded_point_positions,
 )
@@ -131,9 +131,9 @@ def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     """Prediction errors without a model [m]."""
     free, measured = cable.unclamped_vertex_names, recorded_point_positions(recording, cable.unclamped_vertex_names)
     predictions = {
-        "stay": constant_position_baseline_prediction(recording, free),
-        "move_with_clamps": mean_clamp_displacement_baseline_prediction(recording, free, cable.clamped_vertex_names),
-        "linear_carry": interpolated_displacement_baseline_prediction(
+        "stay": constant_position_naive_prediction(recording, free),
+        "move_with_clamps": mean_clamp_displacement_naive_prediction(recording, free, cable.clamped_vertex_names),
+        "linear_carry": interpolated_displacement_naive_prediction(
             recording,
             free,
             cable.parent_branch_vertex_names,

@@ -59,7 +59,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 
 @contextlib.contextmanager
-def limited_memory() -> Iterator[None]:
+def limit_process_memory() -> Iterator[None]:
     """Limit this process to 1.75 GiB beyond its present memory use (context manager; effective on Linux only).
 
     It protects against libraries that unpack input files: a larger request raises MemoryError.
@@ -207,15 +207,15 @@ def to_lossless_plain_data(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def named_attributes(value: Any, names: str) -> dict[str, Any]:
+def attributes_by_name(value: Any, names: str) -> dict[str, Any]:
     """Return attributes of `value` listed in `names` (blank-separated), by name. `key=name` stores one under `key`."""
     pairs = [name.partition("=") for name in names.split()]
     return {key: getattr(value, name or key) for key, _, name in pairs}
 
 
 def object_attributes_to_json_dict(value: Any, names: str) -> dict[str, Any]:
-    """Return an object's attributes as JSON data, by name. `names` is as in `named_attributes`."""
-    return dict(to_json_types(named_attributes(value, names)))
+    """Return an object's attributes as JSON data, by name. `names` is as in `attributes_by_name`."""
+    return dict(to_json_types(attributes_by_name(value, names)))
 
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:

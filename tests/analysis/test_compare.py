@@ -17,7 +17,7 @@ from yid_ocp.analysis.compare import PAPER_ESTIMATES, compare_methods
 from yid_ocp.analysis.estimation import (
     _predict_held_out_with_expected_errors,
     _worse_than_baseline_issues,
-    channels_worse_than_naive_guess,
+    channels_worse_than_naive_prediction,
     choose_cable_memory_fit,
     prediction_errors_and_units,
 )
@@ -444,7 +444,7 @@ ENTRY = {
 
 def test_a_channel_is_worse_than_a_guess_where_the_best_one_is_clearly_nearer():
     units = {"points.a": "m", "points.b": "m"}
-    [found] = channels_worse_than_naive_guess([ENTRY], units)
+    [found] = channels_worse_than_naive_prediction([ENTRY], units)
     assert found == {
         **{"recording": "run", "channel": "points.a", "unit": "m"},
         **{"baseline": "stays", "guess": pytest.approx(0.01), "rmse": pytest.approx(0.02)},
@@ -455,7 +455,7 @@ def test_a_channel_is_worse_than_a_guess_where_the_best_one_is_clearly_nearer():
     assert issue.evidence_ratio == pytest.approx(error / (1.05 * guess))
     assert (issue.recording, issue.group, issue.weight) == ("run", "points", "not_trusted")
     better = ENTRY | {"rmse": {"points.a": 0.0101, "points.b": 0.01}}
-    assert _worse_than_baseline_issues([better], units) == channels_worse_than_naive_guess([better], units) == []
+    assert _worse_than_baseline_issues([better], units) == channels_worse_than_naive_prediction([better], units) == []
 
 
 @pytest.mark.parametrize(("start", "window"), [("equilibrium", -1.0), ("fitted_to_points", 0.1)])

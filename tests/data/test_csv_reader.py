@@ -48,7 +48,7 @@ def test_csv_columns_of_sensors_on_links(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("\n".join([header, *rows]))
     columns = {f"w{i + 1}": f"angular_velocity_{axis}:imu_link" for i, axis in enumerate("xyz")}
     imu, wrist = sorted(
-        read_csv(tmp_path / "run.csv", CsvOptions(columns=columns)).channel_groups, key=lambda g: g.name
+        read_csv(tmp_path / "run.csv", CsvOptions(column_meanings=columns)).channel_groups, key=lambda g: g.name
     )
     assert (imu.name, imu.names, wrist.name, wrist.names) == ("imu", ("imu_link",), "wrist", ("ft",))
     np.testing.assert_allclose(wrist.t, [0.0, 1.0])
@@ -56,7 +56,7 @@ def test_csv_columns_of_sensors_on_links(tmp_path: Path) -> None:
     np.testing.assert_allclose(imu.t, [0.5, 1.0])
     np.testing.assert_allclose(imu.values_by_quantity["angular_velocity"][1, 0], [0.4, 0.5, 0.6])
     with pytest.raises(DataError, match="no column for force_z of 'ft'"):
-        read_csv(tmp_path / "run.csv", CsvOptions(columns={**columns, "ft_force_z": "skip"}))
+        read_csv(tmp_path / "run.csv", CsvOptions(column_meanings={**columns, "ft_force_z": "skip"}))
 
 
 def test_csv_units_are_converted(tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_csv_units_are_converted(tmp_path: Path) -> None:
 def test_csv_columns_given_chosen_and_renamed(tmp_path: Path) -> None:
     path = table(tmp_path, "stamp;angle;label;X;Y;Z\n0;0.1;start;1;2;3\n1;0.2;;4;5;6\n")
     columns = {"stamp": "t", "angle": "position:elbow", "label": "skip", "X": "x:tip", "Y": "y:tip", "Z": "z:tip"}
-    recording = read_any(path, columns=columns, delimiter=";")
+    recording = read_any(path, column_meanings=columns, delimiter=";")
     assert recording.joint_names == ("elbow",)
     assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])
     path = table(tmp_path, "t,q_a,q_b,m1_x,m1_y,m1_z,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
@@ -112,10 +112,20 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "label=skip"),
     "bare prefix": ("t,q_\n0,1\n", {}, "meaning of column 'q_'", ""),
     "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
-    "only time": ("t,label\n0,1\n", {"columns": {"label": "skip"}}, "the recording has no group", ""),
-    "column not there": (GOOD, {"columns": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
-    "meaning of a column": (GOOD, {"columns": {"q_a": "angle:a"}}, "meaning 'angle:a' of column", "q_a=position:JOINT"),
-    "meaning without joint": (GOOD, {"columns": {"q_a": "position"}}, "meaning 'position' of", "q_a=position:NAME"),
+    "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "the recording has no group", ""),
+    "column not there": (GOOD, {"column_meanings": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
+    "meaning of a column": (
+        GOOD,
+        {"column_meanings": {"q_a": "angle:a"}},
+        "meaning 'angle:a' of column",
+        "q_a=position:JOINT",
+    ),
+    "meaning without joint": (
+        GOOD,
+        {"column_meanings": {"q_a": "position"}},
+        "meaning 'position' of",
+        "q_a=position:NAME",
+    ),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
     "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' holds 'fast'", ""),
     "joint missing in a channel": ("t,q_a,q_b,effort_a\n0,1,1,1\n", {}, "no column for effort of 'b'", ""),
@@ -192,11 +202,11 @@ def test_a_preview_of_what_is_no_table_is_refused_as_reading_it_is(content: byte
 def test_a_table_without_a_header(tmp_path: Path) -> None:
     path = table(tmp_path, "0,0.1,5\n1,0.2,6\n")
     columns = {"1": "t", "2": "position:a", "3": "effort:a"}
-    joints = joints_of(read_any(path, has_header=False, columns=columns))
+    joints = joints_of(read_any(path, has_header=False, column_meanings=columns))
     assert np.array_equal(joints.position[:, 0], [0.1, 0.2])
     assert np.array_equal(joints.values_by_channel["effort"][:, 0], [5, 6])
     with pytest.raises(DataError, match="no header row") as caught:
-        read_any(path, columns=columns)
+        read_any(path, column_meanings=columns)
     assert "--no-header --columns t," in caught.value.hint
 
 
@@ -204,8 +214,8 @@ def test_patterns_of_columns(tmp_path: Path) -> None:
     path = table(tmp_path, "stamp,a_pos,b_pos,a_tau,b_tau,b_ref\n0,1,2,3,4,5\n1,6,7,8,9,10\n")
     columns = {"stamp": "t", "*_pos": "position:*", "*_tau": "effort:*", "b_*": "skip", "b_pos": "position:elbow"}
     with pytest.raises(DataError, match="no column for effort of 'elbow'"):
-        read_any(path, columns=columns)
-    joints = joints_of(read_any(path, columns={**columns, "b_tau": "effort:elbow"}))
+        read_any(path, column_meanings=columns)
+    joints = joints_of(read_any(path, column_meanings={**columns, "b_tau": "effort:elbow"}))
     assert joints.names == ("a", "elbow")
     assert np.array_equal(joints.values_by_channel["effort"], [[3, 4], [8, 9]])
 
@@ -234,8 +244,8 @@ def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
 )
 def test_the_preview_of_a_table(text: str, columns: dict[str, str], tmp_path: Path) -> None:
     contents = preview_file(table(tmp_path, text))
-    assert contents.reader_options["columns"] == columns
-    assert ("header" in contents.reader_options) == text.startswith("0")
+    assert contents.reader_options["column_meanings"] == columns
+    assert ("has_header" in contents.reader_options) == text.startswith("0")
 
 
 def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
@@ -264,7 +274,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     values = {"position": [[0.1, 0.2], [0.5, 0.6]], "velocity": [[1, 2], [3, 4]]}
     np.testing.assert_equal(joints.values_by_channel, {**values, "position_command": [[0.3, 0.4], [0.7, 0.8]]})
     contents = preview_file(path)
-    assert "columns" not in contents.reader_options
+    assert "column_meanings" not in contents.reader_options
     assert [source.imported_as for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
     # a name that says nothing is not guessed
     path.write_text("t,j0\n0,1\n1,2\n", encoding="utf-8")

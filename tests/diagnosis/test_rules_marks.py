@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.verdict import LocatedGap
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.workflow import blind_slices
-from yid_ocp.workflow.blind_slices import join_slices, rescore_blind, write_slice
+from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, write_slice
 
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
@@ -398,7 +398,7 @@ def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path,
     for name in ("draw_blind_results", "write_report"):
         monkeypatch.setattr(blind_slices, name, lambda *_: None)
     parts = [written_slice(tmp_path, "1/2", (0, 2)), written_slice(tmp_path, "2/2", (1, 3)) / "slice.json"]
-    joined = join_slices(parts, tmp_path / "joined").result
+    joined = score_joined_slices(parts, tmp_path / "joined").result
     assert [entry["case"] for entry in joined["marks"]] == [f"case_{i:03d}" for i in range(4)]
     assert (joined["slices"], joined["cases"], joined["false_alarms"]) == (["1/2", "2/2"], 4, 0.0)
     assert rescore_blind(tmp_path / "joined", tmp_path / "again").result["cases"] == 4
@@ -417,4 +417,4 @@ def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path,
 def test_slices_count_together_only_with_one_hash(tmp_path, changes, words):
     first, other = written_slice(tmp_path, "1/2", (0, 2)), written_slice(tmp_path, "2/2", (1, 3), **changes)
     with pytest.raises(DataError, match=words):
-        join_slices([first, other], tmp_path / "joined")
+        score_joined_slices([first, other], tmp_path / "joined")

@@ -13,9 +13,9 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     _noisy,
-    constant_position_baseline_prediction,
-    interpolated_displacement_baseline_prediction,
-    mean_clamp_displacement_baseline_prediction,
+    constant_position_naive_prediction,
+    interpolated_displacement_naive_prediction,
+    mean_clamp_displacement_naive_prediction,
     position_rmse,
     recorded_point_positions,
     rmse_unit_and_count_by_channel,
@@ -162,30 +162,28 @@ def recording():
 
 
 def test_stay_repeats_the_last_given_frame(recording):
-    predicted = constant_position_baseline_prediction(recording, NAMES)
+    predicted = constant_position_naive_prediction(recording, NAMES)
     np.testing.assert_array_equal(predicted[:2], recorded_point_positions(recording, NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 
 def test_all_points_move_with_the_mean_of_the_clamps(recording):
-    predicted = mean_clamp_displacement_baseline_prediction(recording, ("p2", "c1"), ("p0", "p4"))
+    predicted = mean_clamp_displacement_naive_prediction(recording, ("p2", "c1"), ("p0", "p4"))
     np.testing.assert_allclose(predicted[-1, :, 2], 2e-3 * 9)
     np.testing.assert_allclose(predicted[-1, :, :2], [[0.2, 0.0], [0.2, 0.1]])
     # with one clamp they move as it does
-    alone = mean_clamp_displacement_baseline_prediction(recording, ("p2", "c1"), ("p4",))
+    alone = mean_clamp_displacement_naive_prediction(recording, ("p2", "c1"), ("p4",))
     np.testing.assert_allclose(alone[-1, :, 2], 3e-3 * 9)
 
 
 def test_linear_carry_interpolates_along_the_arc_and_children_follow_their_junction(recording):
-    predicted = interpolated_displacement_baseline_prediction(
-        recording, ("p1", "p2", "p3", "c1", "c2"), PARENT, CHILDREN
-    )
+    predicted = interpolated_displacement_naive_prediction(recording, ("p1", "p2", "p3", "c1", "c2"), PARENT, CHILDREN)
     # arc length as in the last given frame; the ends' heights differ by 2 mm there, which lengthens the chain by 1e-5
     np.testing.assert_allclose(predicted[-1, :, 2] / 9e-3, [1.4, 1.8, 2.6, 1.8, 1.8], rtol=1e-3)
 
 
 def test_linear_carry_between_inner_points_holds_the_ends_beyond_them(recording):
-    predicted = interpolated_displacement_baseline_prediction(
+    predicted = interpolated_displacement_naive_prediction(
         recording, ("p2",), PARENT, CHILDREN, clamped=("p0", "p1", "p4")
     )
     np.testing.assert_allclose(predicted[-1, 0, 2], 3 * 9e-3 * 0.25, rtol=1e-3)
@@ -198,9 +196,9 @@ def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
     other = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="other")
     free = ("p1", "p2", "p3", "c1", "c2")
     for method in (
-        lambda r: constant_position_baseline_prediction(r, free),
-        lambda r: mean_clamp_displacement_baseline_prediction(r, free, ("p0", "p4")),
-        lambda r: interpolated_displacement_baseline_prediction(r, free, PARENT, CHILDREN),
+        lambda r: constant_position_naive_prediction(r, free),
+        lambda r: mean_clamp_displacement_naive_prediction(r, free, ("p0", "p4")),
+        lambda r: interpolated_displacement_naive_prediction(r, free, PARENT, CHILDREN),
     ):
         np.testing.assert_array_equal(method(recording)[2:], method(other)[2:])
 
@@ -218,10 +216,10 @@ def test_prediction_error_is_euclidean_and_leaves_out_given_frames_and_gaps():
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda r: constant_position_baseline_prediction(r, ("p9",)), "not recorded"),
-        (lambda r: constant_position_baseline_prediction(r, ("p1",), given=0), "given = 0"),
-        (lambda r: constant_position_baseline_prediction(r, ("p1",), given=11), "given = 11"),
-        (lambda r: interpolated_displacement_baseline_prediction(r, ("c1",), PARENT), "belongs to no branch"),
+        (lambda r: constant_position_naive_prediction(r, ("p9",)), "not recorded"),
+        (lambda r: constant_position_naive_prediction(r, ("p1",), given=0), "given = 0"),
+        (lambda r: constant_position_naive_prediction(r, ("p1",), given=11), "given = 11"),
+        (lambda r: interpolated_displacement_naive_prediction(r, ("c1",), PARENT), "belongs to no branch"),
         (lambda r: position_rmse(np.zeros((3, 1, 3)), np.zeros((4, 1, 3))), "the prediction has the shape"),
     ],
 )
@@ -232,7 +230,7 @@ def test_what_cannot_be_predicted_is_said(recording, call, text):
     seen[1, 2] = np.nan
     hidden = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="hidden")
     with pytest.raises(DataError, match="'p2' is not seen"):
-        constant_position_baseline_prediction(hidden, ("p2",))
+        constant_position_naive_prediction(hidden, ("p2",))
 
 
 @pytest.fixture

@@ -196,7 +196,7 @@ def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, mo
         begun = False
 
         def edit_model(self, model: Any) -> None: ...
-        def start_motion(self, data: Any) -> None:
+        def prepare_motion(self, data: Any) -> None:
             self.begun = True
 
         def add_forces(self, model: Any, data: Any) -> None:

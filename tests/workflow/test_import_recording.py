@@ -49,7 +49,7 @@ def test_flags_say_what_columns_and_units_mean(odd: Path) -> None:
 def test_a_section_of_a_configuration_does_the_same_and_flags_go_before_it(odd: Path) -> None:
     columns = '{stamp: t, j1: "position:shoulder", j2: "position:elbow", mx: "x:tip", my: "y:tip", mz: "z:tip"}'
     more = '  units: {t: ms, position: deg, points: mm}\n  point_names: {tip: "cable:100%"}\n'
-    (odd / "run.yaml").write_text(f"import:\n  columns: {columns}\n{more}")
+    (odd / "run.yaml").write_text(f"import:\n  column_meanings: {columns}\n{more}")
     assert main(["import", "run.csv", "--out", "run.h5", "--config", "run.yaml"]) == 0
     check_odd(odd / "run.h5", odd / "run.csv")
     assert main(["import", "run.csv", "--out", "run.h5", "--config", "run.yaml", "--points", "tip=other"]) == 0

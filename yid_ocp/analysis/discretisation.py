@@ -346,7 +346,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def min_frame_distance_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_grasp_frame_distances(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
     `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths.

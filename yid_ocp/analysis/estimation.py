@@ -15,7 +15,7 @@ from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import MAX_EVIDENCE_RATIO, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.files import named_attributes
+from yid_ocp.files import attributes_by_name
 from yid_ocp.inference.linearized_residual import solve_step_within_unknown_sizes
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import free_estimates_marked_not_trusted, typical_parameter_magnitudes
@@ -170,7 +170,7 @@ def _checked_solution_and_step_stability(
 
 def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | None:
     names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
-    return None if growth is None else named_attributes(growth, names)
+    return None if growth is None else attributes_by_name(growth, names)
 
 
 _MEMORY_SUFFIX = ".memory"
@@ -369,7 +369,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
     return (best, rms[best], error) if best is not None and error > _WORSE_RATIO * rms[best] else None
 
 
-def channels_worse_than_naive_guess(
+def channels_worse_than_naive_prediction(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """Find channels that a baseline predicts clearly better than the model, from `prediction_errors_and_units`."""
@@ -424,10 +424,10 @@ def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableTopolo
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
         parents, children = cable.parent_branch_vertex_names, cable.vertex_names_by_child_branch
-        carried = predictions.interpolated_displacement_baseline_prediction
+        carried = predictions.interpolated_displacement_naive_prediction
         arrays = {
-            "stays": predictions.constant_position_baseline_prediction(recording, points, _START_FRAMES),
-            "moves_with_clamps": predictions.mean_clamp_displacement_baseline_prediction(
+            "stays": predictions.constant_position_naive_prediction(recording, points, _START_FRAMES),
+            "moves_with_clamps": predictions.mean_clamp_displacement_naive_prediction(
                 recording, points, held, _START_FRAMES
             ),
             "linear_carry": carried(recording, points, parents, children, given=_START_FRAMES),

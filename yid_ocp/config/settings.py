@@ -256,7 +256,7 @@ class ImportSettings:
         Le(10),
         OptionInfo("distance of the points NAME_x, NAME_y, NAME_z along the axes of a pose", "m"),
     ] = None
-    columns: Annotated[
+    column_meanings: Annotated[
         _Texts, OptionInfo("table: t, CHANNEL:JOINT, AXIS:POINT or skip, by column or pattern such as *_pos")
     ] = None
     has_header: Annotated[bool | None, OptionInfo("table: whether the first row has names (else 1, 2, ...)")] = None
@@ -379,7 +379,7 @@ class _VirtualFramesSettings:
     max_gripper_travel: Annotated[
         float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
     ] = 0.11
-    gripper_start_offsets: Annotated[
+    gripper_start_offsets_from_object: Annotated[
         Mapping[str, _Vector3], OptionInfo("start relative to the end of the undeformed object, by grasp", "m")
     ] = field(default_factory=dict)
     camera_position: Annotated[_Vector3, OptionInfo("position of the camera", "m")] = (2.6, 0.0, 0.45)

@@ -245,7 +245,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
         try:
             faulthandler.disable()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
-            with files.limited_memory():
+            with files.limit_process_memory():
                 said = complaint(path)
             os.write(there, f".{said}".encode(errors="replace")[:2000])
         finally:

@@ -44,7 +44,7 @@ from yid_ocp.diagnosis.refit import (
     RefittedModel,
     StoredFit,
     load_stored_refit,
-    model_in_step_of_all_candidates,
+    refit_in_all_candidates_step,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import CandidateScore, screen_candidates
@@ -233,7 +233,7 @@ def _diagnosed(
     accepted, final = judged.accepted_selections, nominal
     if accepted:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
-        final = model_in_step_of_all_candidates(search.problem, accepted[-1].refitted_model)
+        final = refit_in_all_candidates_step(search.problem, accepted[-1].refitted_model)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     remaining, rest = held, where
     if accepted:

@@ -313,7 +313,7 @@ def load_stored_refit(
     return _model(known, effects, own, finish, x, True)
 
 
-def model_in_step_of_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
+def refit_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
     """A refit with its problem and evaluation in the step of all candidates; its statistics are kept."""
     if fit.problem.step is problem.problem.step:
         return fit

@@ -18,8 +18,8 @@ from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.virtual.mjcf import (
     MODEL_ASPECT_DESCRIPTIONS,
     MUJOCO_APPROXIMATED_ASPECTS,
+    ExpressionEvaluator,
     JointDynamicsTerms,
-    ParameterEvaluator,
     effect_joint_terms_and_changed_aspects,
     format_xml_numbers,
     model_aspects_depending_on_symbols,
@@ -57,7 +57,7 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
-    SubElement(world, "gravity").text = format_xml_numbers(ParameterEvaluator(system, values)(system.gravity))
+    SubElement(world, "gravity").text = format_xml_numbers(ExpressionEvaluator(system, values)(system.gravity))
     model = SubElement(world, "model", name="model")
     for i, joint in enumerate(tree.joints):
         _sdf_link(model, tree, i)
@@ -78,7 +78,7 @@ def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[
     """The tree with numbers and without separate weights of bodies, and the dynamics of its joints."""
     tree = system.numeric_mechanism(values)
     joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
-    return replace(tree, joints=joints), system_joint_dynamics_terms(system, ParameterEvaluator(system, values))
+    return replace(tree, joints=joints), system_joint_dynamics_terms(system, ExpressionEvaluator(system, values))
 
 
 def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
@@ -196,7 +196,7 @@ _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
     """Support of the export format `form` (`mjcf`, `urdf` or `sdf`) for each effect of a system."""
-    value, found = ParameterEvaluator(system, values), dict[str, FeatureExportSupport]()
+    value, found = ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"

@@ -40,7 +40,7 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
     raise DataError(what, where=where, **said)
 
 
-def constant_position_baseline_prediction(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
+def constant_position_naive_prediction(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
     """Predict, as a baseline without a model, that every point stays at its position in the last given frame.
 
     Returns positions (M, len(points), 3) [m]; the first `given` frames are as measured. Raises `DataError` if a point
@@ -49,19 +49,19 @@ def constant_position_baseline_prediction(recording: Recording, points: Sequence
     return _carried(recording, points, (), given, np.zeros((len(points), 0)))
 
 
-def mean_clamp_displacement_baseline_prediction(
+def mean_clamp_displacement_naive_prediction(
     recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2
 ) -> Array:
     """Predict, as a baseline without a model, that every point moves by the mean displacement of the clamped points.
 
     Displacements count from the last given frame. The path of the `clamped` points is known. Shape and errors are as in
-    `constant_position_baseline_prediction`.
+    `constant_position_naive_prediction`.
     """
     share = np.full((len(points), len(clamped)), 1.0 / max(len(clamped), 1))
     return _carried(recording, points, clamped, given, share)
 
 
-def interpolated_displacement_baseline_prediction(
+def interpolated_displacement_naive_prediction(
     recording: Recording,
     points: Sequence[str],
     parent: Sequence[str],
@@ -73,7 +73,7 @@ def interpolated_displacement_baseline_prediction(
 
     `parent` lists its points from end to end. Displacements are interpolated between its points `clamped` (default: its
     two ends). Children move with their junction: each child starts with the parent point of its junction. Shape and
-    errors are as in `constant_position_baseline_prediction`; a point without a branch also raises `DataError`.
+    errors are as in `constant_position_naive_prediction`; a point without a branch also raises `DataError`.
     """
     known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
     at = _given_frame(recording, parent, given)

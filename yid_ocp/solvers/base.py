@@ -41,7 +41,7 @@ from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
-from yid_ocp.solvers.initial_guess import other_minimum_starts, unknowns_with_neutral_effects_activated
+from yid_ocp.solvers.initial_guess import starts_toward_other_minima, unknowns_with_neutral_effects_activated
 
 if TYPE_CHECKING:
     import pandas
@@ -405,7 +405,7 @@ class _MultiStartSearch:
             if not best.evaluation.ok or assess_goodness_of_fit(best.weighted, best.evaluation, limits).explains:
                 break
             self._try(self._multiple(best.result.x, factor), f"best fit x {factor:g}", most)
-        minima = other_minimum_starts(self._best.weighted, self._best.evaluation, self._best.result.x)
+        minima = starts_toward_other_minima(self._best.weighted, self._best.evaluation, self._best.result.x)
         most = self._n_starts + len(minima)
         for near in minima:
             self._try(near, "another local minimum", most)

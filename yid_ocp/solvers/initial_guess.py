@@ -223,7 +223,7 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
     return step[amplitudes] * size[amplitudes], predicted_cost_reduction(scaled, found.residual, step)
 
 
-def other_minimum_starts(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
+def starts_toward_other_minima(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
     """Starts from which a poorly known unknown may reach another minimum, the most likely start first."""
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []

@@ -27,7 +27,7 @@ from yid_ocp.virtual.joint_motion import (
     grasping_joint_angles,
     random_multisine_motion,
 )
-from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
+from yid_ocp.virtual.mjcf import ExpressionEvaluator, import_mujoco
 from yid_ocp.virtual.mujoco_simulation import (
     InjectedSimulatorTerms,
     SimulationOptions,
@@ -346,7 +346,7 @@ def _camera_error(
         inside = late <= duration
         std = None if group.std is None else group.std[inside]
         return replace(group, t=late[inside], position=position[inside], std=std)
-    value = ParameterEvaluator(system, {})
+    value = ExpressionEvaluator(system, {})
     radius = {s.name: float(value(s.radius)[0]) for s in system.segment_layouts}
     own = np.array([radius.get(name.removeprefix("w_").partition(":")[0], 0.0) for name in group.names])
     ray = centre - position

@@ -24,7 +24,7 @@ from yid_ocp.effects.base import EffectBase, object_joint_names
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error, run_virtual_experiment
-from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
+from yid_ocp.virtual.mjcf import ExpressionEvaluator, import_mujoco
 
 _ForceCallback = Callable[[Any, Any], None]  # function of MuJoCo's model and data that adds to `qfrc_passive`
 _Values = Mapping[str, float]
@@ -62,7 +62,7 @@ class _EffectContext:
 
     def __init__(self, system: System, values: Mapping[str, float]) -> None:
         self.system, self.has_motion_begun = system, False
-        self.value, springs = ParameterEvaluator(system, values), system.elastic_joints
+        self.value, springs = ExpressionEvaluator(system, values), system.elastic_joints
         self.joint_stiffness = {s.joint_name: float(self.value(s.stiffness)[0]) for s in springs}  # [N m/rad]
         self.rest_angles = {s.joint_name: float(self.value(s.rest_angle)[0]) for s in springs}  # [rad]
 
@@ -569,7 +569,7 @@ class _InjectedTerms:
             else:
                 self._forces.append(OUT_OF_LIBRARY_FORCE_BUILDERS[effect.kind](scene, model, place, size["size"]))
 
-    def start_motion(self, data: Any) -> None:
+    def prepare_motion(self, data: Any) -> None:
         self._scene.has_motion_begun = True
 
     def add_forces(self, model: Any, data: Any) -> None:

@@ -17,7 +17,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
-from yid_ocp.virtual.mjcf import ParameterEvaluator
+from yid_ocp.virtual.mjcf import ExpressionEvaluator
 
 BAXTER_JOINT_NAMES_WITHOUT_SIDE = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 _ELBOW_UP_ANGLES: Mapping[str, float] = {
@@ -208,7 +208,7 @@ def grasping_joint_angles(
         undeformed Y are fully stretched, which is a singular posture; offsets that bring the grippers closer avoid it.
     """
     tree = system.numeric_mechanism(values)
-    value = ParameterEvaluator(system, values)
+    value = ExpressionEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
     elastic = {spring.joint_name for spring in system.elastic_joints}
     holders = (tree.frame(grasp.holder_frame).joint_index for grasp in system.grasps)
@@ -221,7 +221,7 @@ def grasping_joint_angles(
     return {tree.joints[j].name: float(posture[j]) for j in wanted}
 
 
-def _undeformed(system: System, tree: Mechanism, value: ParameterEvaluator, start: Mapping[str, float]) -> Array:
+def _undeformed(system: System, tree: Mechanism, value: ExpressionEvaluator, start: Mapping[str, float]) -> Array:
     """Configuration (n,) with an undeformed object and the other joints at the start of the search."""
     posture, elastic = np.zeros(system.n_coordinates), {spring.joint_name for spring in system.elastic_joints}
     for spring in system.elastic_joints:
@@ -235,7 +235,7 @@ def _undeformed(system: System, tree: Mechanism, value: ParameterEvaluator, star
 
 
 def _gap_function(
-    system: System, tree: Mechanism, value: ParameterEvaluator, offsets: Mapping[str, ArrayLike], sought: Sequence[int]
+    system: System, tree: Mechanism, value: ExpressionEvaluator, offsets: Mapping[str, ArrayLike], sought: Sequence[int]
 ) -> ca.Function:
     """Function of q: gaps [m] between grippers and the held points, and their derivatives by the searched joints."""
     q = ca.SX.sym("q", system.n_coordinates)

@@ -90,7 +90,7 @@ class JointDynamicsTerms:
         return JointDynamicsTerms(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
 
 
-class ParameterEvaluator:
+class ExpressionEvaluator:
     """Evaluates CasADi expressions at parameter values (default: nominal). Matrices are flattened by columns."""
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
@@ -138,7 +138,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 
 
 def effect_joint_terms_and_changed_aspects(
-    system: System, effect: Effect, value: ParameterEvaluator
+    system: System, effect: Effect, value: ExpressionEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
     """Terms by joint that an effect adds, and the `MODEL_ASPECT_DESCRIPTIONS` keys that it changes."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
@@ -164,7 +164,7 @@ def effect_joint_terms_and_changed_aspects(
     return terms, aspects or {"reading"}
 
 
-def system_joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
+def system_joint_dynamics_terms(system: System, value: ExpressionEvaluator) -> dict[str, JointDynamicsTerms]:
     """Springs, dampers, rotor inertia and friction by joint, from the description and single-joint effects."""
     found: dict[str, JointDynamicsTerms] = {}
 
@@ -190,7 +190,7 @@ def system_joint_dynamics_terms(system: System, value: ParameterEvaluator) -> di
 
 
 def _actuation(
-    system: System, effects: Sequence[Effect], joint: str, value: ParameterEvaluator
+    system: System, effects: Sequence[Effect], joint: str, value: ExpressionEvaluator
 ) -> tuple[float, float, float, float]:
     """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
 
@@ -207,7 +207,7 @@ def _actuation(
     return gain, offset, delay, time_constant
 
 
-def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms] | None:
+def _joint_terms(system: System, effect: Effect, value: ExpressionEvaluator) -> dict[str, JointDynamicsTerms] | None:
     """Springs, dampers and rotors equivalent to an effect's equations, by joint; None if there is no equivalent."""
     n = system.n_coordinates
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
@@ -290,7 +290,7 @@ def mujoco_xml(
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml: time_step", allowed="a number above 0 [s]")
     tree, weights = _weighed(system.numeric_mechanism(values))
-    value = ParameterEvaluator(system, values)
+    value = ExpressionEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
 
     root = Element("mujoco", model=tree.name)
@@ -397,7 +397,7 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
     return attributes | {name: format_xml_numbers(values) for name, values in numbers.items()}
 
 
-def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_step: float) -> None:
+def _add_grasps(system: System, value: ExpressionEvaluator, root: Element, time_step: float) -> None:
     equality = SubElement(root, "equality")
     firm = {"solref": format_xml_numbers([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
     for grasp in system.grasps:
@@ -420,7 +420,7 @@ def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_s
             SubElement(equality, kind, {"name": f"grasp_{grasp.name}{suffix}", **sites, **firm})
 
 
-def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element, time_step: float) -> None:
+def _add_actuators(system: System, value: ExpressionEvaluator, actuator: Element, time_step: float) -> None:
     for joint in system.driven:
         gain, offset, delay, lag = _actuation(system, system.effects, joint, value)
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
@@ -466,7 +466,7 @@ def mujoco_model_from_mjcf(text: str) -> Any:
         raise ModelError(what, where="MJCF text", allowed="MJCF that MuJoCo compiles", hint=hint) from error
 
 
-def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bool) -> None:
+def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: bool) -> None:
     able = _NATIVE_ASPECTS | MUJOCO_APPROXIMATED_ASPECTS if emulate else _NATIVE_ASPECTS
     for effect in system.effects:
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
@@ -503,7 +503,7 @@ def _shares_body(tree: Mechanism, j: int) -> bool:
     return alone and bool(np.array_equal(np.array(ca.DM(joint.placement.homogeneous_matrix())), np.eye(4)))
 
 
-def _sites(system: System, tree: Mechanism, value: ParameterEvaluator) -> list[tuple[str, Frame]]:
+def _sites(system: System, tree: Mechanism, value: ExpressionEvaluator) -> list[tuple[str, Frame]]:
     sites = [(name, tree.frame(name)) for name in system.point_frames]
     for grasp in system.grasps:
         holder, held = tree.frame(grasp.holder_frame), tree.frame(grasp.held_frame)

@@ -44,7 +44,7 @@ class InjectedSimulatorTerms(Protocol):
     def edit_model(self, model: Any) -> None:
         """Edit the compiled `mujoco.MjModel`."""
 
-    def start_motion(self, data: Any) -> None:
+    def prepare_motion(self, data: Any) -> None:
         """Prepare for a motion that starts at equilibrium. Called once per motion."""
 
     def add_forces(self, model: Any, data: Any) -> None:
@@ -171,7 +171,7 @@ def simulate_in_mujoco(
         else:
             controller = TrackingController(scene, motion, settle_to_equilibrium(scene, nominal_damping))
         if injected is not None:
-            injected.start_motion(scene.data)
+            injected.prepare_motion(scene.data)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)

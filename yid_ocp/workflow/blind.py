@@ -33,7 +33,7 @@ from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_ta
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmOptions
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
-from yid_ocp.workflow.blind_slices import join_slices, rescore_blind, score_slices, write_slice
+from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, score_slices, write_slice
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
@@ -54,7 +54,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         again = functools.partial(rescore_blind, folder, target, arguments.overrides)
         return run_command_and_print(arguments, again)
     if arguments.join:
-        together = functools.partial(join_slices, arguments.join, arguments.out or "joined-slices")
+        together = functools.partial(score_joined_slices, arguments.join, arguments.out or "joined-slices")
         return run_command_and_print(arguments, together)
     runs = [
         load_config(path, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
@@ -97,7 +97,7 @@ def run_blind(
     The folder contains `configs/`, `prepared/` (detectable sizes per experiment), `cases/` (recordings),
     `sealed/labels.json`, `commitment.json` (hashes of the labels, written before the first diagnosis, and of the
     sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), `slice.json`
-    (`yid-blind-slice/1`: labels and answers with hashes, for `join_slices`), `result.json` (`yid-blind/1`), `table.md`
+    (`yid-blind-slice/1`: labels, answers, hashes, for `score_joined_slices`), `result.json` (`yid-blind/1`), `table.md`
     and pictures. A calibration ensemble also has `thresholds.json` (`yid-calibration/1`). Raises `OutputError` if the
     folder holds another ensemble.
     """

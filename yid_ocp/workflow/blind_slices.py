@@ -41,7 +41,7 @@ def _ensemble_sha256(part: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def join_slices(
+def score_joined_slices(
     files: Sequence[str | Path], out: str | Path, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[None]:
     """Score slices of one ensemble together, from their files `slice.json` or the folders of these files.

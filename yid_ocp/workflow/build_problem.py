@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_frame_distance_by_grasp
+from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_grasp_frame_distances
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
@@ -171,7 +171,7 @@ def build_problem(
     return problem
 
 
-def min_initial_frame_distance_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+def min_initial_grasp_frame_distances(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
     """Smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
     system = problem.system
     if not system.grasps:
@@ -181,7 +181,7 @@ def min_initial_frame_distance_by_grasp(problem: EstimationProblem, episode: Epi
     theta = problem.theta.copy()
     for name, value in episode.known_parameters.items():
         theta[system.parameters.index(name)] = value
-    return min_frame_distance_by_grasp(system, posture, theta)
+    return min_grasp_frame_distances(system, posture, theta)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
@@ -189,7 +189,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
         hint = f"first correct these issues: {'; '.join(f'{issue.location_text}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in min_initial_frame_distance_by_grasp(problem, episode).items():
+        for name, gap in min_initial_grasp_frame_distances(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
                 where, allowed = run.setting_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"

@@ -17,7 +17,7 @@ from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
-from yid_ocp.files import named_attributes
+from yid_ocp.files import attributes_by_name
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
@@ -113,13 +113,13 @@ class ProposedConfigChoices:
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the proposal to plain data under the keys of `yid-init/1`."""
-        return named_attributes(self, f"{_KEYS} {_MORE_KEYS} {_LAST_KEYS}") | {
-            "arms": [named_attributes(arm, "joints frames=tool_frames") for arm in self.arms],
+        return attributes_by_name(self, f"{_KEYS} {_MORE_KEYS} {_LAST_KEYS}") | {
+            "arms": [attributes_by_name(arm, "joints frames=tool_frames") for arm in self.arms],
             "places": {
-                group: [named_attributes(place, "point frame why=reason") for place in places]
+                group: [attributes_by_name(place, "point frame why=reason") for place in places]
                 for group, places in self.point_placements.items()
             },
-            "noise": {key: named_attributes(own, "std unit why=reason") for key, own in self.noise_by_group.items()},
+            "noise": {key: attributes_by_name(own, "std unit why=reason") for key, own in self.noise_by_group.items()},
         }
 
     @property

@@ -25,7 +25,7 @@ from yid_ocp.data.readers.base import (
 )
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.files import named_attributes
+from yid_ocp.files import attributes_by_name
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
@@ -34,7 +34,7 @@ _RESULT_FORMAT = "yid-import/1"
 _LISTS = ("joint_topics", "joints")
 _MAPPINGS: Mapping[str, type] = {
     "point_names": str,
-    "columns": str,
+    "column_meanings": str,
     "torque_constants": float,
     "gear_ratios": float,
     "clock_offsets": float,
@@ -55,6 +55,7 @@ _FLAGS = {
     "joint_topics": "--joint-topic",
     "clock_offsets": "--clock-offset",
     "message_fields": "--field",
+    "column_meanings": "--columns",
     "point_names": "--points",
 }  # options whose flag has another name
 _SWITCHES = {("has_header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
@@ -96,7 +97,7 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
             progress.begin_stage(f"reading {file}")
             contents = preview_file(file, progress)
             keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
-            sources = [named_attributes(own, keys) for own in contents.sources]
+            sources = [attributes_by_name(own, keys) for own in contents.sources]
             options = {**contents.reader_options, **asked}
             found.append({"sources": sources, "options": contents.reader_options, "notes": contents.notes})
             lines = third_party_file_summary_lines(contents)
@@ -170,15 +171,15 @@ def _merged(
     units = dict(options.get("units") or {})
     if units.get("effort") in MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}
-    columns, matched = options.get("columns") or {}, set[str]()
+    columns, matched = options.get("column_meanings") or {}, set[str]()
     parts = []
     for file in files:
         own = {name: value for name, value in options.items() if name in known[file] and name not in late}
         own |= {"units": units} if units and "units" in known[file] else {}
-        if columns and "columns" in known[file]:
+        if columns and "column_meanings" in known[file]:
             names = [source.name for source in preview_file(file).sources]
-            own["columns"] = {key: value for key, value in columns.items() if fnmatch.filter(names, key)}
-            matched |= set(own["columns"])
+            own["column_meanings"] = {key: value for key, value in columns.items() if fnmatch.filter(names, key)}
+            matched |= set(own["column_meanings"])
         parts.append(read_third_party_recording(file, own, progress))
     if missing := set(columns) - matched:
         what, allowed = f"no file has a column '{min(missing)}'", "columns that --preview lists"
@@ -232,7 +233,7 @@ def _flag(key: str) -> str:
 
 def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
     """`KEY=VALUE` entries as a mapping; for columns also values without a key, in order."""
-    if option == "columns" and not any("=" in entry for entry in entries):
+    if option == "column_meanings" and not any("=" in entry for entry in entries):
         return {str(i + 1): entry for i, entry in enumerate(entries)}
     pairs: dict[str, Any] = {}
     for entry in entries:
@@ -257,7 +258,7 @@ def _import_command_line(files: Sequence[str], options: Mapping[str, Any]) -> st
         text = str(value)
         if key in _LISTS:
             text = ",".join(value)
-        elif key == "columns" and options.get("header") is False:
+        elif key == "column_meanings" and options.get("has_header") is False:
             text = ",".join(value[name] for name in sorted(value, key=int))
         elif isinstance(value, Mapping):
             text = ",".join(f"{name}={entry}" for name, entry in value.items())

@@ -18,7 +18,7 @@ from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_record
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
-from yid_ocp.files import named_attributes
+from yid_ocp.files import attributes_by_name
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import ParameterCovariance, TargetMotionPlan, plan_motion_to_target
@@ -166,7 +166,7 @@ def _share(values: Array, limit: float) -> float | None:
 
 def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
     names = "place=target_position error=max_position_error swing=max_residual_speed off_path=max_path_deviation"
-    own = named_attributes(found, f"{names} std=end_position_std evaluations=n_evaluations")
+    own = attributes_by_name(found, f"{names} std=end_position_std evaluations=n_evaluations")
     asked = {"point": run.plan.point, "tolerance": run.plan.position_tolerance}
     return own | asked | {"time_step": found.simulator.step.time_step}
 
@@ -232,14 +232,14 @@ def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> 
     rest = "unseen=unobservable_parameters open=unidentifiable_directions"
     starts = "first=initial_criterion value=final_criterion judged=configured_criterion finished=is_converged"
     return {
-        **named_attributes(run.plan, "inform=identify separate=discriminate"),
-        "parameters": {name: named_attributes(own, stds) for name, own in found.parameter_precisions.items()},
+        **attributes_by_name(run.plan, "inform=identify separate=discriminate"),
+        "parameters": {name: attributes_by_name(own, stds) for name, own in found.parameter_precisions.items()},
         "distances": [
             {"effect": first, "explained_by": second, "before": before, "after": after}
             for (first, second), (before, after) in found.effect_distances.items()
         ],
-        "starts": [named_attributes(start, f"{starts} rounds=n_iterations") for start in found.start_results],
-        **named_attributes(found, f"best=best_start_index limits_reached=active_limits {rest}"),
+        "starts": [attributes_by_name(start, f"{starts} rounds=n_iterations") for start in found.start_results],
+        **attributes_by_name(found, f"best=best_start_index limits_reached=active_limits {rest}"),
     }
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.analysis.estimation import (
     ChosenCableMemoryFit,
-    channels_worse_than_naive_guess,
+    channels_worse_than_naive_prediction,
     choose_cable_memory_fit,
     prediction_errors_and_units,
     solve,
@@ -134,7 +134,7 @@ def solution_to_result_dict(
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = prediction_errors_and_units(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
-    worse = channels_worse_than_naive_guess(errors, units)
+    worse = channels_worse_than_naive_prediction(errors, units)
     return {
         "format": _RESULT_FORMAT,
         "status": solution.status.value,

@@ -21,11 +21,11 @@ from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.display import Progress
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.files import (
+    attributes_by_name,
     dataclass_from_plain_data,
     file_sha256,
     json_sha256,
     make_folder,
-    named_attributes,
     read_input_text,
     to_lossless_plain_data,
     write_text,
@@ -152,7 +152,7 @@ def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, An
     names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
     known = {"distance": "mean_distance", "covered": "visible_length_coverage", "contested": "contested_fraction"}
     found = {key: fit and getattr(fit, name) for key, name in known.items()}
-    return found | named_attributes(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
+    return found | attributes_by_name(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
 
 
 def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def _camera_result(calibration: CameraCalibration) -> dict[str, Any]:
     state, told = calibration.camera_state, calibration.prior_state
     change, std = state.difference_from(told), np.sqrt(np.diag(calibration.state_covariance))
     names = "pose depth_factor=depth_scale depth_offset clock_offset clock_about=clock_reference_stamp clock_drift"
-    return named_attributes(state, names) | {
+    return attributes_by_name(state, names) | {
         "message": calibration.message,
         "estimated": calibration.n_frames > 0,
         "frames": calibration.n_frames,
@@ -225,12 +225,12 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
-    for name in settings.gripper_start_offsets:
+    for name in settings.gripper_start_offsets_from_object:
         if name not in grasps:
-            where = ("track", "virtual_frames", "gripper_start_offsets", name)
+            where = ("track", "virtual_frames", "gripper_start_offsets_from_object", name)
             raise unknown_name_error(run, "grasp", name, grasps, *where)
     with add_setting_location_to_errors(run, "track", "virtual_frames"):
-        posture = grasping_joint_angles(system, offsets=settings.gripper_start_offsets)
+        posture = grasping_joint_angles(system, offsets=settings.gripper_start_offsets_from_object)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
         seed = settings.seed
@@ -360,7 +360,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     try:
         return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).estimate_sequence_calibration()))
     except DataError as error:
-        return {"refused": named_attributes(error, "what where allowed hint")}
+        return {"refused": attributes_by_name(error, "what where allowed hint")}
 
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:

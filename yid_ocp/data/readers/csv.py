@@ -49,12 +49,12 @@ _LISTED = 5  # numbers of bad lines in a note
 class CsvOptions(base.SelectionAndUnitOptions):
     """Options of `read_csv`: meaning of columns, columns to keep, delimiter, header and clock.
 
-    `columns` gives the meaning of columns that `read_csv` does not recognise by name: `t`, `channel:joint`,
+    `column_meanings` gives that of columns that `read_csv` does not recognise by name: `t`, `channel:joint`,
     `axis:point`, or `skip`. A `*` in a column name matches any text and is replaced by this text in the meaning:
     `*_pos` with `position:*`.
     """
 
-    columns: Mapping[str, str] | None = None
+    column_meanings: Mapping[str, str] | None = None
     has_header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # omit lines that are not rows of numbers, and count them in `notes`
     delimiter: str = ""  # one character between cells; found in the first line where empty
@@ -87,7 +87,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     digest = file_sha256(path)
     said = options.description, path.name, path.stem, digest
     if (capture := _mocap_table(path)) is not None:
-        if options.columns:
+        if options.column_meanings:
             what = "this is a motion capture export, whose header names its columns"
             allowed, hint = "motion capture exports without --columns", "choose markers with --points MARKER=POINT"
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
@@ -182,7 +182,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     n_lines, numbers, blank = 0, array("d"), bytearray()
     first_lines = [head] if head else []
     if all(_is_number(cell) for cell in names):
-        options["header"] = False
+        options["has_header"] = False
         first_lines.insert(0, (1, names))
         names = [str(i + 1) for i in range(len(names))]
     for _, cells in chain(first_lines, lines):
@@ -200,14 +200,14 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     if bad:
         options["skip_bad_lines"] = True
     meanings, said = column_meanings(names, _COMPONENTS)
-    if "header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
+    if "has_header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
         meanings[0] = ("t", "")
     meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # the first of two equal ones
     unknown = {name: base.SKIPPED_COLUMN_MEANING for name, meaning in zip(names, meanings, strict=True) if not meaning}
-    if "header" in options and meanings[0]:
+    if "has_header" in options and meanings[0]:
         unknown = {names[0]: "t", **unknown}
     if unknown:
-        options["columns"] = unknown
+        options["column_meanings"] = unknown
     known = [(m, i) for i, m in enumerate(meanings) if m and numeric[i]]
     t = table[:, next((i for m, i in known if m == ("t", "")), 0)]
     sources = []
@@ -281,7 +281,7 @@ def _read_table(
     if not options.has_header:
         names = [str(i + 1) for i in range(len(first))]
         lines = chain([(number, first)], lines)
-    meanings, units = _meanings(names, options.columns or {}, f"{path}, line {number}")
+    meanings, units = _meanings(names, options.column_meanings or {}, f"{path}, line {number}")
     for line, cells in lines:
         try:
             numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))

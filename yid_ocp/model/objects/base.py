@@ -151,7 +151,7 @@ class InitCommandObjectFactory:
     has_branches: bool = False
 
 
-def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
+def require_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
     """Return the numbers that an object requires, in the order of `meanings`. Raises `ConfigError` if one is absent."""
     for name, meaning in meanings.items():
         if name not in numbers:
@@ -176,7 +176,7 @@ def parse_comma_separated_numbers(text: str, count: int, flag: str) -> list[floa
     return values
 
 
-def initial_bending_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
+def initial_rigidity_and_damping(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
     """Initial bending rigidity (`rigidity_ratio` x weight x length^2) and damping of `segments`, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:

@@ -22,11 +22,11 @@ _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
 def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    length, mass, radius, tip = base.required_object_numbers(
+    length, mass, radius, tip = base.require_object_numbers(
         "a tapered rod", numbers, base.SIZE_AND_MASS_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitCommandObject(item, base.initial_bending_values(item.build_segments(), 1.0))
+    return InitCommandObject(item, base.initial_rigidity_and_damping(item.build_segments(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
