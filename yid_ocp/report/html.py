@@ -34,7 +34,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     folder or up to two levels above. Without the extra `report`, a warning is logged and no page written.
     """
     if not _installed():
-        log.warning("no report is written, because jinja2 is not installed: pip install 'yid-ocp[report]'")
+        log.warning("no report is written, because plotly is not installed: pip install 'yid-ocp[report]'")
         return False
     import jinja2
 
@@ -64,7 +64,7 @@ def write_shared_plotly_script(folder: Path) -> None:
 
 
 def _installed() -> bool:
-    return all(util.find_spec(name) is not None for name in ("jinja2", "plotly"))
+    return util.find_spec("plotly") is not None
 
 
 @functools.cache

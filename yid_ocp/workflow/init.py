@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.schema import config_json_schema
+from yid_ocp.config.schema import config_json_schema, option_info_from_annotation
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.display import Progress
@@ -21,7 +21,7 @@ from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitCommandObject, init_command_object_factories, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
+from yid_ocp.options import dataclass_options
 from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
 from yid_ocp.report.animation import recording_animation
 from yid_ocp.report.html import write_report
@@ -63,8 +63,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     options = import_recording.reader_options_from_arguments(arguments)
     about = f"{'An arm of position servos' if proposal.arm_mode == 'servo' else 'The arm'}, {where}, with a payload."
     about = about if item is None else f"A {arguments.object.replace('_', ' ')} moved by {where}."
-    lines = _config_lines(where, about, item, proposal, files, options)
-    _write(out, "\n".join(lines) + "\n", written)
+    _write(out, _config_text(where, about, item, proposal, files, options), written)
     result: dict[str, Any] = {
         "format": "yid-init/1",
         "configuration": str(out),
@@ -230,64 +229,48 @@ def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -
 
 _PLAIN_TEXT = re.compile(r"[A-Za-z_/][\w./@-]*")  # text that YAML reads unchanged
 _YAML_KEYWORDS = ("true", "false", "null", "yes", "no", "on", "off")
-_COMMENT_COLUMN = 44
+_COMMENT_MARK, _COMMENT_COLUMN = "  ## ", 44
 _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 
 
-def _config_lines(
+def _config_text(
     robot: str,
     about: str,
     item: InitCommandObject | None,
     proposal: ProposedConfigChoices,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
-) -> Iterator[str]:
-    """Commented YAML lines; every setting has a comment on its line or the line above."""
-    yield f"# yaml-language-server: $schema={_SCHEMA_FILE}"
-    yield f"# Written by `yid-ocp init` {package_version()}. All may be changed; keys: docs/reference/settings.md."
-    yield "# Each line ends with its evidence. Next: `yid-ocp check` on this file, then `yid-ocp solve`."
-    yield _line("", "description", _text(about), "one sentence for the report")
-    yield ""
-    yield "model:"
-    yield _line("  ", "robot", _text(robot), "URDF file, or package:NAME of example-robot-data")
-    yield from _arms(proposal)
-    if item is not None:
-        yield from _object(item, proposal)
-    yield from _friction(proposal)
-    yield from _effects(proposal)
-    yield ""
-    yield from _recording_lines(recordings, imports)
-    yield ""
-    yield from _sensors(proposal)
-    yield ""
-    yield from _parameters(item, proposal)
-    yield ""
-    yield "problem:"
-    step, cutoff = f"{proposal.time_step:g}", f"{proposal.path_cutoff:.3g}"
-    yield _line("  ", "time_step", step, "[s]; `check` reports the effect of half of it")
-    yield _line("  ", "initial_state", proposal.initial_state, proposal.initial_state_reason)
-    yield _line("  ", "path_cutoff", cutoff, "low-pass of prescribed motion [Hz], above what the arm does")
-    yield ""
-    yield "solver:"
-    yield _line("  ", "name", "gauss_newton", "multiple_shooting where it does not converge")
+) -> str:
+    """Commented YAML; every setting has a comment on its line or the line above."""
+    import jinja2  # slow to import
 
-
-def _line(indent: str, key: str, value: str, comment: str = "") -> str:
-    text = f"{indent}{key}: {value}".rstrip()
-    return f"{text:<{_COMMENT_COLUMN - 2}}  # {comment}" if comment else text
-
-
-def _text(value: str) -> str:
-    plain = _PLAIN_TEXT.fullmatch(value) and value.lower() not in _YAML_KEYWORDS
-    return value if plain else json.dumps(value, ensure_ascii=False)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("yid_ocp.workflow"), undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    environment.filters |= {"yaml": _value, "wrapped": _wrapped_list, "number": _number}
+    environment.filters["settings"] = lambda settings: "\n".join(_settings_lines("    ", settings))
+    known: dict[str, Any] = {"about": about, "robot": robot, "item": item, "files": recordings, "imports": imports}
+    known |= {"p": proposal, "sensors": _sensors(proposal), "motors": list(MOTOR_PRESETS)}
+    known |= {"schema": _SCHEMA_FILE, "version": package_version()}
+    text = environment.get_template("init.yaml.jinja").render(
+        known | ({} if item is None else _of_object(item, proposal))
+    )
+    parts = (line.partition(_COMMENT_MARK) for line in text.splitlines())
+    return "".join(
+        f"{own.rstrip():<{_COMMENT_COLUMN - 2}}  # {comment}\n" if comment else f"{own.rstrip()}\n"
+        for own, _, comment in parts
+    )
 
 
 def _value(value: Any) -> str:
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{_text(str(k))}: {_value(v)}' for k, v in value.items())}}}"
+        return f"{{{', '.join(f'{_value(str(k))}: {_value(v)}' for k, v in value.items())}}}"
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_value, value))}]"
-    return _text(value) if isinstance(value, str) else json.dumps(value)
+    if not isinstance(value, str):
+        return json.dumps(value)
+    plain = _PLAIN_TEXT.fullmatch(value) and value.lower() not in _YAML_KEYWORDS
+    return value if plain else json.dumps(value, ensure_ascii=False).replace(_COMMENT_MARK, "  \\u0023# ")
 
 
 def _number(value: float) -> str:
@@ -295,79 +278,33 @@ def _number(value: float) -> str:
     return text if "e" not in text or "." in text.partition("e")[0] else text.replace("e", ".0e")
 
 
-def _listed(indent: str, key: str, values: Iterable[str], comment: str) -> list[str]:
-    """A key with a list, on several lines if one line is too long."""
+def _wrapped_list(values: Iterable[str], column: int) -> str:
+    """A list, on several lines from a column on if one line is too long."""
     rows, row = [], ""
-    for value in map(_text, values):
+    for value in map(_value, values):
         if row and len(row) + len(value) > 90:
             rows.append(row)
             row = ""
         row += f"{value}, "
     rows.append(row)
-    text = f",\n{indent}  {' ' * len(key)} ".join(entry.rstrip(", ") for entry in rows)
-    return [f"{indent}# {comment}", f"{indent}{key}: [{text}]"]
+    return "[" + f",\n{' ' * column}".join(entry.rstrip(", ") for entry in rows) + "]"
 
 
-def _arms(proposal: ProposedConfigChoices) -> Iterator[str]:
-    unused, mode = proposal.unused_joints, proposal.arm_mode
-    yield "  arms:"
-    yield from _listed("    ", "joints", proposal.joints, "recorded joints that move the object")
-    if unused:
-        yield f"    # recorded too, but not needed for what holds the object: {', '.join(unused)}"
-    if unused or not set(proposal.unrecorded_joints) <= set(proposal.joints):
-        yield "    # all other joints of the URDF stay at zero; another value: locked_joints: {JOINT: VALUE} [rad or m]"
-    yield _line("    ", "mode", mode, proposal.arm_mode_reason)
-    other = "prescribed: the arm follows its encoders"
-    if mode == "prescribed":
-        other = "driven: its efforts move the arm, with a tracking filter; for reliable efforts"
-    yield f"{' ' * _COMMENT_COLUMN}# {other}"
-    if mode == "servo":
-        yield _line("    ", "servo", "", "their gains, dampings, delays and limits are parameters, below")
-        held = "until the next; interpolated: straight lines in between"
-        yield _line("      ", "command_interpolation", "held", held)
-        carried = "true if the controller compensates the arm's weight"
-        yield _line("      ", "has_gravity_compensation", "false", carried)
-        known = f"{{kind: dc, preset: {proposal.motor_preset or next(iter(MOTOR_PRESETS))}}}"
-        words = "published figures to begin with"
-        yield _line(
-            "      ",
-            "motor" if proposal.motor_preset else "# motor",
-            known,
-            f"{words}; one of {', '.join(MOTOR_PRESETS)}",
-        )
-
-
-def _object(item: InitCommandObject, proposal: ProposedConfigChoices) -> Iterator[str]:
-    holder, grasps = proposal.holder_frame, proposal.grasps
-    yield "  object:"
-    if item.stands_in_world:
-        yield "    # `mount: {parent_frame: FRAME, xyz: [x, y, z], rpy: [r, p, y]}` sets its place"
-    else:
-        frames = [name for arm in proposal.arms[:1] for name in arm.tool_frames if name != holder]
-        yield "    # its root sits in this frame and leaves it along z, unless xyz [m] and rpy [rad] say else"
-        yield f"    # other frames there: {', '.join(frames[:8]) or 'none'}"
-        yield f"    mount: {{parent_frame: {_text(holder)}, xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}}"
-    yield from _settings_lines("    ", item.settings)
-    if grasps:
-        yield _line("  ", "grasp", "", "further grasp: point 3, axis 5, weld 6 equations")
-    for i, (frame, point) in enumerate(grasps.items()):
-        yield f"    grasp_{i + 1}: {{holder_frame: {_text(frame)}, held_frame: {_text(point)}, kind: point}}"
-    dampings = [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")]
-    if dampings:
-        yield _line("  ", "damping", f"{{object: {max(dampings):.2g}}}", "initial value of the search [N m^2 s]")
-    else:
-        yield _line("  ", "damping", "0.05", "viscous, of every coordinate [N m s/rad]")
+def _of_object(item: InitCommandObject, proposal: ProposedConfigChoices) -> dict[str, Any]:
+    """Initial dampings of an object, frames of points whose places are uncertain, and further frames for sensors."""
     tips = [f"w_{segment.name}" for segment in item.settings.build_segments()]
     of_points = [places for group, places in proposal.point_placements.items() if "." not in group]
     marked = [place for places in of_points for place in places if place.frame]
-    wanted = dict.fromkeys([*tips, *(place.model_frame for place in marked), *grasps.values()])
-    if uncertain := {place.point: place for place in marked if place.position_std > 0}:
-        yield _line("  ", "frames", "", "where points sit [m]; NAME.x, .y and .z there are estimated, 0 ± position_std")
-    for name, place in uncertain.items():
-        there = {"parent_frame": place.frame, "position_std": float(f"{place.position_std:.2g}")}
-        yield f"    {_text(name)}: {_value(there)}"
-    if set(wanted) > set(tips):
-        yield from _listed("  ", "measured_points", wanted, "frames for sensors; NAME:40% along a segment")
+    wanted = dict.fromkeys([*tips, *(place.model_frame for place in marked), *proposal.grasps.values()])
+    return {
+        "dampings": [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")],
+        "uncertain": {
+            place.point: {"parent_frame": place.frame, "position_std": float(f"{place.position_std:.2g}")}
+            for place in marked
+            if place.position_std > 0
+        },
+        "points": wanted if set(wanted) > set(tips) else (),
+    }
 
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
@@ -379,65 +316,17 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
         if isinstance(value, Mapping):
             yield f"{indent}{key}:"
             for name, entry in value.items():
-                yield f"{indent}  {_text(name)}:"
+                yield f"{indent}  {_value(name)}:"
                 yield from _settings_lines(f"{indent}    ", entry)
             continue
-        about = next(m for m in reversed(split_annotated(option.type_hint)[1]) if isinstance(m, OptionInfo))
+        about = option_info_from_annotation(option.type_hint)
         comment = about.description + (f" [{about.unit}]" if about.unit else "")
         numbers = [float(f"{x:.8g}") for x in value] if isinstance(value, tuple) else value
-        yield _line(indent, key, f"{value:g}" if isinstance(value, float) else _value(numbers), comment)
+        yield f"{indent}{key}: {f'{value:g}' if isinstance(value, float) else _value(numbers)}{_COMMENT_MARK}{comment}"
 
 
-def _friction(proposal: ProposedConfigChoices) -> Iterator[str]:
-    about = "of geared arms, its sizes free; `yid-ocp friction` tries every law of the ladder"
-    moving = [name for name in proposal.joints if name not in proposal.still_joints]
-    has_efforts = "joints.effort" in proposal.noise_by_group
-    law = {"law": "load" if proposal.motor_preset else "coulomb"} | (
-        {"joints": moving} if proposal.still_joints else {}
-    )
-    uses_efforts = has_efforts and (proposal.arm_mode == "driven" or proposal.is_identified_from_efforts)
-    if proposal.motor_preset or (moving and uses_efforts):
-        yield _line("  ", "friction", _value(law), about)
-    elif proposal.arm_mode == "servo" or has_efforts:
-        yield _line("  ", "# friction", "{law: coulomb}", about)
-
-
-def _effects(proposal: ProposedConfigChoices) -> Iterator[str]:
-    kinds: dict[str, str] = {}
-    if proposal.arm_mode == "servo" or (proposal.is_identified_from_efforts and not proposal.has_object):
-        kinds["rotor_inertia"] = "inertia of the rotors after their gears"
-    if proposal.is_identified_from_efforts and "joints.effort" in proposal.noise_by_group:
-        kinds["effort_offset"] = "the zero of every torque sensor"
-    if not kinds:
-        return
-    yield _line("  ", "effects", "", f"{', '.join(kinds.values())}, free below")
-    for kind in kinds:
-        for joint in proposal.joints:
-            if kind == "effort_offset" or proposal.arm_mode == "servo" or joint not in proposal.still_joints:
-                yield f"    - {{kind: {kind}, location: {_text(joint)}}}"
-    if not proposal.has_object:
-        yield f"    - {{kind: payload, location: {_text(proposal.holder_frame)}}}   # what the arm holds"
-
-
-def _recording_lines(files: Sequence[str], imports: Mapping[str, Any]) -> Iterator[str]:
-    held = max(1, len(files) // 4) if len(files) > 1 else 0
-    yield "recordings:"
-    yield from _listed("  ", "estimate", files[: len(files) - held], "to estimate on")
-    if held:
-        yield from _listed("  ", "held_out", files[-held:], "only predicted, to test the model")
-    else:
-        yield "  # record a second motion and list it here: it tests whether the model is right"
-        yield "  held_out: []"
-    if imports:
-        yield ""
-        yield _line("", "import", "", "how files were read: `yid-ocp import FILE --config THIS`")
-    for key, value in imports.items():
-        yield f"  {key}: {_value(value)}"
-
-
-def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
-    if proposal.noise_by_group or proposal.clock_descriptions:
-        yield "sensors:"
+def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], str, Sequence[Any]]]:
+    """Every group with its settings, their reason and the places of its points."""
     for group, noise in proposal.noise_by_group.items():
         places, entries, said = proposal.point_placements.get(group, ()), [], f"noise: {noise.reason}"
         if noise.std is not None:
@@ -463,49 +352,4 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
         elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
             entries = ["use: false", *entries]
             said = "an estimate from joint torques, less the loads that the driver knows: in place of efforts only"
-        # a comment, if there is no setting
-        yield _line("  ", group, f"{{{', '.join(entries)}}}", said) if entries else f"  # {group}: {said}"
-        for place in places:
-            yield f"  #   {place.point} at {place.frame or '?'}: {place.reason}"
-    for group, clock in proposal.clock_descriptions.items():
-        yield f"  # {group} come at {clock}"
-
-
-def _parameters(item: InitCommandObject | None, proposal: ProposedConfigChoices) -> Iterator[str]:
-    free, preset = "{free: true}", proposal.motor_preset
-    if item is None:
-        yield _line("", "parameters", "", "`yid-ocp inspect` lists all that there are")
-        payload = f'"payload@{proposal.holder_frame}.*"'
-        yield _line("  ", payload, free, "mass [kg] and first moments [kg m]; {free: false} where it holds nothing")
-    else:
-        yield _line("", "parameters", "", item.parameters_comment)
-        for name, (value, comment) in item.start_values.items():
-            yield _line("  ", name, f"{{free: true, initial: {_number(value)}}}", comment)
-    if proposal.arm_mode == "servo":
-        start = f"published figure of the {preset}" if preset else ""
-        if proposal.firmware_gain is not None:
-            known = f"{{initial: {proposal.firmware_gain:g}}}"
-            said = "the firmware's, as LeRobot sets it; or attribute proportional_gain of the recordings"
-            yield _line("  ", '"*.servo_gain_factor"', known, said)
-        yield _line("  ", '"*.servo_gain"', free, start or "begins at a twentieth of a radian for the effort limit")
-        yield _line("  ", '"*.servo_damping"', free, start or "begins at a tenth of a second times the gain")
-        late = "{free: true, initial: 0.075}" if preset else free
-        yield _line("  ", '"*.servo_delay"', late, "from a command to its torque [s]")
-        yield _line("  ", '"rotor_inertia@*.armature"', free, "of the servos' motors, at the joint [kg m^2]")
-        if preset:
-            yield _line("  ", '"*.servo_torque_limit"', free, "at full duty [N m]")
-            for joint in proposal.still_joints:
-                yield _line("  ", f'"{joint}.*"', "{free: false}", "it hardly turns")
-                yield _line("  ", f"rotor_inertia@{joint}.armature", "{free: false}")
-        else:
-            yield '  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said'
-    if proposal.is_identified_from_efforts:
-        if not proposal.has_object and set(proposal.joints) > set(proposal.still_joints):
-            yield _line("  ", '"rotor_inertia@*.armature"', free, "of the motors, at the joint [kg m^2]")
-        for joint in proposal.joints:
-            said, why = "{free: true, initial: 0.1, bounds: [0.0, 50.0]}", "viscous friction of the arm [N m s/rad]"
-            if joint in proposal.still_joints:
-                said, why = "{initial: 0.1}", "it hardly turns"
-            yield _line("  ", f"{joint}.damping", said, why)
-        if "joints.effort" in proposal.noise_by_group:
-            yield _line("  ", '"effort_offset@*"', free, "zeros of the torque sensors [N m]")
+        yield group, entries, said, places
