@@ -230,16 +230,17 @@ MARKS = [
 ]
 
 
-@pytest.mark.parametrize(("marks", "plots"), [(MARKS, 3), (MARKS[8:], None), ([], 0)], ids=["all", "clean", "none"])
-def test_pictures_and_page_show_whatever_there_is(tmp_path, marks, plots):
+@pytest.mark.parametrize("marks", [MARKS, MARKS[8:], []], ids=["all", "clean", "none"])
+def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     result = to_json_types(detection_and_false_alarm_rates(marks)) | {"seed": 1, "purpose": "report", "versions": {}}
-    draw_blind_results(tmp_path, result)
-    for name in ("detection", "confusion", "calibration"):
-        with Image.open(tmp_path / f"{name}.png") as picture:
+    files = draw_blind_results(tmp_path, result)
+    assert [file.name for file in files] == ["detection.png", "confusion.png", "calibration.png"]
+    for file in files:
+        with Image.open(file) as picture:
             assert min(picture.size) > 100
-    assert write_report(tmp_path / "report.html", ReportData("blind", "", result))
+    assert write_report(tmp_path / "report.html", ReportData("blind", "", result, section_data={"pictures": files}))
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert plots in (None, page.count('<div class="plot"'))
+    assert page.count('src="data:image/png') == 3
     assert f"{len(marks)} cases of seed 1" in page
     assert ("of 5 clean recordings, 0 gave a false alarm" in page) == bool(marks)
     assert page.count("case_000") >= len(marks)

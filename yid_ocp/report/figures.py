@@ -233,26 +233,6 @@ def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: S
     return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
 
 
-def rate_intervals_figure(
-    curves: Mapping[str, Mapping[float, Mapping[str, float]]], x: str, y: str, is_calibration: bool
-) -> Figure:
-    """Plot rates between 0 and 1 with intervals. Each entry has `rate`, `low` and `high`.
-
-    A calibration plot shows the diagonal; all other plots have a logarithmic x axis.
-    """
-    figure = _styled_figure(340, x, y)
-    if is_calibration:
-        line = {"color": MEASURED_COLOR, "dash": "dot"}
-        figure.add_scatter(x=[0, 1], y=[0, 1], mode="lines", line=line, showlegend=False, hoverinfo="skip")
-    else:
-        figure.update_xaxes(type="log")
-    for i, (name, known) in enumerate(curves.items()):
-        rates, low, high = ([entry[key] for entry in known.values()] for key in ("rate", "low", "high"))
-        drawn = {"x": list(known), "y": rates, "error_y": asymmetric_error_bars(rates, low, high)}
-        figure.add_scatter(**drawn, mode="lines+markers", name=name, line={"color": _line_color(i)})
-    return figure.update_yaxes(range=[-0.03, 1.03])
-
-
 def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> Figure:
     """Plot the increase of chi2 over the parameter's value relative to the estimate (profile likelihood)."""
     figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items(), "dash")
@@ -341,31 +321,18 @@ def parameter_values_by_source_figure(
     return figure.update_yaxes(tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
 
 
-def _heat_figure(figure: Figure, rows: Sequence[str], columns: Sequence[str], parts: Array, tickangle: int) -> Figure:
-    """Heat map of numbers between 0 and 1 for each pair of row name and column name."""
-    figure.add_heatmap(
-        x=list(columns), y=list(rows), z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
-        colorscale=_SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
-    )  # fmt: skip
-    every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
-    figure.update_xaxes(tickangle=tickangle, tickvals=list(columns), **every)
-    return figure.update_yaxes(autorange="reversed", tickvals=list(rows), **every)
-
-
-def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> Figure:
-    """Plot a confusion matrix of counts, truth by row, first answer by column. Color: fraction of the row."""
-    parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
-    figure = _heat_figure(_styled_figure(200 + 24 * len(rows), "said first", "true"), rows, columns, parts, -50)
-    text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]
-    return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
-
-
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> Figure:
     """Plot a heat map of explained fractions (n, n) in per cent: how much of the row the column explains."""
     figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
-    text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
-    hover = "%{y} explained by %{x}: %{z:.2f}<extra></extra>"
-    return _heat_figure(figure, names, names, values, -40).update_traces(text=text, hovertemplate=hover)
+    figure.add_heatmap(
+        x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
+        colorscale=_SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
+        hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>",
+        text=[[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values],
+    )  # fmt: skip
+    every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
+    figure.update_xaxes(tickangle=-40, tickvals=list(names), **every)
+    return figure.update_yaxes(autorange="reversed", tickvals=list(names), **every)
 
 
 @dataclass(frozen=True)

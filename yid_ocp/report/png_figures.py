@@ -19,15 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
-    """Observed rates by nominal level in a blind validation: coverage of effect parameters, and p-values."""
-    labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
-    rates = {label: result["calibration"][key] for key, label in labels.items()}
-    return {label: {entry["level"]: entry for entry in own if entry["of"]} for label, own in rates.items()}
-
-
-def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
-    """Write `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
+def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> list[Path]:
+    """Write and return `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
 
     The figures show the detection rate over effect size with binomial 95 % intervals, the first answers against the
     truth, and observed against nominal rates of intervals and p-values. Raises `OutputError` if writing fails.
@@ -47,7 +40,8 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     axes = figure.subplots()
     _draw_rates(axes, sizes, "lower right")
     axes.set(xscale="log", xlabel="size over the detectable size", ylabel="part of the cases", ylim=(-0.03, 1.03))
-    _save(figure, folder / "detection.png")
+    files = [folder / f"{name}.png" for name in ("detection", "confusion", "calibration")]
+    _save(figure, files[0])
 
     rows, columns = result["confusion"]["true"], result["confusion"]["said"]
     figure = Figure(figsize=(3.0 + 0.34 * len(columns), 2.2 + 0.26 * len(rows)), layout="constrained")
@@ -62,14 +56,17 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     axes.set_xticks(range(len(columns)), columns, rotation=90)
     axes.set_yticks(range(len(rows)), rows)
     axes.set(xlabel="said first", ylabel="true")
-    _save(figure, folder / "confusion.png")
+    _save(figure, files[1])
 
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="grey", linewidth=1)
-    _draw_rates(axes, interval_and_p_value_calibration_rates(result), "upper left")
+    labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
+    levels = {label: [own for own in result["calibration"][key] if own["of"]] for key, label in labels.items()}
+    _draw_rates(axes, {label: {own["level"]: own for own in known} for label, known in levels.items()}, "upper left")
     axes.set(xlabel="promised", ylabel="kept")
-    _save(figure, folder / "calibration.png")
+    _save(figure, files[2])
+    return files
 
 
 def _draw_rates(

@@ -112,20 +112,20 @@ def score_slices(
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
         write_strict_json(folder / "thresholds.json", to_json_types(found | made))
-    written = _write_result(folder, result)
+    written, pictures = _write_result(folder, result)
     if all(entry.output.write_report for entry in runs):
         progress.begin_stage("writing the report")
         said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
-        write_report(folder / "report.html", ReportData(folder.name, said, written))
+        data = ReportData(folder.name, said, written, section_data={"pictures": pictures})
+        write_report(folder / "report.html", data)
     return CommandOutcome(folder, written, None)
 
 
-def _write_result(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
+def _write_result(folder: Path, result: Mapping[str, Any]) -> tuple[dict[str, Any], list[Path]]:
     written: dict[str, Any] = to_json_types(result)
     write_strict_json(folder / "result.json", written)
     write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
-    draw_blind_results(folder, written)
-    return written
+    return written, draw_blind_results(folder, written)
 
 
 def rescore_blind(
@@ -160,7 +160,7 @@ def rescore_blind(
     kept = {key: commitment[key] for key in ("seed", "purpose")}
     rescored = {"settings": list(overrides), "changed": changed, "of": str(made)}
     result = blind_scores.detection_and_false_alarm_rates(marks) | {**kept, "rescored": rescored}
-    return CommandOutcome(target, _write_result(target, result | {"code": package_source_hash()}), None)
+    return CommandOutcome(target, _write_result(target, result | {"code": package_source_hash()})[0], None)
 
 
 def _stored_values(folder: Path) -> dict[str, Any]:

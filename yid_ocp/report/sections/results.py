@@ -21,7 +21,6 @@ from yid_ocp.problem.predictions import ChannelPrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, animations_to_dict
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
-from yid_ocp.report.png_figures import interval_and_p_value_calibration_rates
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
 from yid_ocp.report.terminal import (
     SUMMARY_BY_RESULT_FORMAT,
@@ -138,29 +137,6 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
         history = [entry for entry in run.solution.history if math.isfinite(entry.cost) and not entry.note]
         costs[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
     yield "Cost over time", figures.method_costs_over_wall_time_figure(costs)
-
-
-@register_report_section("proof", 10, "What was seen and named")
-def _blind_validation(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    result = findings.result
-    if result.get("format") != "yid-blind/1":
-        return
-    if result["detection"]:
-        intervals = {float(size): own for size, own in result["detection_intervals"].items()}
-        labels = {"gap": "gap seen", "right": "named right"}
-        sizes = {label: {size: own[key] for size, own in intervals.items()} for key, label in labels.items()}
-        figure = figures.rate_intervals_figure(sizes, "size over the detectable size", "part of the cases", False)
-        yield "Detection by size, with binomial 95 % intervals", figure
-    said = result["confusion"]
-    counts = np.array(said["counts"], float).reshape(len(said["true"]), len(said["said"]))
-    if counts.size:
-        yield (
-            "Confusion matrix: true and reported effect",
-            figures.confusion_matrix_figure(said["true"], said["said"], counts),
-        )
-    kept = interval_and_p_value_calibration_rates(result)
-    if any(kept.values()):
-        yield "Calibration: nominal and observed rates", figures.rate_intervals_figure(kept, "promised", "kept", True)
 
 
 @register_report_section("identifiability", 10, "Identifiable parameters")
