@@ -101,11 +101,6 @@ model:
   effects:
     - {kind: kelvin_voigt, location: T1, values: {tau: 0.02}}
 """,
-    "model.moving_clamps.NAME": """\
-model:
-  moving_clamps:
-    hand: {origin_point_name: marker_a, z_axis_point_name: marker_b, roll_convention: transported}
-""",
     "model.extra_meshes": """\
 model:
   extra_meshes:

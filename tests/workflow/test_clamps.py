@@ -38,7 +38,6 @@ parameters:
 problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, duration: 0.4}
 output: {write_report: false, checked_discretisations: none}
 """
-JAW = "model.moving_clamps={jaw: {origin_point_name: a, z_axis_point_name: b}}"
 STRAIGHT = np.array([0.2, 0.2, 0.32])  # the tip's face is at 0.2, 0.2, 0.3
 
 
@@ -78,34 +77,13 @@ def test_every_recording_has_its_own_places_of_markers_in_the_frame_that_carries
         ((), blank(name="elsewhere"), ConfigError, "'mark' is not a point"),
         (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "its parent is not a frame of the object"),
         (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),
-        ((JAW.replace("z_axis_point_name: b", "z_axis_point_name: a"),), None, ConfigError, "one point for both ends"),
-        ((JAW, "model.object.mount.parent_frame=jaw"), None, ConfigError, "moves"),
+        (("model.frames.foot={}", "model.object.mount.parent_frame=foot"), None, ConfigError, "moves"),
     ],
 )
 def test_what_an_object_without_a_robot_cannot_have_is_refused_in_words(tmp_path, overrides, recording, kind, words):
     run = settings(tmp_path, recording, overrides)
     with pytest.raises(kind, match=words):
         build_problem(run)
-
-
-def test_a_moved_clamp_carries_the_object_and_stands_in_what_is_simulated(tmp_path):
-    t = np.arange(41) * 0.01
-    rise = np.zeros((41, 3))
-    rise[:, 2] = 0.01 * np.sin(2 * np.pi * t)
-    base, ahead, tip = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.2, 0.25]), np.array([0.1, 0.2, 0.2])
-    position = np.stack([base + rise, ahead + rise, tip + rise], axis=1)
-    recording = Recording(None, (PointGroup("points", ("a", "b", "w_beam"), t, position, 1e-4),))
-    mount = ("model.object.mount={}", "model.object.mount={parent_frame: jaw}")
-    run = settings(tmp_path, recording, (JAW, "model.frames={}", *mount, "problem.initial_state=equilibrium"))
-    problem = build_problem(run)
-    assert problem.system.prescribed == tuple(f"jaw_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
-    made = run_simulate(run, tmp_path / "made").output
-    assert made is not None
-    group = made.points[0]
-    assert set(group.names) == {"a", "b", "w_beam"}
-    assert group.position[:, group.names.index("a")] == pytest.approx(base + rise, abs=1e-12)
-    # hanging straight down and moved along itself, the beam stays straight
-    assert group.position[:, group.names.index("w_beam")] == pytest.approx(tip + rise, abs=2e-4)
 
 
 def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):

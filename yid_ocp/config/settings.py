@@ -65,25 +65,10 @@ class _FrameSettings(MountSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _MeasuredClampSettings:
-    """A massless clamp frame whose prescribed motion follows two recorded points."""
-
-    origin_point_name: Annotated[str, OptionInfo("point at the clamp's origin")]
-    z_axis_point_name: Annotated[str, OptionInfo("point on its z axis, which must not be along the world's x axis")]
-    roll_convention: Annotated[
-        Literal["level", "transported"],
-        OptionInfo(
-            "rotation about z, which two points leave free. level: x axis perpendicular to world y; "
-            "transported: level at the start, then no rotation about z"
-        ),
-    ] = "level"
-
-
-@dataclass(frozen=True, kw_only=True)
 class GraspSettings:
     """A grasp: a constraint between a frame of the object and a frame of the robot."""
 
-    holder_frame: Annotated[str, OptionInfo("frame of the robot, or a clamp")]
+    holder_frame: Annotated[str, OptionInfo("frame of the robot")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
     kind: Annotated[_GraspKind, OptionInfo("point, axis (and z axes) or weld (and orientation)")] = "point"
     rpy: Annotated[_Vector3, OptionInfo("orientation of held_frame in holder_frame", "rad")] = (0.0, 0.0, 0.0)
@@ -179,10 +164,6 @@ class _ModelSettings:
             "null for an object held by the world or by clamps"
         ),
     ] = None
-    moving_clamps: Annotated[
-        Mapping[str, _MeasuredClampSettings],
-        OptionInfo("clamps that move an object without a robot, by name; a cable has its own clamps at both ends"),
-    ] = field(default_factory=dict)
     arms: Annotated[_JointActuationSettings, OptionInfo("joints of the robot and their drive")] = (
         _JointActuationSettings()
     )

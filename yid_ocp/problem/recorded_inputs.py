@@ -284,9 +284,8 @@ def _clamp_course(
     about_x = np.unwrap(np.arctan2(-d[:, 1], d[:, 2]))
     result = {f"{clamp.clamp_name}_{axis}": origin[:, i] for i, axis in enumerate("xyz")}
     about_z = np.zeros(len(d))
-    if clamp.roll_convention == "transported":
-        # the angular velocity about z of Rx(a) Ry(b) Rz(c) is c' + a' sin b
-        about_z[1:] = -np.cumsum(np.diff(about_x) * np.sin((about_y[1:] + about_y[:-1]) / 2))
+    # the angular velocity about z of Rx(a) Ry(b) Rz(c) is c' + a' sin b
+    about_z[1:] = -np.cumsum(np.diff(about_x) * np.sin((about_y[1:] + about_y[:-1]) / 2))
     result |= {f"{clamp.clamp_name}_rx": about_x, f"{clamp.clamp_name}_ry": about_y, f"{clamp.clamp_name}_rz": about_z}
     return result
 

@@ -28,7 +28,6 @@ from yid_ocp.model.mjcf_robot import mjcf_joint_constants
 from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
-from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.workflow import run_inputs
@@ -59,7 +58,6 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         with add_setting_location_to_errors(run, "model", "arms", "joints"):
             robot = read_urdf(model.robot, **urdf_reader_options(run))
     joints = () if robot is None else robot.joint_names
-    clamps = _clamp_mechanism(run)
     damping, of_object = _dampings(run, joints)
     item = model.object
     with add_setting_location_to_errors(run, "model", "object"):
@@ -69,11 +67,16 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         if name not in joints:
             raise unknown_name_error(run, "joint", name, joints, "model", "arms", "passive_joints", i)
     moved = tuple(name for name in joints if name not in arms.passive_joints)
+    for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
+        if given and robot is None:
+            hint = "set model.robot to a URDF file, or remove model.arms"
+            what, allowed = "model.arms names joints, but the model has no robot", "joints of a robot"
+            raise run.config_error(what, "model", "arms", key, allowed=allowed, hint=hint)
     if robot is None and not objects:
         what, allowed = "the model has neither a robot nor an object", "a robot, an object or both"
         raise run.config_error(what, "model", allowed=allowed, hint="set model.robot or model.object")
     with add_setting_location_to_errors(run, "model", "frames"):
-        carrier, items = _with_extra_frames(run, robot if clamps is None else clamps, [item for item, *_ in objects])
+        carrier, items = _with_extra_frames(run, robot, [item for item, *_ in objects])
     with add_setting_location_to_errors(run, "model"):
         system = System.build(
             carrier,
@@ -83,7 +86,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
                 for name, said in model.grasp.items()
             ],
             driven=moved if mode in ("driven", "servo") else (),
-            prescribed=clamps.joint_names if clamps is not None else moved if mode == "prescribed" else (),
+            prescribed=moved if mode == "prescribed" else (),
             damping=damping,
             gravity=model.gravity,
             point_frames=model.measured_points,
@@ -166,7 +169,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 
 
 def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
-    for key in ("robot", "grasp", "springs", "moving_clamps", "frames"):
+    for key in ("robot", "grasp", "springs", "frames"):
         if getattr(run.model, key):
             what, allowed = f"model.{key} is not possible with object.kind: {kind}, which clamps hold", f"no {key}"
             raise run.config_error(what, "model", key, allowed=allowed, hint=f"remove model.{key}")
@@ -364,36 +367,10 @@ def system_with_second_arm_holding_object(run: RunSettings, system: System) -> S
         return None  # the robot has no other arm of that name
 
 
-def _clamp_mechanism(run: RunSettings) -> Mechanism | None:
-    model, arms = run.model, run.model.arms
-    if model.robot is not None:
-        if model.moving_clamps:
-            hint = "remove model.moving_clamps and set model.grasp, or set model.robot: null"
-            what, allowed = "the model has both a robot and moving clamps", "one of the two"
-            raise run.config_error(what, "model", "moving_clamps", allowed=allowed, hint=hint)
-        return None
-    for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
-        if given:
-            hint = "set model.robot to a URDF file, or remove model.arms"
-            what, allowed = "model.arms names joints, but the model has no robot", "joints of a robot"
-            raise run.config_error(what, "model", "arms", key, allowed=allowed, hint=hint)
-    found: Mechanism | None = None
-    for name, clamp in model.moving_clamps.items():
-        if clamp.origin_point_name == clamp.z_axis_point_name:
-            what, hint = f"clamp '{name}' has one point for both ends", "change one of the two points"
-            raise run.config_error(what, "model", "moving_clamps", name, allowed="two different points", hint=hint)
-        found = (
-            floating_joint_mechanism(name)
-            if found is None
-            else found.with_attached_mechanism(floating_joint_mechanism(name))
-        )
-    return found
-
-
 def _with_extra_frames(
     run: RunSettings, carrier: Mechanism | None, items: Iterable[FlexibleObject]
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
-    """Robot (or clamps) and objects with the additional frames of the settings.
+    """Robot and objects with the additional frames of the settings.
 
     A frame of uncertain position, or that recordings locate (`marker_positions_from_reference_pose`), has parameters
     NAME.x, .y, .z.

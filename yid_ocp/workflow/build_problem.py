@@ -79,10 +79,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         # gains in the settings take precedence over recorded ones
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
-    clamps = tuple(
-        ClampPoseDefinition(name, s.origin_point_name, s.z_axis_point_name, s.roll_convention)
-        for name, s in run.model.moving_clamps.items()
-    )
+    clamps: tuple[ClampPoseDefinition, ...] = ()
     if cable is not None and isinstance(run.model.object, ClampedObject):
         clamps = cable.clamp_pose_definitions_from_points
         for name in {group.name for group in groups}:

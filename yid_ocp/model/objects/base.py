@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -33,7 +33,7 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 class MountSettings:
     """Mount of an object: the parent frame and the pose of the object's root in it."""
 
-    parent_frame: Annotated[str | None, OptionInfo("frame or clamp of the root; default: the world")] = None
+    parent_frame: Annotated[str | None, OptionInfo("frame of the root; default: the world")] = None
     xyz: Annotated[_Vector3, OptionInfo("position in the parent frame", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in the parent frame", "rad")] = (0.0, 0.0, 0.0)
 
@@ -47,14 +47,13 @@ class MountSettings:
 class ClampPoseDefinition:
     """Definition of a clamp's pose by two measured points: the origin, and a second point on the z axis.
 
-    Two points do not determine the roll angle about z. With `level` it is zero (x axis perpendicular to world y). With
-    `transported` it starts as `level`, and the clamp never rotates about its own z axis.
+    Two points do not determine the roll angle about z. It is zero at the start (x axis perpendicular to world y), and
+    the clamp never rotates about its own z axis.
     """
 
     clamp_name: str
     origin_point_name: str
     z_axis_point_name: str
-    roll_convention: Literal["level", "transported"] = "level"
 
 
 @dataclass(frozen=True)
@@ -117,8 +116,8 @@ class CableTopology:
     def clamp_pose_definitions_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Pose definitions of the start clamp and the end clamp."""
         a, b, *_, y, z = self.parent_branch_vertex_names
-        start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
-        return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
+        start = ClampPoseDefinition(START_CLAMP, a, b)
+        return start, ClampPoseDefinition(END_CLAMP, y, z)
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
