@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,7 +16,6 @@ from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
-from yid_ocp.files import attributes_by_name
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
@@ -48,12 +46,6 @@ _STRAIGHTEST_FRACTION = 0.1  # fraction of the samples with the end farthest fro
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
 _LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
 """Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
-_KEYS = (
-    "joints left_out=unused_joints not_recorded=unrecorded_joints holder=holder_frame grasps mode=arm_mode time_step"
-)
-_MORE_KEYS = "mode_why=arm_mode_reason start=initial_state start_why=initial_state_reason cutoff=path_cutoff"
-_LAST_KEYS = "clocks=clock_descriptions still=still_joints motor=motor_preset firmware_gain torque_bias_std"
-"""Keys of `yid-init/1`, with the attribute where it has another name."""
 
 
 @dataclass(frozen=True)
@@ -110,17 +102,6 @@ class ProposedConfigChoices:
     firmware_gain: float | None  # usual proportional gain, if the motor is known and no recording states one
     has_object: bool  # false for an arm alone
     torque_bias_std: Mapping[str, float]  # default by joint [N m]; empty if the recording states it or has no effort
-
-    def to_dict(self) -> dict[str, Any]:
-        """Convert the proposal to plain data under the keys of `yid-init/1`."""
-        return attributes_by_name(self, f"{_KEYS} {_MORE_KEYS} {_LAST_KEYS}") | {
-            "arms": [attributes_by_name(arm, "joints frames=tool_frames") for arm in self.arms],
-            "places": {
-                group: [attributes_by_name(place, "point frame why=reason") for place in places]
-                for group, places in self.point_placements.items()
-            },
-            "noise": {key: attributes_by_name(own, "std unit why=reason") for key, own in self.noise_by_group.items()},
-        }
 
     @property
     def is_identified_from_efforts(self) -> bool:

@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -68,7 +68,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         "format": "yid-init/1",
         "configuration": str(out),
         "recordings": files,
-        "proposal": proposal.to_dict(),
+        "proposal": asdict(proposal),
     }
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
     doubts = [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]

@@ -33,9 +33,7 @@ from yid_ocp.files import (
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
-from yid_ocp.vision import camera_registration as registration
 from yid_ocp.vision import surface_meshes, track_result
-from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
@@ -137,7 +135,7 @@ def _track_result(
     spent = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     return {
         "format": "yid-track/1",
-        "camera": _camera_result(common.camera_calibration),
+        "camera": asdict(common.camera_calibration),
         "sizes": _sizes_result(common.dimensions),
         "things": [asdict(thing) for thing in things],
         "points": {} if found is None else _points(found),
@@ -170,27 +168,6 @@ def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:
             }
             for i, name in enumerate(sizes.names)
         },
-    }
-
-
-def _camera_result(calibration: CameraCalibration) -> dict[str, Any]:
-    state, told = calibration.camera_state, calibration.prior_state
-    change, std = state.difference_from(told), np.sqrt(np.diag(calibration.state_covariance))
-    names = "pose depth_factor=depth_scale depth_offset clock_offset clock_about=clock_reference_stamp clock_drift"
-    return attributes_by_name(state, names) | {
-        "message": calibration.message,
-        "estimated": calibration.n_frames > 0,
-        "frames": calibration.n_frames,
-        "told_pose": told.pose,
-        "turned": float(np.linalg.norm(change[registration.ROTATION_SLICE])),
-        "turn_std": std[registration.ROTATION_SLICE],
-        "shifted": float(np.linalg.norm(change[registration.TRANSLATION_SLICE])),
-        "shift_std": std[registration.TRANSLATION_SLICE],
-        "depth_factor_std": std[registration.DEPTH_SCALE_INDEX],
-        "depth_offset_std": std[registration.DEPTH_OFFSET_INDEX],
-        "clock_offset_std": std[registration.CLOCK_OFFSET_INDEX],
-        "clock_drift_std": std[registration.CLOCK_DRIFT_INDEX],
-        "presence": None if calibration.arm_visibility is None else asdict(calibration.arm_visibility),
     }
 
 
