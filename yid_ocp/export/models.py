@@ -16,7 +16,7 @@ from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.virtual.mjcf import (
-    MODEL_ASPECT_DESCRIPTIONS,
+    MODEL_ASPECTS,
     MUJOCO_APPROXIMATED_ASPECTS,
     ExpressionEvaluator,
     JointDynamicsTerms,
@@ -142,54 +142,16 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
     return FeatureExportSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
 
 
-# each format's elements for the aspects that it supports
-_MJCF = {
-    "stiffness": "stiffness of joints",
-    "rest": "springref of joints",
-    "damping": "damping of joints",
-    "geometry": "places of bodies and sites",
-    "inertia": "inertials",
-    "weight": "gravcomp of bodies",
-    "gravity": "gravity of the option",
-    "grasp": "equality constraints between sites",
-    "grasp_compliance": "a tendon without length, which damps along its pull alone",
-    "sprung_joint": "joints with stiffness and damping",
-    "armature": "armature of joints",
-    "dry_friction": "frictionloss of joints, which sticks at rest where the model creeps",
-    "cubic_stiffness": "polynomial stiffness of joints",
-    "servo": "position actuators: gainprm, biasprm, forcerange and delay",
-    "torque_gain": "gainprm of actuators",
-    "torque_offset": "biasprm of actuators",
-    "torque_delay": "delay of actuators",
-    "torque_lag": "filterexact actuators",
-}
-_URDF = {
-    "damping": "damping of joints",
-    "geometry": "origins of joints",
-    "inertia": "inertials",
-    "dry_friction": "friction of joints, which engines take in ways of their own",
-}
-_SDF = {
-    **_URDF,
-    "stiffness": "spring_stiffness of axes",
-    "rest": "spring_reference of axes",
-    "geometry": "poses of links and frames",
-    "sprung_joint": "spring_stiffness and damping of axes",
-    "gravity": "gravity of the world",
-}
-_SUPPORT_BY_FORMAT: Mapping[str, Mapping[str, FeatureExportSupport]] = {
-    name: {
-        aspect: FeatureExportSupport("not representable", f"{name.upper()} has nothing for {words}")
-        if aspect not in table
-        else FeatureExportSupport("emulated" if aspect in MUJOCO_APPROXIMATED_ASPECTS else "native", table[aspect])
-        for aspect, words in MODEL_ASPECT_DESCRIPTIONS.items()
-    }
-    for name, table in (("mjcf", _MJCF), ("urdf", _URDF), ("sdf", _SDF))
-}
+def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
+    known = MODEL_ASPECTS[aspect]
+    if aspect == "reading":
+        return _READING
+    if form not in known:
+        return FeatureExportSupport("not representable", f"{form.upper()} has nothing for {known['is']}")
+    return FeatureExportSupport("emulated" if aspect in MUJOCO_APPROXIMATED_ASPECTS else "native", known[form])
 
-_READING = FeatureExportSupport(
-    "not representable", f"{MODEL_ASPECT_DESCRIPTIONS['reading']}: correct the readings instead"
-)
+
+_READING = FeatureExportSupport("not representable", f"{MODEL_ASPECTS['reading']['is']}: correct the readings instead")
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
 _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
@@ -205,7 +167,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
             found[label] = _NEUTRAL
         else:
             _, aspects = effect_joint_terms_and_changed_aspects(system, effect, value)
-            parts = [_READING if x == "reading" else _SUPPORT_BY_FORMAT[form][x] for x in sorted(aspects)]
+            parts = [_aspect_support(x, form) for x in sorted(aspects)]
             found[label] = _worst(parts)
     return found
 
@@ -217,6 +179,6 @@ def format_support_by_parameter(
     found = {}
     for entry in system.parameters:
         owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_depending_on_symbols(system, entry.symbol))
-        parts = [_SUPPORT_BY_FORMAT[form][aspect] for aspect in aspects] or [_UNUSED]
+        parts = [_aspect_support(aspect, form) for aspect in aspects] or [_UNUSED]
         found[entry.name] = effects[owner] if owner in effects else _worst(parts)
     return found

@@ -10,12 +10,14 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import casadi as ca
 import numpy as np
+from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
@@ -25,32 +27,8 @@ from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement,
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, MidpointState, System
 
-MODEL_ASPECT_DESCRIPTIONS: Mapping[str, str] = {
-    "stiffness": "stiffness of joints",
-    "rest": "angles at which springs are relaxed",
-    "damping": "viscous damping of joints",
-    "geometry": "places of joints and points",
-    "inertia": "masses and inertias",
-    "weight": "weight that is not mass times gravity",
-    "gravity": "the gravity vector",
-    "grasp": "where and how a grasp holds",
-    "grasp_compliance": "springs in place of a rigid grasp",
-    "sprung_joint": "joints with springs where the nominal model is rigid",
-    "armature": "rotor inertia at a joint",
-    "dry_friction": "dry friction at a joint",
-    "cubic_stiffness": "springs that stiffen with the cube of the angle",
-    "torque_gain": "true over recorded torque",
-    "torque_offset": "constant part of a recorded torque that does not act",
-    "torque_delay": "torque that acts later than recorded",
-    "torque_lag": "torque that follows its record",
-    "servo": "gain, damping, delay and limit of position servos",
-    "servo_firmware": "dead band and current limit of position servos",
-    "clock": "a clock that runs fast or slow",
-    "reading": "what a sensor reads; the motion does not depend on it",
-    "memory": "forces with a memory",
-    "force": "forces that no joint, spring or damper makes",
-}
-"""Aspects of a model that an engine may or may not represent, with their descriptions."""
+MODEL_ASPECTS: Mapping[str, Mapping[str, str]] = YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml"))
+"""Aspects of a model that an engine may or may not represent: a description (`is`) and the elements of each format."""
 
 _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of friction torque tau_c [N m]
 
@@ -61,7 +39,7 @@ MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
 # aspects for which MuJoCo has an equivalent term
 _NATIVE_ASPECTS = (
-    frozenset(MODEL_ASPECT_DESCRIPTIONS)
+    frozenset(MODEL_ASPECTS)
     - MUJOCO_APPROXIMATED_ASPECTS
     - _IGNORED_ASPECTS
     - {"servo_firmware", "clock", "memory", "force"}
@@ -109,7 +87,7 @@ class ExpressionEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Keys of `MODEL_ASPECT_DESCRIPTIONS` whose part of the system's description depends on `symbols`."""
+    """Keys of `MODEL_ASPECTS` whose part of the system's description depends on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -140,7 +118,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ExpressionEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
-    """Terms by joint that an effect adds, and the `MODEL_ASPECT_DESCRIPTIONS` keys that it changes."""
+    """Terms by joint that an effect adds, and the `MODEL_ASPECTS` keys that it changes."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
@@ -471,9 +449,9 @@ def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: b
     for effect in system.effects:
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
         if aspects:
-            changed = MODEL_ASPECT_DESCRIPTIONS[min(aspects)]
+            changed = MODEL_ASPECTS[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            allowed = ", ".join(words for name, words in MODEL_ASPECT_DESCRIPTIONS.items() if name in able)
+            allowed = ", ".join(own["is"] for name, own in MODEL_ASPECTS.items() if name in able)
             where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:
