@@ -49,9 +49,9 @@ def column(values, j, change):
     return values
 
 
-def causes(recording, driving=True, **sensors) -> set[str]:
+def causes(recording, **sensors) -> set[str]:
     chosen = {name.replace("_", "."): options for name, options in sensors.items()}
-    found = recording_quality_issues(recording, lambda group: chosen.get(group, SensorOptions()), driving)
+    found = recording_quality_issues(recording, lambda group: chosen.get(group, SensorOptions()))
     assert all(doubt.recording == recording.name and doubt.advice and doubt.evidence_ratio >= 1 for doubt in found)
     return {doubt.cause for doubt in found}
 
@@ -187,12 +187,11 @@ def test_a_camera_that_runs_longer_than_the_joints_at_both_ends_is_not_late():
     assert causes(replace(RECORDING, points=(longer,))) == set()
 
 
-def test_half_of_the_samples_missing_is_a_warning_where_joints_drive_the_model():
+def test_half_of_the_samples_missing_is_a_warning():
     rows = np.random.default_rng(1).random(len(RECORDING.joints.t)) > 0.5
     thin = {name: values[rows] for name, values in RECORDING.joints.values_by_channel.items()}
     recording = changed(RECORDING, t=RECORDING.joints.t[rows], **thin)
     assert causes(recording) == {"dropped_samples"}
-    assert causes(recording, driving=False) == set()
 
 
 def test_nothing_moves():

@@ -26,7 +26,7 @@ from yid_ocp.report.animation import (
     animations_to_dict,
     recording_animation,
 )
-from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
+from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 from yid_ocp.vision.surface_meshes import load_robot_meshes_by_joint
 
@@ -284,19 +284,20 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path):
     assert str(tmp_path / "nowhere") in str(caught.value.where)
 
 
-def test_changes_of_very_different_sizes_get_a_logarithmic_axis():
+def test_values_of_very_different_sizes_get_a_logarithmic_axis():
     def drawn(**rows):
-        return figures.values_before_after_figure(rows, "x [m]", ("1", "2", "3"))
+        return figures.parameter_values_by_source_figure(rows, "x [m]", {"2": "#000000"})
 
-    close = drawn(a=ValueBeforeAfter(2.0, 1.0), b=ValueBeforeAfter(3.0, None, reference=1.0))
-    far = drawn(a=ValueBeforeAfter(20.0, 0.1), b=ValueBeforeAfter(3.0, 1.0))
+    close = drawn(a={"1": (2.0, None), "2": (1.0, None)}, b={"1": (3.0, None), "3": (1.0, None)})
+    far = drawn(a={"1": (20.0, None), "2": (0.1, None)})
     assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
-    assert [trace.name for trace in close.data[1:]] == ["1", "2", "3"]
+    assert [trace.name for trace in close.data] == ["2", "1", "3"]
+    assert close.data[0].marker.color == "#000000" != close.data[1].marker.color
     # bars of what cannot be told do not widen the axis
-    figure = drawn(a=ValueBeforeAfter(2.0, 1.0, float("inf"), 1e7))
+    figure = drawn(a={"1": (2.0, float("inf")), "2": (1.0, 1e7)})
     assert figure.layout.xaxis.range[1] < 3.0
     assert figure.data[1].error_x.array is None
-    assert figure.data[2].error_x.array == (2e7,)
+    assert figure.data[0].error_x.array == (2e7,)
 
 
 def test_a_map_keeps_its_groups_together_and_its_gaps_empty():

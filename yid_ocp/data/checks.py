@@ -110,17 +110,16 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
-def recording_quality_issues(recording: Recording, options: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
+def recording_quality_issues(recording: Recording, options: SensorOptionsLookup) -> list[Issue]:
     """Find data quality issues of one recording by all checks that need no model.
 
-    `options` returns the sensor options of a group, such as its stated noise. `driving` states whether joints drive the
-    model, so that gaps between their samples matter.
+    `options` returns the sensor options of a group, such as its stated noise.
     """
     recording = recording.with_effort_sampling_kind(options("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(
         _common_clock(recording),
-        _dropped(recording, driving),
+        _dropped(recording),
         _velocities(recording),
         channel_checks.stuck_channel_issues(recording),
         channel_checks.excess_noise_issues(recording, options),
@@ -179,10 +178,10 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
 
 
-def _dropped(recording: Recording, driving: bool) -> Iterator[Issue]:
+def _dropped(recording: Recording) -> Iterator[Issue]:
     """Samples missing from an otherwise even clock of the model's inputs."""
     joints = recording.joints
-    if joints is None or not driving or len(joints.t) < 20:
+    if joints is None or len(joints.t) < 20:
         return
     steps = np.diff(joints.t)
     base = float(np.percentile(steps, 2))

@@ -275,48 +275,30 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
     return {"x": np.asarray(t[keep], float if is_late else np.float32), "y": np.asarray(values[keep], np.float32)}
 
 
-def _rows_figure(height: int, names: Sequence[str], title: str) -> Figure:
-    order = {"categoryorder": "array", "categoryarray": list(names)}
-    return _styled_figure(height, title, "").update_yaxes(autorange="reversed", automargin=True, **order)
-
-
-def estimates_figure(values: Mapping[str, tuple[float, float | None, float, bool]], unit: str) -> Figure:
-    """Plot estimates ± 2 std and initial values, one row per parameter: (value, std, initial, whether trusted)."""
-    names = list(values)
-    figure = _rows_figure(110 + 34 * len(names), names, unit)
-    marker = {"color": _GRID_COLOR, "size": 10, "symbol": "diamond", "line": {"color": _TEXT_COLOR, "width": 1}}
-    figure.add_scatter(x=[values[name][2] for name in names], y=names, mode="markers", name="start", marker=marker)
-    labels = {True: "estimate", False: "estimate that cannot be trusted"}
-    for (found, label), color in zip(labels.items(), LINE_COLORS, strict=False):
-        chosen = [name for name in names if values[name][3] == found]
-        bars = {"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color}
-        points = {"x": [values[name][0] for name in chosen], "y": chosen, "error_x": bars, "name": label}
-        figure.add_scatter(**points, mode="markers", showlegend=bool(chosen), marker={"color": color, "size": 10})
-    largest = max([abs(number) for value, _, initial, _ in values.values() for number in (value, initial)] or [1.0])
-    lowest = min(0.0, *(value for value, *_ in values.values()))
-    figure.update_xaxes(range=[lowest - 0.05 * largest, 1.6 * largest])
-    return figure.update_yaxes(tickfont={"size": 11})
-
-
 def parameter_values_by_source_figure(
-    rows: Mapping[str, Mapping[str, tuple[float, float | None]]], unit: str
+    rows: Mapping[str, Mapping[str, tuple[float, float | None]]], axis: str, colors: Mapping[str, str] | None = None
 ) -> Figure:
-    """Plot values ± 2 std from several sources, with one row per parameter and one color per source."""
-    sources = list(dict.fromkeys(source for row in rows.values() for source in row))
+    """Plot values ± 2 std from several sources, with one row per name and one color per source (default: palette)."""
+    sources = list(dict.fromkeys([*(colors or ()), *(source for row in rows.values() for source in row)]))
     names = list(rows)
-    figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), unit, "")
+    figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), axis, "")
     spread = 0.6 / max(len(sources), 1)
     for i, source in enumerate(sources):
         own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
-        color, symbol = _line_color(i), _SYMBOLS[i // len(LINE_COLORS) % len(_SYMBOLS)]
-        bars = {"type": "data", "array": [2 * (std or 0.0) for *_, std in own], "color": color, "thickness": 1.2}
+        color, symbol = (colors or {}).get(source, _line_color(i)), _SYMBOLS[i // len(LINE_COLORS) % len(_SYMBOLS)]
+        lengths = [2 * std if std is not None and np.isfinite(std) else 0.0 for *_, std in own]
+        bars = {"type": "data", "array": lengths, "color": color, "thickness": 1.2} if any(lengths) else None
         places = [k + spread * (i - (len(sources) - 1) / 2) for k, *_ in own]
         points = {"x": [value for _, value, _ in own], "y": places, "error_x": bars, "name": source}
-        figure.add_scatter(**points, mode="markers", marker={"color": color, "size": 8, "symbol": symbol})
-    numbers = [0.0, *(value for row in rows.values() for value, _ in row.values())]
-    low, high = min(numbers), max(numbers)
-    # bars of undetermined parameters would compress all others
-    figure.update_xaxes(range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
+        if own:
+            figure.add_scatter(**points, mode="markers", marker={"color": color, "size": 8, "symbol": symbol})
+    numbers = [value for row in rows.values() for value, _ in row.values()]
+    low, high = min([0.0, *numbers]), max([0.0, *numbers])
+    if numbers and min(numbers) > 0 and high > 30 * min(numbers):
+        figure.update_xaxes(**_POWERS, dtick="D2" if high < 1e3 * min(numbers) else 1)
+    else:
+        # bars of undetermined parameters would compress all others
+        figure.update_xaxes(range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
     ends = [len(names) - 0.5, -0.5]
     return figure.update_yaxes(tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
 
@@ -333,53 +315,6 @@ def confusability_matrix_figure(names: Sequence[str], values: Array) -> Figure:
     every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
     figure.update_xaxes(tickangle=-40, tickvals=list(names), **every)
     return figure.update_yaxes(autorange="reversed", tickvals=list(names), **every)
-
-
-@dataclass(frozen=True)
-class ValueBeforeAfter:
-    """A value before and after a change, with standard deviations and an optional reference value."""
-
-    before: float
-    after: float | None = None
-    before_std: float = 0.0
-    after_std: float = 0.0
-    reference: float | None = None
-
-
-def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]) -> Figure:
-    """Plot values before and after a change, one row each. Error bars are two standard deviations.
-
-    `axis` is the title of the x axis, with unit. `words` are the legends of before, after and the reference marks.
-    """
-    figure = _rows_figure(110 + 32 * len(rows), list(rows), axis)
-    moved = [(name, row.before, row.after) for name, row in rows.items() if row.after is not None]
-    figure.add_scatter(
-        x=[x for _, before, after in moved for x in (before, after, None)],
-        y=[y for name, *_ in moved for y in (name, name, None)],
-        mode="lines", line={"color": _GRID_COLOR, "width": 6}, hoverinfo="skip", showlegend=False,
-    )  # fmt: skip
-    hollow = {"color": _BACKGROUND_COLOR, "size": 11, "line": {"color": BEFORE_COLOR, "width": 2.5}}
-    full = {"color": AFTER_COLOR, "size": 11}
-    tick = {"symbol": "line-ns", "size": 16, "line": {"color": _TEXT_COLOR, "width": 2.5}}
-    numbers: list[float] = []
-    for entries, word, marker, color in (
-        ([(n, r.before, r.before_std) for n, r in rows.items()], words[0], hollow, BEFORE_COLOR),
-        ([(n, r.after, r.after_std) for n, r in rows.items()], words[1], full, AFTER_COLOR),
-        ([(n, r.reference, 0.0) for n, r in rows.items()], words[2], tick, _TEXT_COLOR),
-    ):
-        known = [(name, value, std) for name, value, std in entries if value is not None]
-        spread = [2 * std if np.isfinite(std) else 0.0 for *_, std in known]
-        bars = {"type": "data", "array": spread, "color": color, "thickness": 1.2} if any(spread) else None
-        x, y = [value for _, value, _ in known], [name for name, *_ in known]
-        numbers += x
-        if known:
-            figure.add_scatter(x=x, y=y, mode="markers", name=word, marker=marker, error_x=bars)
-    if min(numbers) > 0 and max(numbers) > 30 * min(numbers):
-        figure.update_xaxes(type="log", exponentformat="power", dtick="D2" if max(numbers) < 1e3 * min(numbers) else 1)
-    else:
-        # bars of undetermined parameters would compress all others
-        figure.update_xaxes(range=[min(0.0, 1.1 * min(numbers)), 1.15 * max([*numbers, 1e-12])])
-    return figure
 
 
 @dataclass(frozen=True)

@@ -177,7 +177,7 @@ def record_simulation(
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
     theta = zip(system.parameters.names, map(float, system.parameters.vector(values)), strict=True)
     truth = {name: value for name, value in theta if name.rpartition(".")[2] in _TRUE_QUANTITIES}
-    made = _how_it_was_made(chosen, system, seen=len(run.frame_times) > 0)
+    made = _how_it_was_made(chosen, system)
     joints = _joints(system, run, chosen, streams)
     about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name
     return validated_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
@@ -247,33 +247,15 @@ def _camera_points(
     return PointGroup("points_camera", visible, run.frame_times, position, std, "camera", pose=pose)
 
 
-def _how_it_was_made(experiment: VirtualExperimentSettings, system: System, seen: bool) -> str:
-    simulation, noise, camera = experiment.simulation, experiment.arm_noise, experiment.camera
-    sampled = 1e3 / simulation.sample_rate
+def _how_it_was_made(experiment: VirtualExperimentSettings, system: System) -> str:
+    simulation = experiment.simulation
     held = 1e3 / (simulation.sample_rate * simulation.controller_periods_per_sample)
-    input_ = f"commands of position servos held over each {held:g} ms, recorded every {sampled:g} ms"
-    efforts = offset = ""
-    if not system.servos:
-        input_ = f"torque held over each {held:g} ms and recorded as {simulation.effort_kind} every {sampled:g} ms"
-        white, constant = (
-            ", ".join(f"{value:g}" for value in np.atleast_1d(std)) for std in (noise.effort_std, noise.effort_bias_std)
-        )
-        efforts, offset = f"effort {white} N m, ", f"; constant offset of the effort {constant} N m"
-    made = (
+    control = "commands of position servos" if system.servos else "torque"
+    return (
         f"Virtual experiment in MuJoCo {import_mujoco().__version__} (implicitfast, "
-        f"{1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {len(system.driven)} joints "
-        f"from static equilibrium, {input_}, seed {experiment.seed}. White noise: "
-        f"joint position {noise.position_std:g} rad, velocity {noise.velocity_std:g} rad/s, "
-        f"{efforts}arm points {1e3 * noise.point_std:g} mm{offset}"
+        f"{1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {len(system.driven)} joints from static "
+        f"equilibrium, {control} held over each {held:g} ms, seed {experiment.seed}."
     )
-    if noise.position_resolution:
-        made += f"; encoders count in steps of {noise.position_resolution:.3g} rad"
-    if simulation.period_jitter_std or noise.lost_sample_fraction:
-        made += f"; periods vary by {1e3 * simulation.period_jitter_std:g} ms, {noise.lost_sample_fraction:.1%} of the"
-        made += " samples of joints are lost"
-    if camera is None or not seen:
-        return made + "; no camera."
-    return made + f", camera {1e3 * camera.point_std:g} mm at about {camera.frame_rate:g} Hz."
 
 
 def _noisy(clean: Array, std: float | Array, rng: np.random.Generator) -> Array:

@@ -69,9 +69,10 @@ def run_plan(
         scene = animation_of_trajectories(
             "planned", [ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)]
         )
-        more = {"plan" if isinstance(found, TargetMotionPlan) else "information": found}
         result = _motion_result(run, found, source) | told
-        written = folder.write_result_and_report(run, progress, result, animations=[scene], section_data=more)
+        written = folder.write_result_and_report(
+            run, progress, result, animations=[scene], section_data={"plan": found}
+        )
     return CommandOutcome(folder.path, written, found, found.is_successful)
 
 

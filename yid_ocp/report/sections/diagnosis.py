@@ -17,7 +17,7 @@ from yid_ocp.inference.null_test import residual_channels
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
-from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
+from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
 from yid_ocp.report.terminal import format_error_value_and_unit, scale_and_unit_with_metres_as_mm
 
@@ -60,11 +60,14 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     rows = []
     for channel, (error, unit) in before.items():
         factor, shown = scale_and_unit_with_metres_as_mm(unit)
-        later = factor * after[channel][0] if changed and channel in after else None
-        reference = factor * floor[channel] if channel in floor else None
-        rows.append((channel, shown, ValueBeforeAfter(factor * error, later, reference=reference)))
+        values = {_NOMINAL_LABEL: (factor * error, None)}
+        if changed and channel in after:
+            values[_EXTENDED_LABEL] = (factor * after[channel][0], None)
+        if channel in floor:
+            values["noise alone"] = (factor * floor[channel], None)
+        rows.append((channel, shown, values))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
-    sentences = ["Errors on held-out recordings by channel; the tick is the error from noise alone."]
+    sentences = ["Errors on held-out recordings by channel, with the error from noise alone."]
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
@@ -81,15 +84,19 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             f"No effect is named, so no error is shown after it; chi² per degree of freedom is {first:.3g} (one is "
             "noise alone)."
         )
-    words = (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone")
-    return "How large the gap is", sentences, _before_after_figures(rows, "held-out error (rms)", words)
+    return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
-def _before_after_figures(
-    rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
+def _figures_by_model(
+    rows: Sequence[tuple[str, str, Mapping[str, tuple[float, float | None]]]], axis: str, nominal_label: str
 ) -> _TitledFigures:
+    colors = {
+        nominal_label: figures.BEFORE_COLOR,
+        _EXTENDED_LABEL: figures.AFTER_COLOR,
+        "noise alone": figures.MEASURED_COLOR,
+    }
     return draw_figure_per_unit(
-        rows, lambda own, unit: figures.values_before_after_figure(own, f"{axis} [{unit}]", words)
+        rows, lambda own, unit: figures.parameter_values_by_source_figure(own, f"{axis} [{unit}]", colors)
     )
 
 
@@ -361,11 +368,12 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     rows, moved = [], []
     for entry in finding.nominal_changes:
         std, before, after = finding.nominal_model.std.get(entry.name, 0.0), entry.value_before, entry.value_after
-        rows.append((entry.name, entry.unit, ValueBeforeAfter(before, after, std, entry.std_after)))
+        values = {"fitted without the effects": (before, std), _EXTENDED_LABEL: (after, entry.std_after)}
+        rows.append((entry.name, entry.unit, values))
         if abs(after - before) > 0.1 * max(abs(before), 1e-9):
             text = f"{entry.name} goes from {before:.3g} to {after:.3g} {entry.unit}"
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
-    shown = _before_after_figures(rows, "value", ("fitted without the effects", _EXTENDED_LABEL, ""))
+    shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
         "Free parameters absorb a missing effect: this is their change when it is added. Bars: two standard "

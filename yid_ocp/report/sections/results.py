@@ -6,6 +6,7 @@ import base64
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,11 @@ _MAX_ANIMATIONS = 4  # a page with more is slow to open
 _MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
 _MAX_LISTED_RECORDINGS = 3  # recordings that are drawn
 _MAX_POINTS = 6  # points of a group; more are in the recording
+_ESTIMATE_COLORS = {
+    "start": figures.MEASURED_COLOR,
+    "estimate": figures.LINE_COLORS[0],
+    "estimate that cannot be trusted": figures.LINE_COLORS[1],
+}
 _ESTIMATED, _HELD_OUT = "estimated on", "held out"
 _JOINT_CHANNEL_UNITS = {
     "position": ("rad", "m"),
@@ -75,8 +81,10 @@ def _estimates(findings: ReportData) -> list[tuple[str, Any]]:
     for name, entry in result.get("parameters", {}).items():
         if entry.get("free") and "initial" in entry:
             found = entry["verdict"] not in lost and result["status"] != "failed"
-            rows.append((name, entry["unit"], (entry["value"], entry["std"], entry["initial"], found)))
-    return draw_figure_per_unit(rows, figures.estimates_figure)
+            label = "estimate" if found else "estimate that cannot be trusted"
+            values = {"start": (entry["initial"], None), label: (entry["value"], entry["std"])}
+            rows.append((name, entry["unit"], values))
+    return draw_figure_per_unit(rows, partial(figures.parameter_values_by_source_figure, colors=_ESTIMATE_COLORS))
 
 
 @register_report_section("search", 40, "How it was found")
@@ -163,29 +171,22 @@ def _friction_torque(findings: ReportData) -> Iterator[tuple[str, Any]]:
             yield cloud.joint, figures.scatter_figure(points, words, "friction [N m]")
 
 
-@register_report_section("information", 10, "The most informative motion")
-def _informative_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    return _motion_figures(findings, "information")
-
-
 @register_report_section("plan", 10, "The planned motion")
 def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    return _motion_figures(findings, "plan")
-
-
-def _motion_figures(findings: ReportData, key: str) -> Iterator[tuple[str, Any]]:
     """Distance of a plan's point from its target; joint positions, velocities and efforts over time."""
-    found = findings.section_data.get(key)
+    found = findings.section_data.get("plan")
     if found is None:
         return
     system, names = found.simulator.step.system, found.joint_names
-    if key == "plan" and (where := found.point_trajectories.get(findings.result["point"])) is not None:
+    if (where := found.point_trajectories.get(findings.result.get("point"))) is not None:
         lines, tolerance = _lines(found.t, "xyz", 1e3 * (where - found.target_position)), findings.result["tolerance"]
         curve = TimePlotData("from the place [mm]", lines, band_half_height=1e3 * tolerance)
         yield "", lines_over_time_figure(curve)
-    courses = [("joints, from the start", "position", found.joint_positions - found.joint_positions[0])]
-    courses += [("velocity", "velocity", found.joint_velocities)] if key == "information" else []
-    for words, channel, values in (*courses, ("effort", "effort", found.joint_efforts)):
+    for words, channel, values in (
+        ("joints, from the start", "position", found.joint_positions - found.joint_positions[0]),
+        ("velocity", "velocity", found.joint_velocities),
+        ("effort", "effort", found.joint_efforts),
+    ):
         title = f"{words} [{_joint_channel_unit(system, names, channel)}]"
         yield "", lines_over_time_figure(TimePlotData(title, _lines(found.t, names, values)))
 
