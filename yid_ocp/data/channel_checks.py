@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import scipy.special
+from ruamel.yaml import YAML
 from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, BoolArray
@@ -331,46 +333,7 @@ class Issue:
         return place + span
 
 
-ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = {
-    "time_unit": "times are not in seconds",
-    "time_scale": "the clock runs too fast or too slowly",
-    "clock_base": "clocks of two groups do not overlap",
-    "clock_offset": "the clock of one group is late or early",
-    "clock_drift": "the clocks of two groups run apart",
-    "clock_jump": "the clock jumps",
-    "gap": "samples are missing in the data that drive the model",
-    "dropped_samples": "many samples are missing",
-    "few_samples": "too few samples",
-    "standstill": "nothing moves",
-    "stuck": "a channel repeats one value",
-    "quantised": "a channel has steps larger than its noise",
-    "saturated": "a channel is saturated",
-    "noise": "more noise than stated",
-    "noise_overstated": "less noise than stated",
-    "same_data": "the same data twice",
-    "degrees": "angles are in degrees",
-    "angle_scale": "an angle has the wrong scale",
-    "angle_sign": "an angle has the wrong sign",
-    "swapped_joints": "two joints are exchanged",
-    "angle_limits": "angles are beyond the joint's limits",
-    "speed_limits": "joints exceed their speed limit",
-    "effort_zero": "efforts are zero",
-    "effort_sign": "an effort has the wrong sign",
-    "effort_gain": "an effort has the wrong scale",
-    "effort_offset": "an effort's zero is off",
-    "effort_lag": "efforts are late",
-    "effort_limits": "efforts exceed the joint's limit",
-    "effort_unlike": "efforts do not fit this robot",
-    "point_scale": "lengths are not in metres",
-    "point_mirrored": "points are mirrored or have swapped axes",
-    "point_frame": "points are in another frame",
-    "point_swapped": "two points are exchanged",
-    "point_reach": "points are beyond the object's reach",
-    "encoder_offset": "an encoder's zero is off",
-    "point_unlike": "points do not fit the robot's motion",
-    "weak_excitation": "the motion is too weak to determine the free parameters",
-    "worse_than_guess": "a prediction without a model has a smaller error",
-}
+ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = YAML(typ="safe").load(Path(__file__).with_name("issue_causes.yaml"))
 """Description of every cause of an issue, as shown in tables."""
 
 SensorOptionsLookup = Callable[[str], SensorOptions]
