@@ -40,17 +40,7 @@ _MAPPINGS: Mapping[str, type] = {
     "clock_offsets": float,
     "message_fields": str,
 }
-_SINGLE = (
-    "command_topic",
-    "pose_axis_point_distance",
-    "has_header",
-    "skip_bad_lines",
-    "delimiter",
-    "episode",
-    "clock_kind",
-    "point_sensor_name",
-    "frame",
-)
+_SINGLE = [entry.name for entry in fields(ImportSettings) if entry.name not in (*_LISTS, *_MAPPINGS, "units")]
 _FLAGS = {
     "joint_topics": "--joint-topic",
     "clock_offsets": "--clock-offset",
