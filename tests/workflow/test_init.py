@@ -128,12 +128,12 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
     model, measured = scene["scenes"][0]["motions"]
     assert set(measured["points"]) == {"m1", "m2"}
-    assert set(measured["points"]) <= set(model["measured_points"])
+    assert set(measured["points"]) <= set(model["points"])
     # a straight stick that is seen where it is: points and frames meet all the time
     for name, at in measured["points"].items():
         seen, told = (
             np.array([row[3 * k : 3 * k + 3] for row in own["places"]], float)
-            for own, k in ((measured, at), (model, model["measured_points"][name]))
+            for own, k in ((measured, at), (model, model["points"][name]))
         )
         assert np.nanmax(np.abs(seen - told)) < 30  # tenths of a millimetre
     # a page that already exists is not written over
