@@ -365,9 +365,9 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
     if terms.stiffness > 0:
         numbers |= {"stiffness": [terms.stiffness], "springref": [terms.constant_force / terms.stiffness]}
     if terms.cubic_stiffness:
-        if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
-            what, hint = f"the spring at '{joint.name}' has a cubic part", "leave the cubic part or the rest angle out"
-            allowed = "no cubic part with a rest angle; otherwise MuJoCo 3.6 or newer (polynomial stiffness)"
+        if terms.constant_force:
+            what, allowed = f"the spring at '{joint.name}' has a cubic part", "no cubic part with a rest angle"
+            hint = "leave the cubic part or the rest angle out"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         numbers["stiffness"] = [terms.stiffness, 0.0, terms.cubic_stiffness]
     others = {"armature": [terms.armature], "frictionloss": [terms.dry_friction]}
@@ -418,9 +418,6 @@ def _add_actuators(system: System, value: ExpressionEvaluator, actuator: Element
         if lag > 0:
             attributes |= {"dyntype": "filterexact", "dynprm": format_xml_numbers([lag])}
         if delay > 0:
-            if not hasattr(import_mujoco().MjModel, "actuator_delay"):
-                what, allowed = f"the torque of '{joint}' is delayed", "MuJoCo 3.5 or newer, which has actuator delays"
-                raise ModelError(what, where=f"joint '{joint}'", allowed=allowed, hint="pip install -U mujoco")
             samples = math.ceil(delay / time_step) + 1
             attributes |= {"delay": format_xml_numbers([delay]), "nsample": str(samples), "interp": between}
         SubElement(actuator, "general", attributes)

@@ -303,10 +303,9 @@ def _initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
     """Set the commands of all actuators and fill the history of delayed actuators with them."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
-    if hasattr(scene.mujoco, "mj_initCtrlHistory") and hasattr(model, "actuator_delay"):
-        for i in map(int, np.flatnonzero(np.asarray(model.actuator_delay))):
-            before = np.full((int(model.actuator_history[i, 0]), 1), commands[i])
-            scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
+    for i in map(int, np.flatnonzero(np.asarray(model.actuator_delay))):
+        before = np.full((int(model.actuator_history[i, 0]), 1), commands[i])
+        scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
 
 
 def _settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Array) -> None:
@@ -314,8 +313,7 @@ def _settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: A
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
     held = _settling_model(scene, damping)
-    if hasattr(held, "actuator_delay"):
-        held.actuator_delay[:] = 0.0
+    held.actuator_delay[:] = 0.0
     next(calm for calm in _calming(scene, held) if calm < _REST)
     posture = data.qpos.copy()
     scene.mujoco.mj_resetData(model, data)
