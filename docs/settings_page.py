@@ -140,7 +140,7 @@ model:
     "model.grasp.NAME": """\
 model:
   grasp:
-    right: {holder_frame: right_gripper, held_frame: w_T3, kind: axis, rpy: [0.0, 1.5708, 0.0]}    # [rad]
+    right: {holder_frame: right_gripper, held_frame: w_T3, kind: axis, held_frame_rpy: [0.0, 1.5708, 0.0]}    # [rad]
 """,
     "model.springs.NAME": """\
 model:

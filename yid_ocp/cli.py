@@ -204,7 +204,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--episode", type=int, metavar="NUMBER", help="episode of a LeRobot dataset; 0 when absent")
     group.add_argument("--clock-kind", choices=("recorded", "nominal"), help="of a table: whether times were measured")
     group.add_argument("--point-sensor-name", metavar="TEXT", help="name of the sensor of the points")
-    group.add_argument("--frame", metavar="TEXT", help="frame of reference of the points, of a table or C3D file")
+    group.add_argument("--point-frame", metavar="TEXT", help="reference frame of points, of a table or C3D file")
 
 
 def _init(parser: argparse.ArgumentParser) -> None:

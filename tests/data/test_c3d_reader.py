@@ -37,7 +37,7 @@ def write_c3d(path: Path, labels: tuple[str, ...] = LABELS, unit: str = "mm", fr
 
 def test_markers_of_a_file(tmp_path: Path) -> None:
     written = write_c3d(tmp_path / "run.c3d")
-    recording = read_any(tmp_path / "run.c3d", frame="lab")
+    recording = read_any(tmp_path / "run.c3d", point_frame="lab")
     (points,) = recording.points
     assert (points.names, points.frame, points.clock) == (("base", "tip"), "lab", "nominal")
     assert np.allclose(points.t, np.arange(6) / 200)

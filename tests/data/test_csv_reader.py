@@ -26,7 +26,9 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
         "\n"
         "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
     )
-    recording = read_any(path, clock_kind="nominal", point_sensor_name="camera", frame="base", description="two joints")
+    recording = read_any(
+        path, clock_kind="nominal", point_sensor_name="camera", point_frame="base", description="two joints"
+    )
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert joints.clock == "nominal"

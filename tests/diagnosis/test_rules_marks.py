@@ -19,7 +19,7 @@ from yid_ocp.diagnosis.blind_scores import (
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import EffectSearchRecord
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import LocatedGap
+from yid_ocp.diagnosis.verdict import GapLocalization
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.workflow import blind_slices
@@ -294,7 +294,7 @@ def diagnosed(decrease=80.0, there=0.5):
     known = {"screening": screening(ranked), "nominal_model": fit((), loss(3.0, 3.2), 100.0, {"k": 2.0})}
     record = EffectSearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
     named = {"single_effect_models": (refits[FRICTION.label],), "selected_effects": (added(FRICTION),)}
-    return finding(**named, record=record, located_gap=LocatedGap((place("elbow"),), decrease), **known)
+    return finding(**named, record=record, located_gap=GapLocalization((place("elbow"),), decrease), **known)
 
 
 def again(finding, **limits):

@@ -27,8 +27,8 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
+    GapLocalization,
     Judgement,
-    LocatedGap,
     NominalModelGapEvidence,
     _check_effect_amplitude_transfer,
     _compare,
@@ -185,7 +185,7 @@ def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
 )
 def test_what_effects_explain_of_what_can_be_explained(costs, decrease, part):
     """Fall of r'r less what one parameter takes, over the smoother's fall less the degrees of freedom that it takes."""
-    nominal, last, located = fit(cost=costs[0]), fit([ONE], cost=costs[1]), LocatedGap((), decrease)
+    nominal, last, located = fit(cost=costs[0]), fit([ONE], cost=costs[1]), GapLocalization((), decrease)
     assert _explained_fraction(nominal, last, located) == pytest.approx(part)
     assert _explained_fraction(replace(nominal, has_process_noise=True), last, located) == 1.0
     assert _explained_fraction(nominal, last, None) == 1.0

@@ -382,7 +382,7 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
     assert made.point_names == ("cable:100%",)
     # the section repeats the import
     columns = {"r": "position:roll", "p": "position:pitch", "ax": "x:tip", "ay": "y:tip", "az": "z:tip"}
-    assert run.import_.columns == columns
+    assert run.import_.column_meanings == columns
     assert main(["import", "bag.csv", "--out", "again.h5", "--config", "run.yaml"]) == 0
     assert np.array_equal(read_recording("again.h5").points[0].position, made.points[0].position)
 

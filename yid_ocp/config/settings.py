@@ -71,7 +71,7 @@ class GraspSettings:
     holder_frame: Annotated[str, OptionInfo("frame of the robot")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
     kind: Annotated[_GraspKind, OptionInfo("point, axis (and z axes) or weld (and orientation)")] = "point"
-    rpy: Annotated[_Vector3, OptionInfo("orientation of held_frame in holder_frame", "rad")] = (0.0, 0.0, 0.0)
+    held_frame_rpy: Annotated[_Vector3, OptionInfo("orientation in holder_frame", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +262,7 @@ class ImportSettings:
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
     clock_kind: Annotated[ClockKind | None, OptionInfo("table: whether its times were measured")] = None
     point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None
-    frame: Annotated[str | None, OptionInfo("table or C3D file: reference frame of the points")] = None
+    point_frame: Annotated[str | None, OptionInfo("table or C3D file: frame of the points")] = None
 
 
 @dataclass(frozen=True, kw_only=True)

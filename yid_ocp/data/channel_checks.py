@@ -264,7 +264,7 @@ def _measured_positions(recording: Recording, point: str) -> Array:
 
 Severity = Literal["warning", "not_trusted", "refused"]
 
-MAX_EVIDENCE_RATIO = 1e3
+MAX_ISSUE_EVIDENCE_RATIO = 1e3
 """Largest value of `Issue.evidence_ratio`; larger ratios are clipped."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
@@ -304,7 +304,7 @@ class Issue:
     what: str  # sentence on the cause, with numbers
     # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
     weight: Severity
-    evidence_ratio: float  # observed value over the detection limit, 1 to `MAX_EVIDENCE_RATIO`
+    evidence_ratio: float  # observed value over the detection limit, 1 to `MAX_ISSUE_EVIDENCE_RATIO`
     advice: str  # recommended action
     # location; empty means all
     recording: str
@@ -318,7 +318,7 @@ class Issue:
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSE_DESCRIPTIONS:
             raise ValueError(f"there is no cause '{self.cause}'")
-        object.__setattr__(self, "evidence_ratio", float(min(max(self.evidence_ratio, 1.0), MAX_EVIDENCE_RATIO)))
+        object.__setattr__(self, "evidence_ratio", float(min(max(self.evidence_ratio, 1.0), MAX_ISSUE_EVIDENCE_RATIO)))
 
     @property
     def certainty_word(self) -> str:

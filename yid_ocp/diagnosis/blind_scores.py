@@ -26,7 +26,7 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
@@ -481,7 +481,7 @@ class _RecordedCase:
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
         flags = (data["are_offsets_stated"], data["has_left_baseline"])
         self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *flags)
-        self.located_gap = None if located is None else restored(LocatedGap, located)
+        self.located_gap = None if located is None else restored(GapLocalization, located)
         self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
@@ -503,7 +503,7 @@ class _RecordedCase:
         seen = tuple(DetectableAmplitudes(self._effects[label], {}, own) for label, own in data["detectable"].items())
         return ScreeningResult(seen, scores, ConfusabilityMatrix(tuple(data["labels"]), overlaps), _NO_JOINT_MODEL)
 
-    def locate(self) -> LocatedGap:
+    def locate(self) -> GapLocalization:
         if self.located_gap is None:
             raise UnrecordedRefitError("where the gap lies")
         return self.located_gap

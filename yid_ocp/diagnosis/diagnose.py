@@ -49,7 +49,7 @@ from yid_ocp.diagnosis.refit import (
 )
 from yid_ocp.diagnosis.screening import CandidateScore, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, LocatedGap, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import DataError, SolverError, failed_rollout_error
 from yid_ocp.inference.null_test import (
@@ -213,7 +213,7 @@ def _diagnosed(
     evidence = replace(evidence, has_left_baseline=earlier.fit_parameters_differ_significantly(nominal, limits))
     smoothed: SmoothedUnknownsResult | None = None
 
-    def locate() -> LocatedGap:
+    def locate() -> GapLocalization:
         nonlocal smoothed
         search.progress.begin_stage("locating the gap", 1.0, 8.5)
         # without events, the smoother already ran on all fitted data
@@ -221,7 +221,7 @@ def _diagnosed(
         smoothed = _smooth_about_model(nominal, limits) if known is None else known
         by_chance = smoothed.dof_before - smoothed.dof_after
         places = gap_locations_by_smoother_evidence(smoothed, limits.location_z)
-        return LocatedGap(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
+        return GapLocalization(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
 
     located = functools.cache(locate)
 

@@ -20,8 +20,8 @@ from yid_ocp.diagnosis.select import (
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
+    GapLocalization,
     Judgement,
-    LocatedGap,
     NominalModelGapEvidence,
 )
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin
@@ -92,7 +92,7 @@ class DiagnosisResult(NominalModelGapEvidence, Judgement, ReprMixin):
     counterfactual: ErrorsWithEffectsRemovedAndAdded | None = None
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
-    located_gap: LocatedGap | None = None
+    located_gap: GapLocalization | None = None
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first; empty if all were done

@@ -60,7 +60,7 @@ class EffectAmplitudeTransferCheck:
 
 
 @dataclass(frozen=True)
-class LocatedGap:
+class GapLocalization:
     """Location of the nominal model's gap, as found by the smoother."""
 
     locations: tuple[GapLocation, ...]
@@ -181,7 +181,7 @@ def _with_verdict(said: Judgement, gap: bool, are_data_sufficient: bool, limits:
 def judge(
     search: RefitContext,
     evidence: NominalModelGapEvidence,
-    locate: Callable[[], LocatedGap],
+    locate: Callable[[], GapLocalization],
     finished: Callable[[str], None] = lambda _: None,
 ) -> Judgement:
     """Decide the verdict from the evidence for a gap and from the results of a search for effects.
@@ -212,7 +212,7 @@ def judge(
     return _with_verdict(said, has_gap or bool(added), enough and is_seen, limits)
 
 
-def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, located: LocatedGap | None) -> float:
+def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, located: GapLocalization | None) -> float:
     """Decrease of r'r by effects over that by the smoother, minus degrees of freedom; 1 with process noise."""
     if located is None or nominal.has_process_noise or located.chi2_decrease <= 0:
         return 1.0

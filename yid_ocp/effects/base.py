@@ -113,7 +113,7 @@ class EffectBase(Effect):
         return ()
 
     @property
-    def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
+    def max_abs_initial_internal_coordinates(self) -> Mapping[str, float]:
         """Largest absolute initial value of each internal coordinate whose initial value is estimated."""
         return {}
 

@@ -166,7 +166,7 @@ class _JointPresliding(EffectBase):
         return ("s",)
 
     @property
-    def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
+    def max_abs_initial_internal_coordinates(self) -> Mapping[str, float]:
         """Bound 1 on the initial |s|. The initial `s` of every recording is estimated."""
         return dict.fromkeys(self.internal_coordinate_symbols, 1.0)
 

@@ -252,18 +252,18 @@ def estimated_initial_state_names(
         coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
         found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]
     for effect in system.effects:
-        if isinstance(effect, EffectBase) and effect.max_abs_unknown_initial_states:
+        if isinstance(effect, EffectBase) and effect.max_abs_initial_internal_coordinates:
             index = system.parameters.index
             names = effect.amplitude_parameter_names
             if any(name in free or theta[index(name)] != effect.neutral_values[name] for name in names):
-                found += [f"z.{name}" for name in effect.max_abs_unknown_initial_states]
+                found += [f"z.{name}" for name in effect.max_abs_initial_internal_coordinates]
     return tuple(found)
 
 
 def _unobserved_state_limits(system: System) -> dict[str, float]:
     """Largest magnitude of each unobserved initial internal coordinate of the effects."""
     effects = [effect for effect in system.effects if isinstance(effect, EffectBase)]
-    return {name: size for effect in effects for name, size in effect.max_abs_unknown_initial_states.items()}
+    return {name: size for effect in effects for name, size in effect.max_abs_initial_internal_coordinates.items()}
 
 
 def initial_internal_state_offset_bounds(system: System, names: Sequence[str]) -> Array:

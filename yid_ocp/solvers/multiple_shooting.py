@@ -37,7 +37,7 @@ from yid_ocp.solvers.nonlinear_program import (
     available_memory_bytes,
 )
 from yid_ocp.solvers.symbolic_transcription import (
-    MIN_RIDGE_FACTOR,
+    MIN_HESSIAN_RIDGE,
     check_no_effect_changes_inputs,
     problem_unknowns_from_program,
     transcribe,
@@ -246,7 +246,7 @@ class _AdaptiveRidge(ca.Callback):
 
     def __init__(self, scale: Array, size: int) -> None:
         ca.Callback.__init__(self)
-        self.factor = MIN_RIDGE_FACTOR
+        self.factor = MIN_HESSIAN_RIDGE
         self._scale, self._change, self._size = scale, np.zeros(len(scale)), size
         self.construct("factor", {})
 
@@ -259,7 +259,7 @@ class _AdaptiveRidge(ca.Callback):
     def update(self, before: Array, after: Array) -> None:
         change = (after - before) / np.maximum(np.abs(after), self._scale)
         turned = float(change @ self._change) < 0
-        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, MIN_RIDGE_FACTOR)
+        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, MIN_HESSIAN_RIDGE)
         self._change = change
 
 

@@ -50,7 +50,7 @@ from yid_ocp.solvers.nonlinear_program import (
 )
 
 # Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
-MIN_RIDGE_FACTOR = 0.1
+MIN_HESSIAN_RIDGE = 0.1
 
 
 def transcribe(
@@ -285,7 +285,7 @@ class _Maker:
         residuals += self._priors(columns)
         order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
         lower, upper, start = (np.concatenate(part) for part in (self._w.lower, self._w.upper, self._w.values))
-        ridge = GaussNewtonHessianRidge(np.concatenate(at_ridge), problem.unknown_scales[order], MIN_RIDGE_FACTOR)
+        ridge = GaussNewtonHessianRidge(np.concatenate(at_ridge), problem.unknown_scales[order], MIN_HESSIAN_RIDGE)
         vectors = lower, upper, start, np.concatenate([np.zeros(0), *self._p.values])
         terms = tuple(constraints), tuple(residuals)
         symbols = ca.MX.sym("w", self._w.size), ca.MX.sym("p", self._p.size)

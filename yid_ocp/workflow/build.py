@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import EffectSettings, GraspSettings, ParameterSettings, RunSettings
+from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EffectBase, make_effect
@@ -82,8 +82,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             carrier,
             objects=[(item, frame, place) for item, (_, frame, place) in zip(items, objects, strict=True)],
             grasps=[
-                Grasp(name, said.holder_frame, said.held_frame, said.kind, ca.SX(ca.DM(rotation_from_rpy(*said.rpy))))
-                for name, said in model.grasp.items()
+                Grasp(name, s.holder_frame, s.held_frame, s.kind, ca.SX(ca.DM(rotation_from_rpy(*s.held_frame_rpy))))
+                for name, s in model.grasp.items()
             ],
             driven=moved if mode in ("driven", "servo") else (),
             prescribed=moved if mode == "prescribed" else (),
@@ -359,7 +359,7 @@ def system_with_second_arm_holding_object(run: RunSettings, system: System) -> S
         return None
     other = _OTHER_SIDE[side]
     mirrored, holder = ([f"{other}{name.removeprefix(side)}" for name in own] for own in (joints, [grasp.holder_frame]))
-    added = GraspSettings(holder_frame=holder[0], held_frame=free[0], kind=grasp.kind, rpy=grasp.rpy)
+    added = replace(grasp, holder_frame=holder[0], held_frame=free[0])
     arms = replace(model.arms, joints=(*joints, *mirrored))
     try:
         return build_system(replace(run, model=replace(model, arms=arms, grasp={**model.grasp, other: added})))

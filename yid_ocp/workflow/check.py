@@ -26,7 +26,7 @@ from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_initial_grasp_frame_distances
-from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, command_with_settings
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_settings_command
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
@@ -38,7 +38,7 @@ _N_MODES = 3
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `check` and return its exit code."""
-    code = command_with_settings(_run_check)(arguments)
+    code = make_settings_command(_run_check)(arguments)
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 

@@ -42,7 +42,7 @@ class CommandOutcome(Generic[_CommandOutput]):
     is_successful: bool = True
 
 
-def command_with_settings(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
+def make_settings_command(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
     """Make a command that calls `work(settings, out, progress, ...)`, where `...` are the arguments `names`."""
 
     def run(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.solvers.base import EstimateChecks
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.solve import solution_to_result_dict
 
@@ -76,4 +76,4 @@ def _compare_result(problem: EstimationProblem, comparison: MethodComparison) ->
     }
 
 
-run_from_arguments = command_with_settings(_run_compare)
+run_from_arguments = make_settings_command(_run_compare)

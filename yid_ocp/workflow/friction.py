@@ -16,7 +16,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, Status, solve
 from yid_ocp.workflow.build import friction_joint_names, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
@@ -83,4 +83,4 @@ def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tupl
     }
 
 
-run_from_arguments = command_with_settings(_run_friction)
+run_from_arguments = make_settings_command(_run_friction)

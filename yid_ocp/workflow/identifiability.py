@@ -32,7 +32,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm_holding_object
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings, worker_config_from_arguments
+from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import solve_and_decide_cable_memory
@@ -78,7 +78,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         rank_changes=arguments.what_if,
     )
     work = partial(run_identifiability, options=asked, workers=worker_config_from_arguments(arguments))
-    return command_with_settings(work)(arguments)
+    return make_settings_command(work)(arguments)
 
 
 def run_identifiability(

@@ -28,7 +28,7 @@ from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_file
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role
@@ -76,7 +76,7 @@ def run_plan(
     return CommandOutcome(folder.path, written, found, found.is_successful)
 
 
-run_from_arguments = command_with_settings(run_plan)
+run_from_arguments = make_settings_command(run_plan)
 
 
 def _compile_step_for_planning(run: RunSettings) -> Step:

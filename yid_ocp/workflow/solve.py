@@ -26,7 +26,7 @@ from yid_ocp.solvers import base as solvers
 from yid_ocp.solvers.base import EpisodeAndPrediction, EstimateChecks, IterationCallback
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings
+from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
 _RESULT_FORMAT = "yid-solve/1"
@@ -69,7 +69,7 @@ def run_solve(
     return CommandOutcome(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 
-run_from_arguments = command_with_settings(run_solve, "live")
+run_from_arguments = make_settings_command(run_solve, "live")
 
 
 def solve_and_decide_cable_memory(

@@ -45,7 +45,7 @@ from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import issues_to_plain_data, recording_quality_issues_with_model
-from yid_ocp.workflow.command_runner import CommandOutcome, command_with_settings, worker_config_from_arguments
+from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path, unknown_name_error
 
@@ -54,7 +54,7 @@ _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `track` and return its exit code."""
-    return command_with_settings(partial(_run_track, workers=worker_config_from_arguments(arguments)))(arguments)
+    return make_settings_command(partial(_run_track, workers=worker_config_from_arguments(arguments)))(arguments)
 
 
 def _run_track(

@@ -41,7 +41,7 @@ def read_c3d(
     point_names: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     point_sensor_name: str = "motion capture",
-    frame: str = "world",
+    point_frame: str = "world",
     description: str = "",
 ) -> Recording:
     """Read the markers of a C3D file as one point group `points`.
@@ -58,7 +58,9 @@ def read_c3d(
     digest = file_sha256(path)
     found = _markers(path)
     own = {"points": found.unit} if found.unit else {}
-    group = PointGroup("points", found.names, found.t, found.position, None, point_sensor_name, frame, None, "nominal")
+    group = PointGroup(
+        "points", found.names, found.t, found.position, None, point_sensor_name, point_frame, None, "nominal"
+    )
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
     options = base.SelectionAndUnitOptions(point_names=point_names, units={**own, **(units or {})})

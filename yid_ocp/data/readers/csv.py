@@ -60,7 +60,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     delimiter: str = ""  # one character between cells; found in the first line where empty
     clock_kind: ClockKind = "recorded"  # whether the times were measured
     point_sensor_name: str = "unknown"  # sensor of the points
-    frame: str = "world"  # reference frame of the points
+    point_frame: str = "world"  # reference frame of the points
     description: str = ""  # what was recorded
 
 
@@ -93,7 +93,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         seen, unit, remarks = capture
         sensor = seen.sensor if options.point_sensor_name == "unknown" else options.point_sensor_name
-        group = replace(seen, sensor=sensor, frame=options.frame)
+        group = replace(seen, sensor=sensor, frame=options.point_frame)
         made, units = Recording(None, (group,), *said, notes=remarks), {"points": unit}
     else:
         meanings, units, table, notes = _read_table(path, options)
@@ -138,7 +138,7 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
         own: dict[str, Any] = {name: values[rows] for name, values in channels.items()}
         joints = JointGroup(joint_names, t[rows], clock=options.clock_kind, **own)
     if point_names:
-        rows, said = measured([position]), (options.point_sensor_name, options.frame, None, options.clock_kind)
+        rows, said = measured([position]), (options.point_sensor_name, options.point_frame, None, options.clock_kind)
         points.append(PointGroup("points", point_names, t[rows], position[rows], None, *said))
     for name, (names, parts) in mounted.items():
         rows = measured(list(parts.values()))
