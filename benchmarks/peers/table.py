@@ -125,7 +125,7 @@ def draw(known: Mapping[str, Any], path: Path) -> None:
                     axis.plot(x, y, **style)
     axes[0].set_yticks(range(len(cases)), [entry["title"] for entry in cases.values()])
     axes[0].set_ylim(len(cases) - 0.5, -0.5)
-    titles = ("confident but wrong [%]", "held-out error over the least of the case", "CPU time [s]")
+    titles = ("confident but wrong [%]", "held-out error / smallest error of this case", "CPU time [s]")
     for axis, title in zip(axes, titles, strict=True):
         axis.set_xlabel(title)
         axis.grid(alpha=0.3)
