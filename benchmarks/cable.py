@@ -42,7 +42,6 @@ from yid_ocp.problem.predictions import (
     constant_position_naive_prediction,
     interpolated_displacement_naive_prediction,
     mean_clamp_displacement_naive_prediction,
-    position_rmse,
     recorded_point_positions,
 )
 from yid_ocp.solvers import GaussNewton, solve
@@ -107,6 +106,11 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
     )
 
 
+def _position_rmse(predicted: np.ndarray, measured: np.ndarray) -> float:
+    """Root mean square of the Euclidean error over points and frames, without the two given frames and gaps [m]."""
+    return float(np.sqrt(np.nanmean(np.sum((predicted - measured)[2:] ** 2, axis=2))))
+
+
 def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: Sequence[str]) -> dict[str, float]:
     """Root mean square position error over some points, by recording, held-out ones included [m].
 
@@ -123,7 +127,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
         for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
             if samples.sensor.point_names == tuple(points):
                 shape = (len(predicted), len(points), 3)
-                errors[episode.name] = position_rmse(predicted.reshape(shape), samples.value.reshape(shape))
+                errors[episode.name] = _position_rmse(predicted.reshape(shape), samples.value.reshape(shape))
     return errors
 
 
@@ -141,7 +145,7 @@ def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
             cable.clamped_vertex_names,
         ),
     }
-    return {name: position_rmse(predicted, measured) for name, predicted in predictions.items()}
+    return {name: _position_rmse(predicted, measured) for name, predicted in predictions.items()}
 
 
 def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:

@@ -67,25 +67,22 @@ def words(results):
 
 THREE = {"c": (1, 1.0), "a": (1, 2.0), "ac": (2, 1.0), "as": (2, 3.0), "acs": (3, 4.0)}
 SETS = {
-    "one does": ("wca", {"w": (3, 1.0), "c": (2, 5.0), "cw": (3, 9.0)}, "w", "w", 4),
-    "two pairs do": ("wcas", {"w": (2, 1.0), "cw": (3, 1.0), "as": (3, 9.0), "acw": (3, 20.0)}, "as cw", "w cw", 11),
-    "three do": ("wcas", THREE, "acs", "a as acs", 15),
-    "four would": ("wcas", {"acsw": (3, 4.0)}, "", "", 15),
-    "one motion at a time": ("mt", {"m": (1, 1.0), "mt": (3, 9.0)}, "", "m", 3),
-    "one rate at a time": ("sf", {"f": (1, 1.0), "fs": (3, 9.0)}, "", "f", 3),
-    "a motion and a rate": ("mf", {"m": (1, 1.0), "fm": (3, 9.0)}, "fm", "m fm", 4),
-    "nothing to find": ("wc", {"": (3, 0.0), "w": (3, 5.0)}, "-", "", 3),
-    "never to the worse": ("wc", {"": (2, 1.0), "w": (1, 5.0)}, "", "", 4),
-    "until nothing is gained": ("wc", {"c": (1, 1.0), "cw": (1, 1.0)}, "", "c", 4),
-    "no change": ("", {}, "", "", 1),
+    "one does": ("wca", {"w": (3, 1.0), "c": (2, 5.0), "cw": (3, 9.0)}, "w", 4),
+    "two pairs do": ("wcas", {"w": (2, 1.0), "cw": (3, 1.0), "as": (3, 9.0), "acw": (3, 20.0)}, "as cw", 11),
+    "three do": ("wcas", THREE, "acs", 15),
+    "four would": ("wcas", {"acsw": (3, 4.0)}, "", 15),
+    "one motion at a time": ("mt", {"m": (1, 1.0), "mt": (3, 9.0)}, "", 3),
+    "one rate at a time": ("sf", {"f": (1, 1.0), "fs": (3, 9.0)}, "", 3),
+    "a motion and a rate": ("mf", {"m": (1, 1.0), "fm": (3, 9.0)}, "fm", 4),
+    "nothing to find": ("wc", {"": (3, 0.0), "w": (3, 5.0)}, "-", 3),
+    "no change": ("", {}, "", 1),
 }
 
 
-@pytest.mark.parametrize(("considered", "table", "smallest", "greedy", "count"), SETS.values(), ids=SETS)
-def test_the_fewest_changes_that_find_every_parameter(short_run, considered, table, smallest, greedy, count):
+@pytest.mark.parametrize(("considered", "table", "smallest", "count"), SETS.values(), ids=SETS)
+def test_the_fewest_changes_that_find_every_parameter(short_run, considered, table, smallest, count):
     found = ranked(short_run, considered, table)
     assert words(found.smallest_sufficient_sets) == smallest
-    assert words(found.greedy_sequence) == greedy
     assert found.n_evaluated_sets == count
 
 
@@ -197,7 +194,6 @@ def test_springs_need_a_marker_off_the_axis_or_the_joint(springs):
     complete = {entry.changes for entry in ranking.single_changes if set(entry.verdicts.values()) == {"identifiable"}}
     assert complete == {("camera:coupling_marker",), ("camera:spring_1_marker",)}
     assert {entry.changes for entry in ranking.smallest_sufficient_sets} == complete
-    assert [entry.changes for entry in ranking.greedy_sequence] == [ranking.single_changes[0].changes]
     assert [entry.changes for entry in what_if(springs("series_ends")).smallest_sufficient_sets] == [("camera:joint",)]
 
 

@@ -19,7 +19,7 @@ PARTS = {
     "": {"format", "status", "parameters", "directions", "what_if", "inputs", "versions", "correlations"},
     "parameters": {"value", "unit", "std_relative", "verdict", "interval", "std_alone"},
     "directions": {"singular_value", "components", "words", "verdict"},
-    "what_if": {"base", "singles", "smallest", "greedy", "searched"},
+    "what_if": {"base", "singles", "smallest", "searched"},
     "changes": {"changes", "words", "std_relative", "verdicts", "identifiable", "gain", "message"},
 }
 

@@ -16,7 +16,6 @@ from yid_ocp.problem.predictions import (
     constant_position_naive_prediction,
     interpolated_displacement_naive_prediction,
     mean_clamp_displacement_naive_prediction,
-    position_rmse,
     recorded_point_positions,
     rmse_unit_and_count_by_channel,
 )
@@ -203,16 +202,6 @@ def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
         np.testing.assert_array_equal(method(recording)[2:], method(other)[2:])
 
 
-def test_prediction_error_is_euclidean_and_leaves_out_given_frames_and_gaps():
-    measured, predicted = np.zeros((4, 2, 3)), np.zeros((4, 2, 3))
-    predicted[:2] = 100.0
-    predicted[2:, 0] = [3.0, 4.0, 0.0]
-    assert position_rmse(predicted, measured) == pytest.approx(np.sqrt(25 / 2))
-    measured[2:, 1] = np.nan
-    assert position_rmse(predicted, measured) == pytest.approx(5.0)
-    assert np.isnan(position_rmse(predicted, np.full_like(measured, np.nan)))
-
-
 @pytest.mark.parametrize(
     ("call", "text"),
     [
@@ -220,7 +209,6 @@ def test_prediction_error_is_euclidean_and_leaves_out_given_frames_and_gaps():
         (lambda r: constant_position_naive_prediction(r, ("p1",), given=0), "given = 0"),
         (lambda r: constant_position_naive_prediction(r, ("p1",), given=11), "given = 11"),
         (lambda r: interpolated_displacement_naive_prediction(r, ("c1",), PARENT), "belongs to no branch"),
-        (lambda r: position_rmse(np.zeros((3, 1, 3)), np.zeros((4, 1, 3))), "the prediction has the shape"),
     ],
 )
 def test_what_cannot_be_predicted_is_said(recording, call, text):

@@ -78,13 +78,12 @@ class ExperimentChangeRanking(ReprMixin):
 
     `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
     last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make every parameter
-    identifiable, largest gain first. `greedy_sequence` adds the best single change repeatedly.
+    identifiable, largest gain first.
     """
 
     unchanged_experiment: ChangedExperimentResult
     single_changes: tuple[ChangedExperimentResult, ...]
     smallest_sufficient_sets: tuple[ChangedExperimentResult, ...]
-    greedy_sequence: tuple[ChangedExperimentResult, ...]
     n_evaluated_sets: int
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -139,9 +138,8 @@ def what_if(
         raise failed_rollout_error(base.message)
     changes = [c for c in outcomes.possible if considered_changes is None or c.name in considered_changes]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
-    greedy = _greedy(outcomes, changes, base)
     smallest = _rank_results(_smallest(outcomes, changes, base))
-    return ExperimentChangeRanking(base, tuple(singles), tuple(smallest), tuple(greedy), len(outcomes.known))
+    return ExperimentChangeRanking(base, tuple(singles), tuple(smallest), len(outcomes.known))
 
 
 def evaluate_experiment_change_sets(
@@ -163,23 +161,6 @@ def _smallest(
         if complete := [outcome for outcome in found if outcome._is_complete]:
             return complete
     return []
-
-
-def _greedy(
-    outcomes: _Outcomes, changes: Sequence[ExperimentChange], base: ChangedExperimentResult
-) -> list[ChangedExperimentResult]:
-    chosen: tuple[ExperimentChange, ...] = ()
-    steps: list[ChangedExperimentResult] = []
-    best = base
-    while len(chosen) < _MAX_CHANGE_SET_SIZE and not best._is_complete:
-        trials = [(*chosen, change) for change in changes if change not in chosen]
-        found = outcomes.of_all(trials := list(filter(_are_compatible, trials)))
-        top = next(iter(_rank_results(found)), best)
-        if (top.identifiable, top.gain) <= (best.identifiable, best.gain):
-            break
-        chosen, best = trials[found.index(top)], top
-        steps.append(top)
-    return steps
 
 
 def _are_compatible(changes: Sequence[ExperimentChange]) -> bool:

@@ -94,20 +94,6 @@ def interpolated_displacement_naive_prediction(
     return _carried(recording, points, knots, given, share)
 
 
-def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
-    """Root mean square of the Euclidean error over points and frames [m]. NaN if there is nothing to compare.
-
-    The arrays have the shape (M, np, 3); different shapes raise `DataError`. The first `given` frames and missing
-    points do not count.
-    """
-    if predicted.shape != measured.shape:
-        what = f"the prediction has the shape {predicted.shape}, the measurement {measured.shape}"
-        raise DataError(what, where="predicted", allowed="equal shapes (M, np, 3)", hint="predict the measured frames")
-    square = np.sum((predicted - measured)[given:] ** 2, axis=2)
-    seen = np.isfinite(measured[given:]).all(axis=2)
-    return float(np.sqrt(np.mean(square[seen]))) if np.any(seen) else float("nan")
-
-
 def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
     """Measured positions (M, len(points), 3) [m] of points of one group of a recording."""
     group = _group_with_points(recording, points)

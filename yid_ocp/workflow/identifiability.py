@@ -182,7 +182,6 @@ def _identifiability_result(
             "base": _outcome(ranking.unchanged_experiment),
             "singles": list(map(_outcome, ranking.single_changes)),
             "smallest": list(map(_outcome, ranking.smallest_sufficient_sets)),
-            "greedy": list(map(_outcome, ranking.greedy_sequence)),
             "searched": ranking.n_evaluated_sets,
         }
     return result | {

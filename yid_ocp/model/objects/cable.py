@@ -86,13 +86,6 @@ class CableOptions:
         Literal["axis", "weld"],
         OptionInfo("axis: the roll at the end clamp is free; weld: it is held at the parameter clamp_end.roll"),
     ] = "axis"
-    rests_in_undeformed_shape: Annotated[
-        bool, OptionInfo("whether the rest shape of branches is the undeformed shape instead of straight")
-    ] = True
-    rigid_first_edge: Annotated[
-        bool,
-        OptionInfo("whether the first edge is rigid up to its second point, so that only half of the next edge bends"),
-    ] = False
     has_edge_lengths_per_recording: Annotated[
         bool, OptionInfo("whether every recording has its own edge lengths; every edge then has a length parameter")
     ] = True
@@ -257,8 +250,6 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             own = edge_to_edge_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1])
             before = None
             at = junction - 2
-        if not options.rests_in_undeformed_shape:
-            own = [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
         edges = [lengths[edge] for edge in pairwise(chain)]
         segment = Segment(
             name,
@@ -274,8 +265,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             has_length_parameter_per_link=options.has_edge_lengths_per_recording,
         )
         segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
-        segment = replace(segment, rest_rotation=own[0], link_rest_rotations=own[1:], clamped_edge_length=before)
-        segments.append(replace(segment, clamped_at_base=options.rigid_first_edge and at is None))
+        segments.append(replace(segment, rest_rotation=own[0], link_rest_rotations=own[1:], clamped_edge_length=before))
     return segments
 
 
