@@ -199,9 +199,10 @@ class Disturbed(MadeUp):
         super().__init__(*arguments, **more)
         self.has_process_noise, self.frozen = True, [] if asked is None else asked
 
-    def problem_with_whitening_at(self, x, warm=None):
+    def problem_with_whitening_at(self, x, warm=None, predictions=()):
         self.frozen.append((np.asarray(x).tolist(), warm))
         made = Disturbed(self._rows, self.initial_unknowns, asked=self.frozen)
+        made.whitening_filters = ("filter",)
         made.frozen_at = np.asarray(x).tolist()
         return made
 
@@ -269,6 +270,30 @@ def test_another_start_of_gauss_newton_is_weighed_anew_only_where_it_leads_elsew
     assert "(best of 2 starts)" in found.message
     assert found.x.tolist() == pytest.approx([2.5])
     assert [at[0] for at, _ in problem.frozen] == pytest.approx([1.0, 2.5], rel=1e-3)
+
+
+class Coarse(Carrying):
+    """A method whose other starts are first followed to coarse tolerances; it reports the costs."""
+
+    with_coarse_tolerances = property(lambda self: self)
+
+    def minimize_cost(self, problem, start, callback):
+        found = super().minimize_cost(problem, start, callback)
+        return replace(found, history=tuple(replace(h, cost=problem.evaluate(h.x).cost) for h in found.history))
+
+
+@pytest.mark.parametrize(
+    ("ended", "weighed", "kept"),
+    [(2.402, [], 2.4), (2.45, [[2.45]], 2.45), (2.58, [[4.0], [2.58]], 2.58)],
+    ids=["no better", "a little further down", "in another minimum"],
+)
+def test_a_start_that_leads_further_down_a_known_minimum_is_weighed_from_its_end(ended, weighed, kept):
+    """The standard deviation is 0.5, the optimum 2.5; the first search ends at 2.4."""
+    problem = Disturbed(linear(2.0 * np.eye(1), [-5.0]))
+    solver = Coarse([[1.0], [2.4]], [[2.4]], [[4.0], [ended]], [[ended]], [[ended]])
+    solution = solve(problem, solver)
+    assert [at for at, _ in problem.frozen[2:]] == weighed
+    assert solution.x.tolist() == [kept]
 
 
 def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby():

@@ -155,9 +155,13 @@ def _checked_solution_and_issues(
 def _checked_solution_and_step_stability(
     start: EstimationProblem, problem: EstimationProblem, solution: Solution
 ) -> tuple[Solution, dict[str, Any]]:
-    """The solution, marked as not converged if the step is unstable, and stability data for result.json."""
+    """The solution, marked as not converged if the step is unstable, and stability data for result.json.
+
+    The start is examined only if the search failed.
+    """
     growth = discretisation.largest_alternating_error_growth
-    begin, end = growth(start, start.initial_unknowns), growth(problem, solution.x)
+    begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
+    end = growth(problem, solution.x)
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.keeps_errors_below_resolution:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status

@@ -248,16 +248,17 @@ def _whitened_episode(
     at: tuple[Array, Array],
     guess: Array | None,
     before: WhiteningFilter | None,
+    result: EpisodePrediction | str | None = None,
     keep_weights: bool = False,
 ) -> tuple[Episode, WhiteningFilter | None]:
     """Episode with estimated input errors, and the filter that whitens its residual at (theta, offset).
 
     The filter is None without process noise or if the rollout fails. It is linearised about the motion smoothed by
-    `before`, if given. With `keep_weights` it keeps the weights of `before`.
+    `before`, if given. With `keep_weights` it keeps the weights of `before`. `result` is the prediction, if known.
     """
     if episode.input_errors is None:
         return episode, None
-    result = predictor.predict_episode(episode, *at, False, guess)
+    result = result or predictor.predict_episode(episode, *at, False, guess)
     if not isinstance(result, str):
         episode = replace(episode, equilibrium_guess=result.equilibrium_guess)
     if before is not None and not isinstance(result, str):
@@ -310,14 +311,18 @@ def _behind_effects(
 
 
 def problem_with_whitening_at(
-    problem: EstimationProblem, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
+    problem: EstimationProblem,
+    x: ArrayLike,
+    equilibrium_guesses: EquilibriumGuesses | None = None,
+    predictions: Sequence[EpisodePrediction] = (),
+    rounds: int = 1,
 ) -> EstimationProblem:
     """Return a problem whose residuals are whitened by sensor and process noise, linearized at `x`.
 
     The problem itself is returned if it has no process noise, or if the rollout fails at `x`. If it is already
     whitened, the new filter is linearized about the motion and torques that the old filter smooths. `rounds` is the
     number of linearizations (2 at a fit). `equilibrium_guesses` are configurations from which the search for equilibria
-    starts.
+    starts. `predictions` of all recordings by this problem at `x`, if known, save rollouts.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
@@ -325,7 +330,8 @@ def problem_with_whitening_at(
     def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
         before = _own_filter(problem.whitening_filters[i])
         own = problem.theta_and_initial_state_deviation(x, i)
-        return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before)
+        known = predictions[i] if predictions else None
+        return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before, known)
 
     if not problem.has_process_noise:
         return problem
@@ -333,7 +339,7 @@ def problem_with_whitening_at(
     if any(m is None and e.input_errors is not None for m, e in zip(made, episodes, strict=True)):
         return problem
     found = problem.with_episodes(episodes, problem.held_out, made)
-    return found if rounds < 2 else problem_with_whitening_at(found, x, equilibrium_guesses, rounds - 1)
+    return found if rounds < 2 else problem_with_whitening_at(found, x, equilibrium_guesses, rounds=rounds - 1)
 
 
 def problem_with_held_out_kalman_whitening(
@@ -350,9 +356,10 @@ def problem_with_held_out_kalman_whitening(
     known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
     for held, (before, (own, theta, offset)) in zip(problem.held_out, known, strict=True):
         whitening, at = _own_filter(before), (theta, offset)
+        result = problem.predictor.predict_episode(own, *at, False) if own.input_errors else None
         if first := whitening is None:
-            own, whitening = _whitened_episode(problem.predictor, own, at, None, None)
-        own, whitening = _whitened_episode(problem.predictor, own, at, None, whitening, first and keep_weights)
+            own, whitening = _whitened_episode(problem.predictor, own, at, None, None, result)
+        own, whitening = _whitened_episode(problem.predictor, own, at, None, whitening, result, first and keep_weights)
         episodes.append(replace(held, input_errors=own.input_errors, equilibrium_guess=own.equilibrium_guess))
         made.append(whitening)
     return problem.with_episodes(problem.episodes, episodes, problem.whitening_filters, made)

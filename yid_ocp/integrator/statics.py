@@ -48,8 +48,10 @@ _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
 _NEWTON_ITERATION_LIMIT = 100
 _NEAR_GUESS = 0.1  # beyond this distance from a guess [rad or m], it may be another equilibrium
+_MAX_KNOWN_EQUILIBRIA = 8  # a problem asks for the same ones while it is built, checked and first evaluated
 _REST_TOLERANCE = 1e-10  # allowed imbalance [N m] and constraint violation [m]
 _ENERGY_ITERATION_LIMIT = 300  # iterations of the search for the lowest energy
+_Found = tuple[bool, float, float, Array]  # whether a search failed, energy, error and (q, z, forces)
 _MIN_RECIPROCAL_CONDITION = 1e-14  # smaller reciprocal condition numbers count as singular
 _MAX_HOLD_DEFLECTION = 0.02  # larger deflections of a holding spring mean a posture unfit for the grasp [rad]
 
@@ -73,6 +75,7 @@ class EquilibriumSolver:
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
         )
         potential = system.elastic_energy(e.q0) + e.rigid_body_terms.potential_energy + _servo_energy(system, e.u, e.q0)
+        self._least_energy: dict[bytes, _Found] = {}  # by the last searches without a guess
         self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.u, e.theta], [potential])
 
     @property
@@ -111,13 +114,14 @@ class EquilibriumSolver:
         held = np.zeros(nu) if torque is None else float_array_with_checked_shape("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness, np.where(_is_motor_off(system, held), _HOLD_STIFFNESS, 0.0))
         count, h = len(self.free_coordinates) + nz, step.clock_scaled_time_step(theta)
+        sought = b"" if guess is not None else np.concatenate([given, theta, held, [torque is None]]).tobytes()
 
         def equations(w: Array) -> tuple[Array, Array]:
             (value, by_point, *_), _ = self._rest_equations(w, theta, hold, h)
             return value[self._sought], by_point[np.ix_(self._sought, self._sought)]
 
-        best: tuple[bool, float, float, Array] | None = None
-        for start in self._guesses(given, guess):
+        best = self._least_energy.get(sought)
+        for start in () if best else self._guesses(given, guess):
             w, error, converged = self._near(equations, start) if guess is not None and m else (start, math.inf, False)
             if not converged:
                 w, error, converged = _damped_newton(equations, start, _REST_TOLERANCE)
@@ -134,6 +138,9 @@ class EquilibriumSolver:
             lowest = self._lowest_energy(theta, hold)
             if lowest is not None:
                 return self.solve(configuration, theta, torque, lowest, names)
+        if guess is None:
+            kept = [*self._least_energy.items()][1 - _MAX_KNOWN_EQUILIBRIA :]
+            self._least_energy = {**dict(kept), sought: best}
         q = self._configuration(w, given)
         give = hold.give(q, system)
         state, by_theta, by_posture = self._differentiate(w, theta, hold, h, tuple(names))

@@ -90,7 +90,7 @@ class EstimateChecks:
     expected_prediction_errors : mapping of recording to mapping of channel to float
         Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
     step_stability : mapping
-        Growth of alternating errors at the `start` of the search and at the `estimate`.
+        Growth of alternating errors at the `estimate`, and at the `start` of a search that failed.
     """
 
     data_std: Mapping[str, float] = field(default_factory=dict)
@@ -429,22 +429,32 @@ class _MultiStartSearch:
         self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
 
     def _no_better_minimum(self, x: Array, note: str) -> _Fit | None:
-        """The best fit, where under its weights a start leads to it or to a worse one; else None."""
+        """The best fit, where under its weights a start leads to it or to a worse one; else None.
+
+        A start that leads a little further down the same minimum is weighed anew from there.
+        """
         best, coarse = self._best, getattr(self._solver, "with_coarse_tolerances", None)
         if coarse is None or not (best.evaluation.ok and self._problem.has_process_noise):
             return None
-        near = _minimize_cost(coarse, best.weighted, x, _noting(self._callback, note))
+        noted = _noting(self._callback, note)
+        near = _minimize_cost(coarse, best.weighted, x, noted)
         cost, distance = (
             near.history[-1].cost if near.history else 0.0,
             _stds_apart(best.evaluation, near.x - best.result.x),
         )
-        is_worse = cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
-        # along an unknown that the data hardly inform the better end counts
-        is_same = distance < _SAME_MINIMUM_STDS and cost > best.evaluation.cost - _MIN_COST_GAIN_OF_START
-        if near.status == Status.FAILED or not (is_worse or is_same or near.stopped_by_callback):
+        is_same = distance < _SAME_MINIMUM_STDS
+        # along an unknown that the data hardly inform the better end counts, beyond the solver's own tolerance
+        least = max(_MIN_COST_GAIN_OF_START, getattr(self._solver, "cost_tolerance", 0.0) * best.evaluation.cost)
+        is_no_better = is_same and cost > best.evaluation.cost - least
+        is_no_better |= cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
+        if near.status == Status.FAILED or not (is_same or is_no_better or near.stopped_by_callback):
             return None
-        same = replace(best.result, stopped_by_callback=near.stopped_by_callback)
-        return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
+        if is_no_better or near.stopped_by_callback:
+            same = replace(best.result, stopped_by_callback=near.stopped_by_callback)
+            return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
+        again = _fit_from(best.weighted, self._solver, near.x, noted, self._fits)
+        count, history = near.n_evaluations + again.n_evaluations, [*near.history, *again.history]
+        return replace(again, n_evaluations=count, history=history)
 
     def solution(self, limits: ExcessResidualCriteria, verdicts: bool) -> Solution:
         """Solution of the best fit, with its uncertainty."""
@@ -504,9 +514,9 @@ def _fit_from(
 ) -> _Fit:
     """The fit from one start, with shorter horizons first if the rollout fails there."""
     history: list[Iterate] = []
-    evaluations, first = 0, problem.evaluate(x, False) if getattr(solver, "needs_rollout", True) else None
-    warm = first.equilibrium_guesses or None if first is not None and first.ok else None
-    if first is not None and not first.ok:
+    evaluations, known_at_x = 0, problem.evaluate(x, False) if getattr(solver, "needs_rollout", True) else None
+    warm = known_at_x.equilibrium_guesses or None if known_at_x is not None and known_at_x.ok else None
+    if known_at_x is not None and not known_at_x.ok:
         longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
         for fraction in _HORIZON_FRACTIONS:
             note = f"first {fraction * longest:.3g} s"
@@ -521,24 +531,28 @@ def _fit_from(
                 continue
             x, evaluations = part.x, evaluations + part.n_evaluations
             history += [replace(entry, note=note) for entry in part.history]
-            if problem.evaluate(x, derivatives=False).ok:
+            known_at_x = problem.evaluate(x, derivatives=False)
+            if known_at_x.ok:
                 break
     passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
-    weighted = problem
+    weighted, is_weighted = problem, any(problem.whitening_filters)
     for number in range(passes):
-        weighted = problem_with_whitening_at(weighted, x, warm) if passes > 1 else problem
+        predictions = () if known_at_x is None else known_at_x.episode_predictions
+        weighted = problem_with_whitening_at(weighted, x, warm, predictions) if passes > 1 else problem
         noted = _noting(callback, f"pass {number + 1} of at most {passes}" if passes > 1 else "")
         begun, coarse = x, getattr(solver, "with_coarse_tolerances", solver) if passes > 1 else solver
         for own in (solver,) if coarse == solver else (coarse, solver):
             result = _minimize_cost(own, weighted, x, noted)
             x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
-            history += result.history
+            known_at_x, history = result.evaluation, [*history, *result.history]
             moved = _stds_apart(result.evaluation, x - begun)
             # far from its end a pass need not be exact, as the next one weighs anew
             if result.stopped_by_callback or (moved > _SAME_MINIMUM_STDS and number < passes - 1):
                 break
-        # the second pass is the first about torque offsets that are not guessed
-        if (number and (len(result.history) < 2 or moved < _SAME_FIT_STDS)) or result.stopped_by_callback:
+        # the first weights are about torque offsets that are guessed
+        if (
+            (number or is_weighted) and (len(result.history) < 2 or moved < _SAME_FIT_STDS)
+        ) or result.stopped_by_callback:
             break
         # a search that reaches a known fit is not whitened again
         if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
