@@ -339,6 +339,12 @@ ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = YAML(typ="safe").load(Path(__file_
 SensorOptionsLookup = Callable[[str], SensorOptions]
 
 
+def mean_sample_rate(t: Array) -> float:
+    """Mean sample rate [Hz] of the times `t` [s]; NaN for fewer than two samples."""
+    span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
+    return (len(t) - 1) / span if span > 0 else math.nan
+
+
 def median_sample_period(t: Array) -> float:
     """Median time between samples at the times `t` [s], or zero for fewer than two samples."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import median_sample_period
-from yid_ocp.data.readers.base import mean_sample_rate, merge_on_fastest_clock
+from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period
+from yid_ocp.data.readers.base import merge_on_fastest_clock
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 

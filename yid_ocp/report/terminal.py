@@ -8,18 +8,19 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS
-from yid_ocp.data.readers import FilePreview
-from yid_ocp.data.readers.base import mean_sample_rate
+from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     goodness_of_fit_message,
     value_and_uncertainty_text,
 )
 from yid_ocp.sensors.base import channel_kinds_for_group_name
+
+if TYPE_CHECKING:
+    from yid_ocp.data.readers import FilePreview
 
 TableRows = list[Sequence[str]]
 _StatementKind = Literal["note", "verdict", "conclusion"]

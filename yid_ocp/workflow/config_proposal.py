@@ -11,9 +11,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import white_noise_std
+from yid_ocp.data.channel_checks import mean_sample_rate, white_noise_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
-from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model import Mechanism, Segment

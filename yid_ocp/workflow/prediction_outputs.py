@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import h5py
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
-from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.inference import whitening
 from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
@@ -23,6 +22,9 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.solvers import Solution
 from yid_ocp.solvers.base import EpisodeAndPrediction
+
+if TYPE_CHECKING:
+    from yid_ocp.diagnosis import DiagnosisResult
 
 
 def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:

@@ -234,12 +234,6 @@ def import_optional(module: str, extra: str, what: str) -> Any:
         raise missing_package_error(DataError, what, extra) from error
 
 
-def mean_sample_rate(t: Array) -> float:
-    """Mean sample rate [Hz] of the times `t` [s]; NaN for fewer than two samples."""
-    span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
-    return (len(t) - 1) / span if span > 0 else math.nan
-
-
 def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
     """Guess the units of values that cannot be in SI units. Returns the units, and the reasons as sentences."""
     units: dict[str, str] = {}

@@ -17,6 +17,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
+from yid_ocp.data.channel_checks import mean_sample_rate
 from yid_ocp.data.foreign_formats import column_meanings, mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
@@ -169,7 +170,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
         group, _, remarks = capture
-        count, rate = np.isfinite(group.position).all(axis=2).sum(axis=0), base.mean_sample_rate(group.t)
+        count, rate = np.isfinite(group.position).all(axis=2).sum(axis=0), mean_sample_rate(group.t)
         listed = zip(group.names, count, strict=True)
         kept = (base.TopicOrColumnSummary(name, "marker", int(n), rate, f"point {name}") for name, n in listed)
         return base.FilePreview(tuple(kept), {}, remarks)
@@ -214,7 +215,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
         becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out: its name says nothing"
-        rate = base.mean_sample_rate(t) if ok else math.nan
+        rate = mean_sample_rate(t) if ok else math.nan
         sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
     notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.diagnosis import DiagnosisResult
-from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
 from yid_ocp.inference.null_test import residual_channels
@@ -20,6 +18,9 @@ from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
 from yid_ocp.report.terminal import format_error_value_and_unit, scale_and_unit_with_metres_as_mm
+
+if TYPE_CHECKING:
+    from yid_ocp.diagnosis import DiagnosisResult
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
 _MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
@@ -186,6 +187,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
 
 def _events(finding: DiagnosisResult) -> _Chapter | None:
+    from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages  # other commands need none of it
+
     events = finding.events
     if not events:
         return None
