@@ -29,11 +29,13 @@ from make_recordings import TRAVEL, TRUTH
 
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import scale_parameters_to_more_links
 from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict, judge_recorded_case
+from yid_ocp.diagnosis.diagnose import diagnose
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.files import make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem

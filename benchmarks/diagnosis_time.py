@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
-from yid_ocp.diagnosis import diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build_problem import build_problem
 

@@ -20,7 +20,8 @@ from statistics import median
 from typing import Any
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.diagnosis import DiagnosisResult, diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import ForceOrFaultEvent
 from yid_ocp.workflow.build_problem import build_problem
 

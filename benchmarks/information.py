@@ -33,7 +33,9 @@ from planning import PlannedMovement
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording, SensorChannelGroup
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import make_effect
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions

@@ -28,7 +28,7 @@ from make_recordings import TRAVEL, TRUTH
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis import diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.effects.base import elastic_joints_within_segment
 from yid_ocp.problem import EstimationProblem

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from yid_ocp.data import read_any as read_any
     from yid_ocp.data import read_recording as read_recording
     from yid_ocp.data import write_recording as write_recording
-    from yid_ocp.diagnosis import DiagnosisResult as DiagnosisResult
-    from yid_ocp.diagnosis import diagnose as diagnose
+    from yid_ocp.diagnosis.diagnose import diagnose as diagnose
+    from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult as DiagnosisResult
     from yid_ocp.errors import YidError as YidError
     from yid_ocp.integrator.step import compile_step as compile_step
     from yid_ocp.integrator.step import simulate as simulate
@@ -49,7 +49,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.what_if": ("what_if",),
     "config.reader": ("load_config",),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
-    "diagnosis": ("DiagnosisResult", "diagnose"),
+    "diagnosis.diagnose": ("diagnose",),
+    "diagnosis.diagnosis_result": ("DiagnosisResult",),
     "errors": ("YidError",),
     "integrator.step": ("compile_step", "simulate"),
     "model": ("Grasp", "Segment", "System", "flexible_object"),

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.config.settings import DiagnosisSettings, ProblemSettings, config_yaml_with_defaults
-from yid_ocp.diagnosis import Thresholds
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.objects.cable import Cable, CableOptions
 from yid_ocp.problem import ProblemOptions, SensorOptions

@@ -9,7 +9,8 @@ import pytest
 from factories import cases
 from small_problems import swinging_pendulum
 
-from yid_ocp.diagnosis import diagnose, hypotheses
+from yid_ocp.diagnosis import hypotheses
+from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedHeldOutRecording
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 

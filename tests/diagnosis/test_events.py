@@ -12,7 +12,7 @@ from factories import FORCE, smoothed, trace
 from small_problems import joints, places, recording, seen
 
 from yid_ocp.data.recording import Recording, SensorChannelGroup
-from yid_ocp.diagnosis import diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.events import (
     EventSet,
     ForceOrFaultEvent,

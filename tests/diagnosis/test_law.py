@@ -7,7 +7,8 @@ import scipy.interpolate
 from small_problems import H, assert_slopes_are_those_of_differences, joints, pendulum_step, recording, torque_function
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.law import (
     TorqueLawTable,
     make_torque_law,

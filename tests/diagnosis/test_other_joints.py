@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf

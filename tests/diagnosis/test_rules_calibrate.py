@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import CaseGroundTruth
 from yid_ocp.diagnosis.blind_scores import (
     _CALIBRATION_FORMAT,
@@ -21,7 +20,7 @@ from yid_ocp.diagnosis.blind_scores import (
     permissive_thresholds,
     score_blind_case,
 )
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.virtual.injected import InjectedEffect
 
 DAMPER = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})

@@ -4,7 +4,8 @@ from dataclasses import fields
 
 import pytest
 
-from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.options import dataclass_options
 
 KIND = "joint_coulomb@elbow"

@@ -11,8 +11,7 @@ from factories import cases
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis import diagnose
-from yid_ocp.diagnosis.diagnose import _held_out_null_test, fit_nominal_model
+from yid_ocp.diagnosis.diagnose import _held_out_null_test, diagnose, fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from pendulum_bench import Bench
 
-from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
 from yid_ocp.errors import YidError
 from yid_ocp.integrator.step import step_with_time_step

@@ -19,9 +19,10 @@ import numpy as np
 import plotly.offline
 import pytest
 
-from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
 from yid_ocp.report.html import _plotly_script, _shared_script, write_report, write_shared_plotly_script

@@ -17,9 +17,10 @@ from yid_ocp.analysis.estimate_history import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
-from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
-from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel
+from yid_ocp.diagnosis.diagnose import diagnose
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError

@@ -24,7 +24,7 @@ from yid_ocp.solvers import Solution
 from yid_ocp.solvers.base import EpisodeAndPrediction
 
 if TYPE_CHECKING:
-    from yid_ocp.diagnosis import DiagnosisResult
+    from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 
 
 def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:

@@ -20,7 +20,7 @@ from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_r
 from yid_ocp.report.terminal import format_error_value_and_unit, scale_and_unit_with_metres_as_mm
 
 if TYPE_CHECKING:
-    from yid_ocp.diagnosis import DiagnosisResult
+    from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
 _MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
