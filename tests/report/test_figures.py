@@ -6,6 +6,7 @@ import json
 
 import casadi as ca
 import numpy as np
+import plotly.graph_objects as go
 import pytest
 import trimesh
 from matplotlib.figure import Figure
@@ -286,7 +287,7 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path):
 
 def test_values_of_very_different_sizes_get_a_logarithmic_axis():
     def drawn(**rows):
-        return figures.parameter_values_by_source_figure(rows, "x [m]", {"2": "#000000"})
+        return go.Figure(figures.parameter_values_by_source_figure(rows, "x [m]", {"2": "#000000"}))
 
     close = drawn(a={"1": (2.0, None), "2": (1.0, None)}, b={"1": (3.0, None), "3": (1.0, None)})
     far = drawn(a={"1": (20.0, None), "2": (0.1, None)})
@@ -303,7 +304,7 @@ def test_values_of_very_different_sizes_get_a_logarithmic_axis():
 def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
     values = np.array([1.0, np.nan, -4000.0])
     rows = [TimeHeatMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
-    figure = figures.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
+    figure = go.Figure(figures.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations"))
     [heat] = figure.data
     assert (heat.z[0][1], len(heat.x), "1000" in heat.colorbar.ticktext) == (None, 4, True)
     assert heat.zmax == -heat.zmin > 0
@@ -314,17 +315,17 @@ def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
 def test_a_ranking_says_what_lies_beyond_its_axis():
     untried = {"untried": (None, 0.5)}
     entries = {"good": ((90.0, 80.0, 95.0), 88.0), "bad": ((-900.0, -2000.0, -100.0), 1.0)} | untried
-    figure = figures.candidate_ranking_figure(entries, "closed [%]", "promised [%]")
+    figure = go.Figure(figures.candidate_ranking_figure(entries, "closed [%]", "promised [%]"))
     assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
     assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
-    alone = figures.candidate_ranking_figure(untried, "closed", "promised")
+    alone = go.Figure(figures.candidate_ranking_figure(untried, "closed", "promised"))
     assert [trace.type for trace in alone.data] == ["bar"]
 
 
 def test_bands_and_spans_are_shaded():
     t = np.linspace(0, 3, 31)
     plots = [TimePlotData("a", {"line": (t, t)}, t, t, 0.2, [(1.0, 2.0)])]
-    band, span = figures.time_plots_figure(plots, "#000000", {"line": "blue"}).layout.shapes
+    band, span = go.Figure(figures.time_plots_figure(plots, "#000000", {"line": "blue"})).layout.shapes
     assert (band.y0, band.y1, span.x0, span.x1) == (-0.2, 0.2, 1.0, 2.0)
 
 
@@ -333,12 +334,12 @@ def test_long_curves_are_thinned_and_gaps_stay():
     measured = np.sin(t)
     measured[:10_000] = np.nan
     plots = figures.prediction_and_residual_plots("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)})
-    figure = figures.time_plots_figure(plots)
+    figure = go.Figure(figures.time_plots_figure(plots))
     assert max(len(trace.x) for trace in figure.data) <= figures._MAX_CURVE_POINTS
     assert np.isnan(figure.data[0].y[0])
 
 
 def test_cost_history_has_a_curve_for_each_horizon():
-    figure = figures.solution_cost_history_figure([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
+    figure = go.Figure(figures.solution_cost_history_figure([5.0, 3.0, 9.0, 2.0], ["first 1 s"] * 2 + ["", ""]))
     assert [trace.name for trace in figure.data] == ["first 1 s", "whole recordings"]
     assert [list(trace.x) for trace in figure.data] == [[0, 1], [2, 3]]

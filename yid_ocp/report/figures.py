@@ -1,19 +1,23 @@
-"""Plotly figures of the report: over time, curves, and one row per name. They need the extra `report`."""
+"""Plotly figures of the report: over time, curves, and one row per name.
+
+A figure is plain data, the traces `data` and the `layout`, as plotly's script reads it; plotly's Python objects take
+longer to make than all else of a page.
+"""
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.arrays import Array
+from yid_ocp.files import to_json_types
 from yid_ocp.report.terminal import scale_and_unit_with_metres_as_mm
-
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
 
 # on a dark page, templates/dark.json maps each color; figures use no other colors
 _TEXT_COLOR, _GRID_COLOR, _BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
@@ -40,44 +44,66 @@ _LAYOUT: dict[str, Any] = {
 }
 _MIN_CLOSURE_PERCENT = -50.0  # lower end of an axis of closures [%]
 _Curve = tuple[Sequence[float], Sequence[float]]
+_Figure = dict[str, Any]
 
 
 def _line_color(i: int) -> str:
     return LINE_COLORS[i % len(LINE_COLORS)]
 
 
-def figure_html(figure: Figure) -> str:
+def figure_html(figure: _Figure) -> str:
     """Convert a figure to an HTML element. The page's script draws it in light or dark colors."""
-    figure.update_layout(template=None)  # all settings are given here; the default template adds kilobytes
-    told = str(figure.to_json()).replace("<", "\\u003c")
+    told = json.dumps(_plotly_json(figure), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     script = f'<script type="application/json">{told}</script>'
-    return f'<div class="plot" style="height:{figure.layout.height}px">{script}</div>'
+    return f'<div class="plot" style="height:{figure["layout"]["height"]}px">{script}</div>'
 
 
-def _styled_figure(height: int, x: str, y: str, base: Figure | None = None) -> Figure:
-    """A plotly figure (`base` or a new one) with height [px], axis titles, and the report's colors and fonts."""
-    import plotly.graph_objects as go
+def _plotly_json(value: Any) -> Any:
+    """JSON data of a figure, with arrays as plotly's script reads them: base64, with their type."""
+    if isinstance(value, Mapping):
+        return {key: _plotly_json(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return {"dtype": value.dtype.str[1:], "bdata": base64.b64encode(value.tobytes()).decode("ascii")}
+    return [*map(_plotly_json, value)] if isinstance(value, (list, tuple, range)) else to_json_types(value)
 
-    figure = go.Figure() if base is None else base
-    figure.update_layout(_LAYOUT, height=height)
-    figure.update_xaxes(title_text=x or None, **_AXIS_STYLE)
-    figure.update_yaxes(title_text=y or None, **_AXIS_STYLE)
+
+def _styled_figure(height: int, x: str, y: str) -> _Figure:
+    """A figure with height [px], axis titles, and the report's colors and fonts."""
+    axes = {f"{name}axis": {"title": {"text": title}, **_AXIS_STYLE} for name, title in (("x", x), ("y", y))}
+    return {"data": [], "layout": {**_LAYOUT, "height": height, **axes, "shapes": [], "annotations": []}}
+
+
+def _add_trace(figure: _Figure, kind: str = "scatter", /, **trace: Any) -> _Figure:
+    figure["data"].append({"type": kind, **trace})
     return figure
 
 
-def _add_curves(figure: Figure, curves: Iterable[tuple[str, _Curve]], later_dash: str = "solid") -> Figure:
+def _set_axis(figure: _Figure, name: str, /, **settings: Any) -> _Figure:
+    """Change settings of the axis `name`, such as `xaxis`."""
+    figure["layout"][name].update(settings)
+    return figure
+
+
+def _add_line(figure: _Figure, axis: str, value: float, **line: Any) -> None:
+    """Add a line over the whole width or height at a value of `axis`, x or y."""
+    other = "x" if axis == "y" else "y"
+    at = {f"{axis}0": value, f"{axis}1": value, f"{axis}ref": axis, f"{other}0": 0, f"{other}1": 1}
+    figure["layout"]["shapes"].append({"type": "line", **at, f"{other}ref": f"{other} domain", "line": line})
+
+
+def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]], later_dash: str = "solid") -> _Figure:
     """Add one line with markers per name and (x, y), each in its own color; `later_dash` once colors repeat."""
     for i, (name, (x, y)) in enumerate(curves):
         line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_COLORS) else later_dash}
         if len(x):
-            figure.add_scatter(x=list(x), y=list(y), mode="lines+markers", name=name, line=line)
+            _add_trace(figure, x=list(x), y=list(y), mode="lines+markers", name=name, line=line)
     return figure
 
 
-def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
+def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> _Figure:
     """Plot the cost of every accepted iterate, with one curve per intermediate horizon."""
     figure = _styled_figure(320, "accepted point", "cost")
-    figure.update_yaxes(**_POWERS)
+    _set_axis(figure, "yaxis", **_POWERS)
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
     spans = zip([0, *ends], ends, strict=False)
     return _add_curves(figure, ((notes[i] or "whole recordings", (range(i, j), costs[i:j])) for i, j in spans))
@@ -126,18 +152,15 @@ def prediction_and_residual_plots(
 
 def time_plots_figure(
     curves: Sequence[TimePlotData], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
-) -> Figure:
+) -> _Figure:
     """Plot measured points and lines over time, one row per plot.
 
     `dots` is the color of measured points. `lines` maps line names to colors (default: the palette, in order).
     """
-    import plotly.graph_objects as go
-
     names = dict.fromkeys(name for curve in curves for name in curve.lines)
     colors = lines or {name: _line_color(i) for i, name in enumerate(names)}
     heights = [_LOW_ROW_HEIGHT if curve.is_low_row else _ROW_HEIGHT for curve in curves]
     inner = sum(heights) + _ROW_GAP * (len(curves) - 1)
-    # all traces at once, because plotly validates the whole figure after each added trace
     axes: dict[str, Any] = {}
     traces, shapes, titles = list[dict[str, Any]](), list[dict[str, Any]](), list[dict[str, Any]]()
     told: set[str] = set()
@@ -169,10 +192,13 @@ def time_plots_figure(
         titles.append({**_axis_title(curve.axis_title, top), "font": {"size": 12}})
         top -= (height + _ROW_GAP) / inner
     axes[f"xaxis{last}"]["title"] = {"text": "time [s]"}
-    figure = go.Figure(traces, {**_LAYOUT, **axes, "shapes": shapes, "annotations": titles})
     margin = {"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN}
     height = inner + _TOP_MARGIN + _BOTTOM_MARGIN
-    return figure.update_layout(height=height, margin=margin, legend_y=1 + 22 / inner)
+    legend, around = {**_LAYOUT["legend"], "y": 1 + 22 / inner}, {"shapes": shapes, "annotations": titles}
+    return {
+        "data": traces,
+        "layout": {**_LAYOUT, **axes, **around, "height": height, "margin": margin, "legend": legend},
+    }
 
 
 def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along_time: bool = False) -> dict[str, Any]:
@@ -187,22 +213,23 @@ def _axis_title(text: str, y: float) -> dict[str, Any]:
     return {"text": text, "showarrow": False, **at}
 
 
-def lines_over_time_figure(curve: TimePlotData) -> Figure:
+def lines_over_time_figure(curve: TimePlotData) -> _Figure:
     """Plot the lines of one plot, each in its own color."""
     figure = _styled_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
         dash = _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]
         style = {"color": _line_color(i), "width": 1.5, "dash": dash}
-        figure.add_scatter(**_thinned(t, value), mode="lines", name=name, line=style)
+        _add_trace(figure, **_thinned(t, value), mode="lines", name=name, line=style)
     if curve.band_half_height is not None:
-        figure.add_shape(_shade("", (0, 1), (-curve.band_half_height, curve.band_half_height)))
+        figure["layout"]["shapes"].append(_shade("", (0, 1), (-curve.band_half_height, curve.band_half_height)))
     # the legend below takes as many rows as the screen is narrow
     below = {"orientation": "h", "y": -0.22, "yanchor": "top", "x": 0, "font": {"size": 11}}
-    figure.update_layout(legend=below, margin={"t": 30})
-    return figure.add_annotation(_axis_title(curve.axis_title, 1), font={"size": 12})
+    title = {**_axis_title(curve.axis_title, 1), "font": {"size": 12}}
+    figure["layout"] |= {"legend": below, "annotations": [title]}
+    return figure
 
 
-def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure:
+def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> _Figure:
     """Plot a histogram of whitened residuals per sensor group, with the standard normal density."""
     figure = _styled_figure(340, "residual in standard deviations", "density")
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
@@ -211,17 +238,17 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure
         density, _ = np.histogram(np.clip(values, -edge, edge), bins=bins, density=True)
         steps = {"x": (0.5 * (bins[1:] + bins[:-1])).tolist(), "y": density.tolist()}
         line = {"color": _line_color(i), "shape": "hvh"}
-        figure.add_scatter(**steps, mode="lines", line=line, name=f"{name} ({len(values)} values)")
+        _add_trace(figure, **steps, mode="lines", line=line, name=f"{name} ({len(values)} values)")
     even = np.linspace(-edge, edge, 121)
     normal = {"x": even.tolist(), "y": (np.exp(-0.5 * even**2) / np.sqrt(2 * np.pi)).tolist()}
     line = {"color": _TEXT_COLOR, "dash": "dot"}
-    return figure.add_scatter(**normal, mode="lines", line=line, name="standard normal")
+    return _add_trace(figure, **normal, mode="lines", line=line, name="standard normal")
 
 
-def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> Figure:
+def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
     """Plot each method's relative excess cost over wall time, from (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
-    figure.update_yaxes(**_POWERS)
+    _set_axis(figure, "yaxis", **_POWERS)
     least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}
     excess = {name: (t, [max(c / least[name] - 1, 1e-9) for c in cost]) for name, (t, cost) in costs.items()}
     return _add_curves(figure, excess.items())
@@ -233,37 +260,39 @@ def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: S
     return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
 
 
-def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> Figure:
+def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Figure:
     """Plot the increase of chi2 over the parameter's value relative to the estimate (profile likelihood)."""
     figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items(), "dash")
-    figure.add_hline(y=level, line={"color": _TEXT_COLOR, "dash": "dot"}, annotation_text="95 %")
-    figure.update_xaxes(type="log", range=[-1.0, 1.0])
-    return figure.update_yaxes(range=[-0.2, 2.5 * level])
+    _add_line(figure, "y", level, color=_TEXT_COLOR, dash="dot")
+    at = {"x": 1, "xref": "x domain", "xanchor": "right", "y": level, "yref": "y", "yanchor": "bottom"}
+    figure["layout"]["annotations"].append({"text": "95 %", "showarrow": False, **at})
+    _set_axis(figure, "xaxis", type="log", range=[-1.0, 1.0])
+    return _set_axis(figure, "yaxis", range=[-0.2, 2.5 * level])
 
 
-def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> Figure:
+def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> _Figure:
     """Plot points by name at (x, y)."""
     figure = _styled_figure(340, x, y)
     for i, (name, (across, up)) in enumerate(clouds.items()):
         points = {"x": np.asarray(across, np.float32), "y": np.asarray(up, np.float32)}
-        figure.add_scatter(**points, mode="markers", name=name, marker={"size": 3, "color": _line_color(i)})
+        _add_trace(figure, **points, mode="markers", name=name, marker={"size": 3, "color": _line_color(i)})
     return figure
 
 
 def estimated_curve_figure(
     curve: tuple[Array, Array, Array], others: Mapping[str, Array], visited: tuple[float, float], x: str, y: str
-) -> Figure:
+) -> _Figure:
     """Plot a curve (x, y, std) with a band of two stds, `others` as dashed lines, and lines at the `visited` x."""
     figure, (at, middle, std) = _styled_figure(340, x, y), curve
     edges = np.concatenate([middle + 2 * std, (middle - 2 * std)[::-1]])
     band = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False, "opacity": 0.25}
-    figure.add_scatter(x=[*at, *at[::-1]], y=list(edges), mode="lines", fillcolor=AFTER_COLOR, **band)
-    figure.add_scatter(x=list(at), y=list(middle), mode="lines", name="law", line={"color": AFTER_COLOR})
+    _add_trace(figure, x=[*at, *at[::-1]], y=list(edges), mode="lines", fillcolor=AFTER_COLOR, **band)
+    _add_trace(figure, x=list(at), y=list(middle), mode="lines", name="law", line={"color": AFTER_COLOR})
     for i, (name, values) in enumerate(others.items()):
         line = {"color": _line_color(i + 1), "dash": "dash"}
-        figure.add_scatter(x=list(at), y=list(values), mode="lines", name=name, line=line)
+        _add_trace(figure, x=list(at), y=list(values), mode="lines", name=name, line=line)
     for edge in visited:
-        figure.add_vline(x=edge, line={"color": _TEXT_COLOR, "dash": "dot"})
+        _add_line(figure, "x", edge, color=_TEXT_COLOR, dash="dot")
     return figure
 
 
@@ -277,7 +306,7 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
 
 def parameter_values_by_source_figure(
     rows: Mapping[str, Mapping[str, tuple[float, float | None]]], axis: str, colors: Mapping[str, str] | None = None
-) -> Figure:
+) -> _Figure:
     """Plot values ± 2 std from several sources, with one row per name and one color per source (default: palette)."""
     sources = list(dict.fromkeys([*(colors or ()), *(source for row in rows.values() for source in row)]))
     names = list(rows)
@@ -291,30 +320,33 @@ def parameter_values_by_source_figure(
         places = [k + spread * (i - (len(sources) - 1) / 2) for k, *_ in own]
         points = {"x": [value for _, value, _ in own], "y": places, "error_x": bars, "name": source}
         if own:
-            figure.add_scatter(**points, mode="markers", marker={"color": color, "size": 8, "symbol": symbol})
+            _add_trace(figure, **points, mode="markers", marker={"color": color, "size": 8, "symbol": symbol})
     numbers = [value for row in rows.values() for value, _ in row.values()]
     low, high = min([0.0, *numbers]), max([0.0, *numbers])
     if numbers and min(numbers) > 0 and high > 30 * min(numbers):
-        figure.update_xaxes(**_POWERS, dtick="D2" if high < 1e3 * min(numbers) else 1)
+        _set_axis(figure, "xaxis", **_POWERS, dtick="D2" if high < 1e3 * min(numbers) else 1)
     else:
         # bars of undetermined parameters would compress all others
-        figure.update_xaxes(range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
+        _set_axis(figure, "xaxis", range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
     ends = [len(names) - 0.5, -0.5]
-    return figure.update_yaxes(tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
+    return _set_axis(figure, "yaxis", tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
 
 
-def confusability_matrix_figure(names: Sequence[str], values: Array) -> Figure:
+def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
     """Plot a heat map of explained fractions (n, n) in per cent: how much of the row the column explains."""
     figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
-    figure.add_heatmap(
-        x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
+    _add_trace(
+        figure, "heatmap", x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False,
+        xgap=1, ygap=1,
         colorscale=_SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
         hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>",
         text=[[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values],
     )  # fmt: skip
-    every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
-    figure.update_xaxes(tickangle=-40, tickvals=list(names), **every)
-    return figure.update_yaxes(autorange="reversed", tickvals=list(names), **every)
+    every = {"type": "category", "tickmode": "array", "showgrid": False, "automargin": True}
+    for name in ("xaxis", "yaxis"):
+        figure["layout"][name]["title"]["standoff"] = 6
+    _set_axis(figure, "xaxis", tickangle=-40, tickvals=list(names), **every)
+    return _set_axis(figure, "yaxis", autorange="reversed", tickvals=list(names), **every)
 
 
 @dataclass(frozen=True)
@@ -327,7 +359,7 @@ class TimeHeatMapRow:
     hover_texts: Sequence[str]  # J
 
 
-def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> Figure:
+def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> _Figure:
     """Plot a heat map over intervals with edges (J + 1,) [s], one row per quantity. Grey: no information.
 
     `axis` is the title of the color scale.
@@ -340,24 +372,25 @@ def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str
     marks = sorted({-m for m in marks} | set(marks))
     bar = {"thickness": 14, "x": 1.2, "tickvals": _even(marks).tolist(), "ticktext": [str(m) for m in marks]}
     figure = _styled_figure(120 + max(17 * len(rows), 100), "time [s]", "")
-    figure.add_heatmap(
-        x=edges.tolist(), y=list(range(len(rows))),
+    _add_trace(
+        figure, "heatmap", x=edges.tolist(), y=list(range(len(rows))),
         z=[[v if np.isfinite(v) else None for v in row.tolist()] for row in _even(values)],
         text=[list(row.hover_texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
         colorscale=_DIVERGING_COLORS, colorbar=bar,
     )  # fmt: skip
-    figure.update_layout(plot_bgcolor=_GRID_COLOR, margin={"r": 150, "t": 40})
-    figure.add_annotation(**_axis_title(f"color: {axis}", 1))
-    figure.update_xaxes(showgrid=False, range=[float(edges[0]), float(edges[-1])])
+    figure["layout"] |= {"plot_bgcolor": _GRID_COLOR, "margin": {**_LAYOUT["margin"], "r": 150, "t": 40}}
+    labels = [_axis_title(f"color: {axis}", 1)]
+    _set_axis(figure, "xaxis", showgrid=False, range=[float(edges[0]), float(edges[-1])])
     ticks = {"tickvals": list(range(len(rows))), "ticktext": [row.name for row in rows], "tickfont": {"size": 11}}
-    figure.update_yaxes(showgrid=False, range=[len(rows) - 0.5, -0.5], automargin=True, **ticks)
+    _set_axis(figure, "yaxis", showgrid=False, range=[len(rows) - 0.5, -0.5], automargin=True, **ticks)
     groups = [row.group for row in rows]
     for group in dict.fromkeys(groups):
         own = [i for i, entry in enumerate(groups) if entry == group]
         at = {"x": 1.01, "xref": "paper", "y": (own[0] + own[-1]) / 2, "xanchor": "left"}
-        figure.add_annotation(text=group, showarrow=False, font={"size": 11}, **at)
+        labels.append({"text": group, "showarrow": False, "font": {"size": 11}, **at})
         if own[0]:
-            figure.add_hline(y=own[0] - 0.5, line={"color": _TEXT_COLOR, "width": 1})
+            _add_line(figure, "y", own[0] - 0.5, color=_TEXT_COLOR, width=1)
+    figure["layout"]["annotations"] = labels
     return figure
 
 
@@ -367,33 +400,34 @@ def _even(value: Any) -> Any:
 
 def candidate_ranking_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, predicted: str
-) -> Figure:
+) -> _Figure:
     """Plot each candidate's gap closure after a refit [%], with interval, and the decrease that screening predicts.
 
     `entries` maps each label to (closure, low, high), or None without a refit, and the decrease. `closed` and
     `predicted` are the titles of the two axes.
     """
-    from plotly.subplots import make_subplots
-
     done = {name: closure for name, (closure, _) in entries.items() if closure}
-    last = 2 if done else 1
-    figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
-    figure = _styled_figure(100 + 28 * len(entries), "", "", base=figure)
+    last, names = "2" if done else "", list(entries)[::-1]
+    figure = _styled_figure(100 + 28 * len(entries), predicted, "")
+    rows = {"type": "category", "categoryarray": names, "categoryorder": "array", "automargin": True}
+    _set_axis(figure, "yaxis", **rows, range=[-0.6, len(entries) - 0.4])
     bars = {"x": [decrease for _, decrease in entries.values()], "y": list(entries), "orientation": "h", "width": 0.55}
-    figure.add_bar(**bars, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last)
-    figure.update_xaxes(title_text=predicted, rangemode="tozero", row=1, col=last)
+    bars |= {"xaxis": f"x{last}", "yaxis": f"y{last}", "marker": {"color": LINE_COLORS[1]}}
+    _add_trace(figure, "bar", **bars, showlegend=False)
+    _set_axis(figure, "xaxis", rangemode="tozero")
     if done:
+        layout = figure["layout"]
+        layout["xaxis2"] = {**layout["xaxis"], "domain": [0.54, 1], "anchor": "y2"}
+        layout["yaxis2"] = {**layout["yaxis"], "anchor": "x2", "matches": "y", "showticklabels": False}
         values, lows, highs = zip(*done.values(), strict=True)
         points = {"x": values, "y": list(done), "error_x": asymmetric_error_bars(values, lows, highs)}
         marker = {"color": LINE_COLORS[0], "size": 11}
-        figure.add_scatter(**points, mode="markers", marker=marker, showlegend=False, row=1, col=1)
+        _add_trace(figure, **points, mode="markers", marker=marker, showlegend=False, xaxis="x", yaxis="y")
         # a worse prediction has no lower limit of closure
         left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6
-        figure.update_xaxes(title_text=closed, range=[left, 108], row=1, col=1)
-        figure.add_vline(x=0, line={"color": _TEXT_COLOR, "width": 1}, row=1, col=1)
-        for name, (value, *_) in done.items():
-            if value < left:
-                text = f"◀ {value:.0f}"
-                figure.add_annotation(x=left, y=name, text=text, showarrow=False, xanchor="left", row=1, col=1)
-    names, ends = list(entries)[::-1], [-0.6, len(entries) - 0.4]
-    return figure.update_yaxes(type="category", categoryarray=names, categoryorder="array", automargin=True, range=ends)
+        layout["xaxis"] = {"title": {"text": closed}, **_AXIS_STYLE, "range": [left, 108], "domain": [0, 0.46]}
+        _add_line(figure, "x", 0, color=_TEXT_COLOR, width=1)
+        texts = {name: f"◀ {value:.0f}" for name, (value, *_) in done.items() if value < left}
+        at = {"x": left, "xanchor": "left", "xref": "x", "yref": "y", "showarrow": False}
+        layout["annotations"] += [{"y": name, "text": text, **at} for name, text in texts.items()]
+    return figure
