@@ -26,21 +26,16 @@ from yid_ocp.data.readers.base import (
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.files import attributes_by_name
+from yid_ocp.options import dataclass_options, mapping_value_type
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
 _LISTS = ("joint_topics", "joints")
-_MAPPINGS: Mapping[str, type] = {
-    "point_names": str,
-    "column_meanings": str,
-    "torque_constants": float,
-    "gear_ratios": float,
-    "clock_offsets": float,
-    "message_fields": str,
-}
-_SINGLE = [entry.name for entry in fields(ImportSettings) if entry.name not in (*_LISTS, *_MAPPINGS, "units")]
+_KINDS = {name: mapping_value_type(entry.type_hint) for name, entry in dataclass_options(ImportSettings).items()}
+_MAPPINGS = {name: kind for name, kind in _KINDS.items() if kind is not None and name != "units"}
+_SINGLE = [name for name, kind in _KINDS.items() if kind is None and name not in _LISTS]
 _FLAGS = {
     "joint_topics": "--joint-topic",
     "clock_offsets": "--clock-offset",
