@@ -173,7 +173,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
     assert {"recording.h5", "csv", "trajectory.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
     planned = read_recording(tmp_path / "out" / "recording.h5")
     np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
-    assert '<section id="information">' in (tmp_path / "out" / "report.html").read_text()
+    assert '<section id="plan">' in (tmp_path / "out" / "report.html").read_text()
     words = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result)))
     for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
