@@ -2,6 +2,7 @@
 
     python benchmarks/friction_laws.py [--laws NAME ...] [--seeds FIRST LAST] [--size usual | small] [--set KEY=VALUE]
                                        [--file FILE]
+    python benchmarks/friction_laws.py --effort [--seeds FIRST LAST]
 
 One geared joint with a pendulum (`configs/servo_pendulum.yaml`) follows 3 s of commands in MuJoCo, whose own solver
 holds and slides it: the size of its dry friction is set anew at every inner step (Dahl's law is a torque there). The
@@ -11,6 +12,9 @@ states, which count what half of the time step changes; those of noise alone sta
 neighbour is less likely by odds of 150 to 1, one parameter counting as one. `small` is three times what is detectable.
 Results are appended to FILE as lines of JSON, so that slices of seeds add up; the table is of all that is there.
 `--set` changes the settings of the fits, never of the recordings: such results need a FILE of their own.
+
+`--effort` compares CPU time and evaluations of `solve` with and without dry friction in the model, on recordings
+without it, with Coulomb friction and with load-dependent friction. The search begins at the published values.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import argparse
 import json
 import math
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -147,6 +152,28 @@ def examined(law: str, seed: int, size: str, changes: Sequence[str]) -> dict[str
     return {**kept, "chi2": chi2, "neighbour_chi2": other, "found": bool(found), "told": bool(told)}
 
 
+def effort(seeds: Sequence[int]) -> None:
+    """Print CPU time [s], evaluations and chi2 of `solve`, means over the seeds, by recording and law."""
+    print("| recording | law of the model | CPU [s] | evaluations | chi2 |\n|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for made in ("viscous", "coulomb", "load"):
+            rows: dict[str, list[tuple[float, float, float]]] = {}
+            for seed in seeds:
+                file = str(Path(folder) / f"{made}_{seed}.h5")
+                write_recording(recorded(seed, of_law(made)), file)
+                for law in ("viscous", "coulomb", "load"):
+                    run = settings(law, file, {})
+                    problem = build_problem(run)
+                    yid_ocp.solve(problem, run.solver)  # it compiles what the second one measures
+                    begun = time.process_time()
+                    found = yid_ocp.solve(problem, run.solver)
+                    own = time.process_time() - begun, found.n_evaluations, 2 * found.cost
+                    rows.setdefault(law, []).append(own)
+            for law, own_rows in rows.items():
+                cpu, evaluations, chi2 = np.mean(own_rows, axis=0)
+                print(f"| {made} | {law} | {cpu:.2f} | {evaluations:.1f} | {chi2:.0f} |")
+
+
 def main() -> int:
     """Run a slice, append it, and print the table of all that is there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -155,7 +182,11 @@ def main() -> int:
     parser.add_argument("--size", choices=("usual", "small"), default="usual")
     parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="of the fits")
     parser.add_argument("--file", type=Path, default=Path("friction_laws.jsonl"))
+    parser.add_argument("--effort", action="store_true", help="compare the effort of solve with and without friction")
     arguments = parser.parse_args()
+    if arguments.effort:
+        effort(range(arguments.seeds[0], arguments.seeds[1] + 1))
+        return 0
     lines = arguments.file.read_text(encoding="utf-8").splitlines() if arguments.file.exists() else []
     done = {(own["law"], own["seed"], own["size"]): own for own in map(json.loads, lines)}
     for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):

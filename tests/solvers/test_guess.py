@@ -166,6 +166,26 @@ def test_an_amplitude_seen_at_its_neutral_value_begins_there_and_one_given_at_it
         np.testing.assert_array_equal(unknowns_with_neutral_effects_activated(begun, x), x)
 
 
+@pytest.mark.parametrize(("kind", "name"), [("joint_viscous", "b"), ("joint_coulomb", "tau_c")])
+def test_friction_that_is_not_there_is_zero_after_a_few_steps_and_costs_nothing(moved, kind, name):
+    problem = moved(kind, {name: 0.0}, (name,))
+    from_zero = solve(problem, GaussNewton())
+    guessed = problem.with_parameter_values({f"{kind}@elbow.{name}": 0.5})
+    np.testing.assert_array_equal(guessed.positive_unknowns_mask, [True, False])
+    solution = solve(guessed, GaussNewton())
+    entry = solution.parameters[f"{kind}@elbow.{name}"]
+    assert abs(entry.value) < 3 * entry.std
+    assert solution.n_evaluations <= from_zero.n_evaluations + 2
+    # where it began adds no prior
+    assert solution.cost == pytest.approx(from_zero.cost, rel=1e-6)
+
+
+def test_an_amplitude_with_a_shape_stays_positive(moved):
+    free = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
+    given = free.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})
+    np.testing.assert_array_equal(given.positive_unknowns_mask, [True, True, False])
+
+
 def test_a_start_that_cannot_be_rolled_out_is_drawn_back(moved, monkeypatch):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
     whole, plain = unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns), problem.evaluate

@@ -412,6 +412,33 @@ def test_an_unknown_clipped_to_its_bound_at_zero_comes_back():
     assert found.x[0] == pytest.approx(2.0, abs=1e-2)
 
 
+def edge(limit):
+    """A weakly informed unknown drawn to 2 beside a well informed one; beyond a limit nothing can be predicted."""
+
+    def rows(x, duration):
+        return None if x[0] > limit else (np.array([10.0 * (x[0] - 2.0), 1e3 * x[1]]), np.diag([10.0, 1e3]))
+
+    return MadeUp(rows, (1.0, 1.0), lower=-np.inf)
+
+
+def test_a_rejected_step_is_followed_by_one_that_is_shorter_along_what_is_weakly_informed_too():
+    problem = edge(1.2)
+    GaussNewton().minimize_cost(problem, np.array([1.0, 0.0]), None)
+    tried = [x[0] - 1.0 for x, *_ in problem.asked[1:5]]
+    accepted = next(i for i, moved in enumerate(tried) if moved <= 0.2)
+    assert tried[0] == pytest.approx(1.0, rel=0.02)
+    assert accepted == 1
+    assert tried[accepted] >= 0.02
+
+
+def test_at_the_edge_of_what_can_be_predicted_the_search_stalls_soon():
+    problem = edge(1.0)
+    found = GaussNewton().minimize_cost(problem, np.array([1.0, 0.0]), None)
+    assert found.status == Status.STALLED
+    assert "it snaps" in found.message
+    assert found.n_evaluations <= 10
+
+
 def test_a_short_step_beside_a_steep_row_is_no_end():
     """A row of slope 1e9 allows no step but a short one; the cost falls along it all the same."""
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_observed_equilibrium_and_denoised_loads
@@ -193,8 +194,17 @@ class EstimationProblem(ReprMixin):
 
     @property
     def positive_unknowns_mask(self) -> BoolArray:
-        """Mask (nx,) of unknowns with a nonnegative lower bound and a positive initial value."""
-        return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
+        """Mask (nx,) of unknowns that stay positive: with bound zero, a positive start, and no effect that may vanish.
+
+        An amplitude of zero is a common result. Where an effect has shape parameters, these would lose their influence.
+        """
+        effects = [e for e in self.system.effects if isinstance(e, EffectBase) and not e.shape_parameter_names]
+        vanishing = {name for e in effects for name in e.amplitude_parameter_names if e.neutral_values[name] == 0}
+        parts = (self.shared_parameters, self.local_parameters)
+        shared, local = ([float(name in vanishing) for name in part] for part in parts)
+        offset = np.zeros(len(self.unknowns.initial_state_names))
+        may_vanish = self.unknowns.pack_same_for_all_recordings(shared, local, offset) > 0
+        return (self.bounds[0] >= 0) & (self.initial_unknowns > 0) & ~may_vanish
 
     @property
     def rms_noise_of_data_residuals(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 from annotated_types import Ge, Gt, Lt
 
@@ -34,6 +35,8 @@ from yid_ocp.solvers.base import (
 
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
+# After a rejected step: least damping, and length of the next step if the trial had no prediction.
+_MIN_REJECTED_DAMPING, _LENGTH_AFTER_FAILURE = 1e-6, 0.25
 # The search ends after this many accepted steps that together lower the cost by no more than this (a tenth of the cost
 # of one standard deviation) and move no unknown by more than this fraction of its standard deviation, if the predicted
 # decrease is at most the cost of a 95 % interval.
@@ -95,12 +98,12 @@ class GaussNewton(SolverWithCheckedSettings):
             made = recorder.solver_result_with_iterates(status, message, x, now.equilibrium_guesses)
             return replace(made, evaluation=now)
 
-        mu, rejected = self.initial_damping, 0
+        mu, rejected, longest = self.initial_damping, False, np.inf
         while True:
             jacobian, residual = now.jacobian, now.residual
             assert jacobian is not None
             size = np.maximum(np.abs(x), scale)
-            if rejected == 0:
+            if not rejected:
                 slope = projected_gradient_norm(x, jacobian.T @ residual, lower, upper, size)
                 recorder.record_iterate(now.cost, x, slope)
                 saved = _saved(problem, recorder.history, now)
@@ -114,7 +117,8 @@ class GaussNewton(SolverWithCheckedSettings):
             # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
-            step = size * bounded_levenberg_marquardt_step(jacobian * size, residual, mu, low, (upper - x) / size)
+            scaled, mu = _step_within_length(jacobian * size, residual, mu, low, (upper - x) / size, longest)
+            step = size * scaled
             promised = predicted_cost_reduction(jacobian, residual, step)
             # damping makes any step promise little
             if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary_point(problem, x, now):
@@ -123,21 +127,39 @@ class GaussNewton(SolverWithCheckedSettings):
             recorder.n_evaluations += 1
             gain = (now.cost - trial.cost) / promised if trial.ok and promised > 0 else -1.0
             if gain > 1e-3:
-                moved = float(np.max(np.abs(step) / size))
-                x, now, rejected = np.clip(x + step, lower, upper), trial, 0
+                moved = float(np.max(np.abs(scaled)))
+                longest = 2.0 * float(np.linalg.norm(scaled)) if rejected else np.inf
+                x, now, rejected = np.clip(x + step, lower, upper), trial, False
                 mu = max(mu * (0.2 if gain > 0.5 else 1.0 if gain > 0.2 else 3.0), 1e-12)
                 if moved < self.step_tolerance and now.jacobian is not None and is_stationary_point(problem, x, now):
                     slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
                     recorder.record_iterate(now.cost, x, slope)
                     return ended(Status.CONVERGED, "the step is below its tolerance")
                 continue
-            rejected += 1
-            mu = max(mu * 8.0, 1e-6)
-            if mu > 1e10 or rejected > 40:
+            # the parabola through both costs with the slope of the first has its minimum at this fraction of the step
+            slope = float(residual @ (jacobian @ step))
+            fraction = -0.5 * slope / max(trial.cost - now.cost - slope, 1e-300) if trial.ok else _LENGTH_AFTER_FAILURE
+            longest = float(np.clip(fraction, 0.1, 0.5) * np.linalg.norm(scaled))
+            rejected, mu = True, max(mu, _MIN_REJECTED_DAMPING)
+            if np.max(np.abs(scaled)) < self.step_tolerance:
                 if is_stationary_point(problem, x, now):
                     return ended(Status.CONVERGED, _LOWEST)
                 reason = f"no step lowers the cost ({trial.message or 'the linear model does not hold'})"
                 return ended(Status.STALLED, f"{reason}; start nearer, shorten the recording, or use multiple_shooting")
+
+
+def _step_within_length(
+    jacobian: Array, residual: Array, mu: float, low: Array, high: Array, longest: float
+) -> tuple[Array, float]:
+    """Damped step within bounds, and its damping, which is raised until the step is at most `longest`."""
+    # the triangular factor has the same normal equations
+    reduced = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0]
+    reduced = reduced[: jacobian.shape[1] + 1]
+    while True:
+        step = bounded_levenberg_marquardt_step(reduced[:, :-1], reduced[:, -1], mu, low, high)
+        if not np.linalg.norm(step) > longest:
+            return step, mu
+        mu *= 3.0
 
 
 def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluation) -> float | None:
