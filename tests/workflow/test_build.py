@@ -125,7 +125,7 @@ def test_effects_bring_their_parameters(written):
         ("model:\n  robot: package:baxterr\n", "line 2: model.robot"),
         ("model:\n  robot: package:baxter\n  damping: {left_s9: 1}\n", "line 3: model.damping.left_s9"),
         ("model:\n  object: {kind: segments, segments: {a: {mass: 1, radius: 0.1}}}\n", "line 2: model.object"),
-        ("model:\n  object: {kind: foam_y}\n  points: [w_T9]\n", "line 1: model"),
+        ("model:\n  object: {kind: foam_y}\n  measured_points: [w_T9]\n", "line 1: model"),
     ],
 )
 def test_errors_of_the_model_name_the_setting(written, text, message):
@@ -196,7 +196,7 @@ def test_damping_by_joint_says_that_of_the_object_too(built, urdf_folder):
         built(BY_JOINT.format(urdf=urdf, more=""))
     assert "line 5: model.damping" in caught.value.where
     assert "`object`" in caught.value.allowed
-    alone = BY_JOINT.format(urdf=urdf, more=", object: 1").replace("object: {kind: foam_y}", "points: []")
+    alone = BY_JOINT.format(urdf=urdf, more=", object: 1").replace("object: {kind: foam_y}", "measured_points: []")
     with pytest.raises(ConfigError, match="there is no joint 'object'"):
         built(alone)
 
