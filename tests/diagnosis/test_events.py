@@ -20,6 +20,7 @@ from yid_ocp.diagnosis.events import (
     _one_each,
     _Overspeed,
     _short,
+    _without_forces_of_motion,
     find_force_and_fault_events,
     problem_corrected_for_events,
 )
@@ -65,7 +66,7 @@ class DisturbanceTerms:
     def edit_model(self, model) -> None:
         pass
 
-    def start_motion(self, data) -> None:
+    def prepare_motion(self, data) -> None:
         self.begun, self.caught = float(data.time), {}
 
     def add_forces(self, model, data) -> None:
@@ -145,10 +146,34 @@ def test_a_snag_is_an_event_of_its_joint(twin):
 def test_forces_that_mostly_recur_are_the_motions_own(twin, pushed):
     """What is there at the same times of another recording comes with the motion; one that does is still an event."""
     other = (replace(PUSHES[0], start=3.2, end=3.7), *PUSHES[1:])
-    again, partly = (twin.recording(DisturbanceTerms(*pushes), seed=1) for pushes in (PUSHES, other))
-    assert not twin.events(pushed, again).disturbances
-    found = twin.events(pushed, partly).disturbances
+    third = (*PUSHES, Push("shoulder", 4.0, 4.5, -1.2))
+    first, again = (twin.recording(DisturbanceTerms(*third), seed=seed) for seed in (0, 1))
+    assert not twin.events(first, again).disturbances
+    found = twin.events(pushed, twin.recording(DisturbanceTerms(*other), seed=1)).disturbances
     assert [event.location for event in found] == ["shoulder", "elbow", "elbow", "shoulder"]
+
+
+def pulses(recording: str, *at: tuple[float, float]) -> list[ForceOrFaultEvent]:
+    """Events of 0.4 s at one joint: start and impulse of each, known to 0.02 N m s."""
+    where = (recording, "elbow", "elbow", "force")
+    return [ForceOrFaultEvent(*where, t, t + 0.4, 5 * size, size, 0.02, "N m") for t, size in at]
+
+
+@pytest.mark.parametrize("calm", range(1, 13))
+def test_a_push_is_found_beside_any_number_of_runs_that_all_have_the_motions_forces(calm):
+    """Among them pushes of the time but not the size of such a force, and one that is alike in one run by chance."""
+    motions = ((1.0, 0.2), (4.0, -0.2))
+    pushes = pulses("pushed", (1.1, 0.5), (2.5, 0.2), (7.0, 0.3))
+    forces = [*pushes, *pulses("pushed", motions[1])]
+    forces += [event for k in range(calm) for event in pulses(f"calm_{k}", *motions)]
+    forces += pulses("calm_0", (7.05, 0.3))
+    durations = {force.recording: 10.0 for force in forces}
+    kept = _without_forces_of_motion(forces, durations, Thresholds())
+    assert kept[:3] == pushes
+    if calm > 3:
+        assert [force.recording for force in kept] == 3 * ["pushed"] + ["calm_0"]
+    alone = _without_forces_of_motion(pushes, durations, Thresholds())
+    assert (alone, _without_forces_of_motion([], {}, Thresholds())) == (pushes, [])
 
 
 def test_currents_tell_of_a_push_what_efforts_tell(twin, pushed):

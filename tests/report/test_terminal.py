@@ -135,10 +135,10 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
 @pytest.mark.parametrize(
     ("error", "noise", "fit", "said"),
     [
-        (0.012, 0.010, GOOD, ": no gap, as torque errors of the stated size carry the motion away, by 10 mm (rms)"),
-        (0.012, 0.002, GOOD, ": a gap, as errors of sensors and torques explain 2 mm; run `yid-ocp diagnose`"),
+        (0.012, 0.010, GOOD, ". This is no gap: torque noise of the stated size accounts for 10 mm"),
+        (0.012, 0.002, GOOD, ". This is a gap: noise accounts for 2 mm; run `yid-ocp diagnose`"),
         (0.003, 0.002, GOOD, None),
-        (0.003, 0.002, BAD, "; noise makes 2 mm of it"),
+        (0.003, 0.002, BAD, ". Noise accounts for 2 mm"),
     ],
 )
 def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
@@ -146,7 +146,7 @@ def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(
     entry = {"recording": "r", "rmse": {channel: error}, "baselines": {"stays": {channel: 0.03}}}
     residuals = {channel: {"rmse": 0.0018, "unit": "m", "n": 9}}
     lines = told("yid-solve/1", solved(fit=fit, residuals=residuals, held_out=[entry | {"expected": {channel: noise}}]))
-    head = f"held out, points is predicted to {1e3 * error:.3g} mm (rms), 1.8 mm where it was fitted, beside 30 mm by "
+    head = f"held-out errors of points are {1e3 * error:.3g} mm (rms), beside 1.8 mm on the fitted recordings, and 30"
     text = " ".join(line.strip() for line in lines[:5])
     assert (head in text) == (said is not None)
     assert said is None or said in text

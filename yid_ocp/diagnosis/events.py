@@ -10,11 +10,12 @@ recorded ones, and samples in their windows are excluded.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.special
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
@@ -56,7 +57,7 @@ _STENCIL_STEPS = (4, 7, 10)  # distances of the samples through which a smooth c
 _NEIGHBOUR_COUNT = 20  # samples on either side with which one is compared
 _MIN_NEIGHBOUR_RATIO = 3.0  # ratio of a wrong sample's deviation to the largest one of its neighbours
 _MIN_RECURRENCE_OVERLAP = 0.5  # of the longer of two windows; overlap from which they are the same time
-_MAX_RECURRING_FRACTION = 0.5  # of all forces; fraction of recurring forces from which these belong to the motion
+_MAX_RECURRING_FRACTION = 0.5  # of all forces; fraction of recurring forces from which some belong to the motion
 _WRONG_SAMPLE_Z = 8.0  # smallest deviation, in stds of noise and robust stds of its neighbours
 
 
@@ -161,9 +162,7 @@ def find_force_and_fault_events(
     forces = _one_each([entry for entry, sure in zip(found, real, strict=True) if sure], problem)
     times = {(e.recording, 0.5 * (e.start_time + e.end_time)) for e in wrong}
     forces = [f for f in forces if not any(f.recording == n and f.start_time <= t <= f.end_time for n, t in times)]
-    single = [f for f in forces if not any(_recurs(f, other) for other in forces)]
-    if len(single) < _MAX_RECURRING_FRACTION * len(forces):
-        forces = single
+    forces = _without_forces_of_motion(forces, {e.name: e.grid.steps * e.grid.time_step for e, *_ in runs}, limits)
     everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.start_time, event.location))
     there = {(event.recording, event.channel) for event in forces}
     shown = tuple(history for history in cut if (history.recording, history.coordinate) in there)
@@ -301,12 +300,44 @@ def _one_each(
     return kept
 
 
-def _recurs(one: ForceOrFaultEvent, other: ForceOrFaultEvent) -> bool:
-    """Whether the same force occurs at the same time of another recording."""
-    if one.recording == other.recording or one.channel != other.channel or one.peak_value * other.peak_value < 0:
-        return False
-    longer = max(one.end_time - one.start_time, other.end_time - other.start_time)
-    return one._overlap(other) > _MIN_RECURRENCE_OVERLAP * longer
+def _without_forces_of_motion(
+    forces: Sequence[ForceOrFaultEvent], durations: Mapping[str, float], limits: Thresholds
+) -> list[ForceOrFaultEvent]:
+    """Forces without those that come with the motion, if most forces recur in other recordings.
+
+    A force comes with the motion if more recordings than by chance have the same force, or if one recording has more
+    than by chance of the same forces as its own recording. Numbers by chance are Poisson distributed.
+    """
+    pairs = np.array([[_recurrence(one, other, durations, limits.location_z) for other in forces] for one in forces])
+    pairs = pairs.reshape(len(forces), len(forces), 2)
+    names = list(dict.fromkeys(force.recording for force in forces))
+    recording = np.array([names.index(force.recording) for force in forces], int)
+    of = np.eye(len(names))[recording]
+    recurs, chance = pairs[..., 0] @ of > 0, pairs[..., 1] @ of  # by force and recording
+    is_recurring = np.any(recurs, axis=1)
+    if is_recurring.sum() <= _MAX_RECURRING_FRACTION * len(forces):
+        return list(forces)
+    by_force = scipy.special.pdtrc(recurs.sum(axis=1) - 1, chance.sum(axis=1))
+    by_recording = scipy.special.pdtrc(of.T @ recurs - 1, of.T @ chance)[recording]
+    p_values = np.minimum(by_force, np.min(by_recording, axis=1, where=recurs, initial=1.0))
+    p_values[~is_recurring] = 1.0
+    common = benjamini_hochberg_mask(p_values, len(forces) * (1 + len(names)), limits.significance_level)
+    return [force for force, is_common in zip(forces, common, strict=True) if not is_common]
+
+
+def _recurrence(
+    one: ForceOrFaultEvent, other: ForceOrFaultEvent, durations: Mapping[str, float], z: float
+) -> tuple[bool, float]:
+    """Whether another recording has the same force, and the probability of that if `other` came at a random time.
+
+    The same force acts on the same coordinate at the same time, with the same impulse within `z` standard deviations.
+    """
+    shorter, longer = sorted(force.end_time - force.start_time for force in (one, other))
+    apart, std = abs(one.impulse - other.impulse), math.hypot(one.impulse_std, other.impulse_std)
+    is_alike = one.channel == other.channel and one.impulse * other.impulse > 0 and apart <= z * std
+    if one.recording == other.recording or not is_alike or shorter <= _MIN_RECURRENCE_OVERLAP * longer:
+        return False, 0.0
+    return one._overlap(other) > _MIN_RECURRENCE_OVERLAP * longer, shorter / durations[other.recording]
 
 
 # -- wrong samples ----------------------------------------------------------------------------------------------------

@@ -35,9 +35,9 @@ from yid_ocp.report.terminal import (
 
 _BASELINE_DESCRIPTIONS = {
     "stays": "points stay where they were first seen",
-    "zero": "an effort of zero",
+    "zero": "the effort is zero",
     "moves_with_clamps": "points move with the mean of the clamps",
-    "linear_carry": "the clamps' motion carried along the cable",
+    "linear_carry": "the cable carries the clamps' motion linearly",
 }
 _MAX_DIRECTIONS = 8
 _MAX_NOISE_RATIO = 2.0  # of an error over noise, or over the fit's error, above which a sentence explains it
@@ -134,16 +134,16 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
             " ".join(format_error_value_and_unit(x, unit)).rstrip()
             for x in (error, fitted, noise, guesses.get(best or ""))
         ]
-        beside = f", beside {sizes[3]} by the best guess without a model ({best})" if best else ""
-        text = f"held out, {group} is predicted to {sizes[0]} (rms), {sizes[1]} where it was fitted{beside}"
+        guess = f", and {sizes[3]} without a model, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
+        text = f"held-out errors of {group} are {sizes[0]} (rms), beside {sizes[1]} on the fitted recordings{guess}"
         if noise is None or error is None or fitted is None:
             continue
         if not result["fit"]["explains"]:
-            yield f"{text}; noise makes {sizes[2]} of it"
+            yield f"{text}. Noise accounts for {sizes[2]}"
         elif error > _MAX_NOISE_RATIO * noise:
-            yield f"{text}: a gap, as errors of sensors and torques explain {sizes[2]}; run `yid-ocp diagnose`"
+            yield f"{text}. This is a gap: noise accounts for {sizes[2]}; run `yid-ocp diagnose`"
         elif error > _MAX_NOISE_RATIO * fitted:
-            yield f"{text}: no gap, as torque errors of the stated size carry the motion away, by {sizes[2]} (rms)"
+            yield f"{text}. This is no gap: torque noise of the stated size accounts for {sizes[2]}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -175,7 +175,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         by_noise = "" if noise is None else format_error_value_and_unit(noise, unit)[0]
         rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
-    legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
+    legend = "; ".join(f"{name}: {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     for entry in result["held_out"]:
         if "message" in entry:
             yield f"held-out recording {entry['recording']} could not be predicted: {entry['message']}"
