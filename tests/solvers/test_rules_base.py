@@ -88,6 +88,14 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start(chi2_at, tried,
     assert (solution.n_evaluations, solution.n_iterations) == (len(tried), len(tried) - 1)
 
 
+@pytest.mark.parametrize(("far", "kept"), [(0.9, 100.0), (8.5, 4.0)], ids=["better than all fits", "worse than a fit"])
+def test_a_start_far_away_is_tried_where_its_prediction_is_better_than_every_fit(far, kept):
+    solver = Steps()
+    at = {1.0: 9.0, 4.0: 7.0, 2.0: 8.0, 10.0: 8.0, 30.0: 20.0, 100.0: far}
+    assert solve(MadeUp(misfit(at.get)), solver).x.tolist() == [kept]
+    assert starts(solver)[4:] == ([[100.0]] if kept == 100.0 else [])
+
+
 def test_a_fit_is_left_alone_where_that_is_asked_for_or_the_cost_says_nothing_of_noise():
     solver = Steps()
     assert solve(MadeUp(misfit(lambda x: 9.0)), solver, restarts=False).message == "run 1"

@@ -167,6 +167,18 @@ def test_a_start_in_motion_is_estimated(parts: Sequence[float], bench: Path) -> 
     assert proposed(moved(SHORT, parts=parts, effort=True, moving=True)).problem.initial_state == "estimated"
 
 
+def test_the_low_pass_lies_above_motion_that_exceeds_the_noise_of_the_encoders(bench: Path) -> None:
+    t = np.arange(0, 4, 1 / RATE)
+    assert proposed(moved(t, moving=True)).problem.path_cutoff == 10.0
+    shaken = moved(t, moving=True)
+    assert shaken.joints is not None
+    # of 0.7 times the noise's size
+    angles = shaken.joints.position + 1e-4 * np.sin(2 * np.pi * 14 * t)[:, None]
+    assert proposed(replace(shaken, joints=replace(shaken.joints, position=angles))).problem.path_cutoff == 20.0
+    uneven = np.sort(t + 4e-3 * np.random.default_rng(0).uniform(-1, 1, len(t)))
+    assert proposed(moved(uneven, moving=True)).problem.path_cutoff == 10.0, "an uneven clock does not show the noise"
+
+
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     beam = ("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05")
     run = proposed(moved(SHORT, parts=(), effort=True), *beam)

@@ -121,7 +121,6 @@ def diagnose(
     DiagnosisResult
         Verdict, effects with parameters in their own units, and fractions of the gap [1]; `to_dict` has all with units.
     """
-    # small matrices: threads of the linear algebra library cost more than they save
     with threadpoolctl.threadpool_limits(1):
         clock = {"": time.perf_counter()}
         told = progress or LoggingProgress(log)
@@ -160,32 +159,32 @@ class _Examined:
 def _examined(
     problem: EstimationProblem, search: RefitContext, solution: Solution | None, clock: dict[str, float]
 ) -> _Examined:
-    limits, progress = search.thresholds, search.progress
-    progress.begin_stage("fitting the nominal model", 3.0, 10.5)
+    limits, stated = search.thresholds, problem.step.time_step
+    search.progress.begin_stage("fitting the nominal model", 3.0, 10.5)
     nominal = fit_nominal_model(problem, search.problem, solution, search.store, limits)
+    # neither events nor candidates are sought while the step makes most of the gap
+    while finer := _at_finer_step_that_explains_gap(search, nominal):
+        search, nominal = finer
+    problem = problem.with_time_step(nominal.problem.step.time_step)
     search, nominal, cuts = _followed(search, nominal)
     clock["nominal"] = time.perf_counter()
     found = _examined_about_fit(problem, search, nominal, cuts, clock)
     while found.is_search_worthwhile:
-        finer = _finer_step_that_explains_gap(
-            found.search, found.nominal, found.events, found.evidence.screening.candidate_scores
-        )
-        again = None if finer is None else _settled(finer, found.nominal.values, "")
-        if finer is None or again is None:
+        ranked, own = found.evidence.screening.candidate_scores, found.search
+        own = replace(own, problem=replace(own.problem, candidate_effects=search.problem.candidate_effects))
+        if (finer := _at_finer_step_that_explains_gap(own, found.nominal, found.events, ranked)) is None:
             break
-        finer = replace(finer, problem=replace(finer.problem, candidate_effects=search.problem.candidate_effects))
-        problem = problem.with_time_step(finer.problem.problem.step.time_step)
-        found = _examined_about_fit(problem, *_followed(finer, again, found.truncated), clock)
+        problem = problem.with_time_step(finer[1].problem.step.time_step)
+        found = _examined_about_fit(problem, *_followed(*finer, found.truncated), clock)
     little = 1 + limits.min_excess_chi2_per_dof
     poor = found.is_search_worthwhile and found.evidence.nominal_test.chi2_per_dof < little
-    if poor and not search.record_skip_if_past_deadline("the nominal model from other starts"):
-        other = _better_nominal_fit(found.search, found.nominal)
-        if other is not None:
-            # the smoother's result belongs to another fit
-            found = _tested(*_followed(found.search, other, found.truncated), found.whole, found.events, None)
+    may_restart = poor and not search.record_skip_if_past_deadline("the nominal model from other starts")
+    if may_restart and (other := _better_nominal_fit(found.search, found.nominal)) is not None:
+        # the smoother's result belongs to another fit
+        found = _tested(*_followed(found.search, other, found.truncated), found.whole, found.events, None)
     clock["other_starts"] = time.perf_counter()
-    steps = search.problem.problem.step.time_step, found.nominal.problem.step.time_step
-    return found if steps[0] == steps[1] else replace(found, stated_and_finer_time_step=steps)
+    used = found.nominal.problem.step.time_step
+    return found if used == stated else replace(found, stated_and_finer_time_step=(stated, used))
 
 
 def _examined_about_fit(
@@ -283,23 +282,25 @@ def _law(
     return find_gap_law(seen.search, problem, final, places, seen.events)
 
 
-def _finer_step_that_explains_gap(
-    search: RefitContext, fit: RefittedModel, events: EventSet, ranked: Sequence[CandidateScore]
-) -> RefitContext | None:
-    """All hypotheses at half the time step, if it explains over half of the predicted decrease; else None."""
-    h = fit.problem.step.time_step / 2
+def _at_finer_step_that_explains_gap(
+    search: RefitContext, fit: RefittedModel, events: EventSet = NO_EVENTS, ranked: Sequence[CandidateScore] = ()
+) -> tuple[RefitContext, RefittedModel] | None:
+    """Hypotheses and nominal fit at half the step, if it explains half of the best candidate's decrease or of all."""
+    h, residual = fit.problem.step.time_step / 2, fit.evaluation.residual
+    excess = float(residual @ residual) - np.count_nonzero(residual)
+    gap = max((score.predicted_chi2_decrease for score in ranked), default=excess)
+    if not ranked and excess < search.thresholds.min_excess_chi2_per_dof * len(residual):
+        return None
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
     finer, x = search.problem.with_time_step(h), fit.problem.unknown_vector(fit.values)
     fine = problem_corrected_for_events(finer.problem, events)
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
-    if left is None:
-        return None
-    excess, rest = (float(r @ r) - np.count_nonzero(r) for r in (fit.evaluation.residual, left))
-    if excess - rest <= max((score.predicted_chi2_decrease for score in ranked), default=excess) / 2:
+    if left is None or excess - (rest := float(left @ left) - np.count_nonzero(left)) <= gap / 2:
         return None
     search.progress.begin_stage(f"half the time step lowers chi2 by {excess - rest:.3g}: going on at {h:g} s")
     store = None if search.store is None else FinerStepRefitStore(search.store, h)
-    return replace(search, problem=finer, store=store)
+    search = replace(search, problem=finer, store=store)
+    return None if (again := _settled(search, fit.values, "")) is None else (search, again)
 
 
 def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> EstimationProblem:

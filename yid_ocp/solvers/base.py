@@ -298,6 +298,8 @@ _HORIZON_FRACTIONS = (0.06, 0.12, 0.25, 0.5)
 # is repeated from these multiples of the initial values, and the best fit is kept.
 _POOR_CHI2_PER_DOF = 5.0
 INITIAL_VALUE_RESTART_FACTORS = (4.0, 2.0, 10.0)
+# If all of these fits are poor, other multiples are predicted. The best one is a start where it beats every fit.
+_FAR_FACTORS = (1e-2, 3e-2, 0.1, 0.3, 30.0, 100.0, 300.0, 1000.0)
 # With process noise, a wrong minimum can have a chi2 per degree of freedom of only 1.03. Another start is tried if a
 # relative std exceeds the first number, or the ratio of a value to its initial value falls below the second.
 _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
@@ -392,11 +394,16 @@ class _MultiStartSearch:
         for factor in INITIAL_VALUE_RESTART_FACTORS:
             if _good_fit(self._problem, self._best.evaluation):
                 break
-            self._try(self._multiple(first, factor), f"initial values x {factor:g}", most)
+            self._try_multiple(first, factor, most)
+        if not _good_fit(self._problem, self._best.evaluation):
+            evaluate = self._best.weighted.evaluate
+            cost = {factor: evaluate(self._multiple(first, factor), False).cost for factor in _FAR_FACTORS}
+            factor = min(cost, key=lambda entry: cost[entry])
+            if cost[factor] < self._best.evaluation.cost:
+                self._try_multiple(first, factor, self._n_starts + 1)
         once = len(self._fits) == 1 and noisy and _accounts_for_process_noise(self._solver)
         if once and np.any(_doubtful(self._best, first)):
-            factor = INITIAL_VALUE_RESTART_FACTORS[0]
-            self._try(self._multiple(first, factor), f"initial values x {factor:g}", 2)
+            self._try_multiple(first, INITIAL_VALUE_RESTART_FACTORS[0], 2)
         if not uses_process_noise_covariance(self._solver):
             return
         most = self._n_starts + len(_NEARBY_START_FACTORS)
@@ -409,6 +416,9 @@ class _MultiStartSearch:
         most = self._n_starts + len(minima)
         for near in minima:
             self._try(near, "another local minimum", most)
+
+    def _try_multiple(self, first: Array, factor: float, most: int) -> None:
+        self._try(self._multiple(first, factor), f"initial values x {factor:g}", most)
 
     def _multiple(self, x: Array, factor: float) -> Array:
         return np.where(self._problem.positive_unknowns_mask, np.clip(x * factor, *self._problem.bounds), x)
@@ -555,8 +565,9 @@ def _fit_from(
         ) or result.stopped_by_callback:
             break
         # a search that reaches a known fit is not whitened again
-        if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
-            return replace(same, n_evaluations=evaluations, history=history)
+        same = [fit for fit in known if passes > 1 and _stds_apart(fit.evaluation, x - fit.result.x) < _SAME_FIT_STDS]
+        if same:
+            return replace(same[0], n_evaluations=evaluations, history=history)
     finish = result.evaluation
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # torque errors were unknowns; the fit is judged by their likelihood about the result
@@ -565,13 +576,8 @@ def _fit_from(
     return _Fit(result, finish, weighted, evaluations, history)
 
 
-def _is_at(fit: _Fit, x: Array) -> bool:
-    """Whether a point differs from a fit by d with negligible |J d|, which bounds all |d_i| / std_i."""
-    return _stds_apart(fit.evaluation, x - fit.result.x) < _SAME_FIT_STDS
-
-
 def _stds_apart(evaluation: Evaluation | None, moved: Array) -> float:
-    """|J d| of a move d; infinite without a Jacobian."""
+    """|J d| of a move d, which bounds all |d_i| / std_i; infinite without a Jacobian."""
     slopes = evaluation.jacobian if evaluation is not None and evaluation.ok else None
     return math.inf if slopes is None else float(np.linalg.norm(slopes @ moved))
 

@@ -15,9 +15,11 @@ from yid_ocp.data.channel_checks import mean_sample_rate, white_noise_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
+from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import ChannelSpecification, channel_kinds_for_group_name
 from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
@@ -25,6 +27,7 @@ from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
 """Usual names of the frame at the end of an arm, most likely first."""
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
+_CUTOFF, _CUTOFF_LEVEL = 10.0, 1e-3  # least cutoff [Hz]; p-value of noise alone below which motion lies above it
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
@@ -182,7 +185,7 @@ def propose_config_choices(
         _places(tree, first, branches, holder, standing) | _sensor_places(tree, first, holder),
         _noise(first, recorded, joints),
         _time_step(period),
-        min(10.0, 0.2 / period),
+        _path_cutoff(recordings, joints, period) if branches and mode == "prescribed" else min(_CUTOFF, 0.2 / period),
         {group.name: _clock(group.t, group.clock) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
         *_motor_and_gain(robot, mode, recordings),
@@ -510,6 +513,28 @@ def _time_step(period: float) -> float:
     else:
         step = period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
     return float(f"{step:.3g}")
+
+
+def _path_cutoff(recordings: Sequence[Recording], joints: Sequence[str], period: float) -> float:
+    """Lowest cutoff [Hz], by octaves, above which recorded angles are noise alone; at most a fifth of the rate.
+
+    What a filter of twice the cutoff keeps beyond this one is compared with white noise of the angles' own size.
+    """
+    most = float(f"{0.2 / period:.3g}")
+    cutoff, groups = min(_CUTOFF, most), [r.joints for r in recordings if r.joints is not None]
+    channels = [(group.t, group.position[:, [group.names.index(name)]]) for group in groups for name in joints]
+    sizes = [_size(t, angle[:, 0]) for t, angle in channels]
+    while cutoff < most and min(sizes) > 0:
+        higher, p_values = LowPassFilter(min(2 * cutoff, most)), []
+        for (t, angle), std in zip(channels, sizes, strict=True):
+            impulse = std * (t == t[len(t) // 2])[:, None]
+            kept, noise = (higher(t, values) - LowPassFilter(cutoff)(t, values) for values in (angle, impulse))
+            degrees = 2 * (higher.cutoff - cutoff) * (t[-1] - t[0])
+            p_values.append(chi2_p_value(degrees * float(np.mean(kept**2) / np.sum(noise**2)), degrees))
+        if min(p_values) > _CUTOFF_LEVEL:
+            break
+        cutoff = higher.cutoff
+    return cutoff
 
 
 def _clock(t: Array, clock: str) -> str:
