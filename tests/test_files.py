@@ -143,6 +143,7 @@ OPENED_ELSEWHERE = {
     "integrator.codegen.kernel_cache_key_text": "sources that come with the package",
     "inference.kalman._library": "a source in C that comes with the package",
     "integrator.compiler._machine": "/proc",
+    "report.html._packed_script": "the user's own cache",
     "report.html._is_plotly_script": "a script that is compared with its original",
     "report.sections.results._image_files": "pictures that the run drew",
     "solvers.nonlinear_program.available_memory_bytes": "/proc",

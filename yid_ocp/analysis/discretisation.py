@@ -20,8 +20,8 @@ from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
+from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
@@ -353,15 +353,15 @@ def min_grasp_frame_distances(system: System, configuration: Mapping[str, float]
     """
     if not system.grasps:
         return {}
-    q, inner = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*system.effect_internal_coordinate_symbols.values())
-    kinematics = forward_kinematics(system.mechanism, q)
-    phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps))
     known = [system.mechanism.joint_index(name) for name in configuration]
     free = [i for i in range(system.n_coordinates) if i not in known]
     full = np.zeros(system.n_coordinates)
     full[known] = list(configuration.values())
-    symbols = [q, system.parameters.symbols, inner]
-    function = ca.Function("phi", symbols, [phi, ca.jacobian(phi, q)[:, free]])
+    with CASADI_LOCK:
+        (q, kinematics), inner = system.symbolic_kinematics, system.effect_internal_coordinate_symbols.values()
+        phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps))
+        symbols = [q, system.parameters.symbols, ca.vertcat(*inner)]
+        function = ca.Function("phi", symbols, [phi, ca.jacobian(phi, q)[:, free]])
 
     def phi_at(x: Array, part: int) -> Array:
         full[free] = x

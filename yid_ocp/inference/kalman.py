@@ -152,51 +152,55 @@ class KalmanSteps:
         return found
 
     def normalized_innovations_and_next_mean(
-        self, mean: Array, measured: Array, shift: Array, push: Array | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Filter all steps: normalized innovations (r, c), final means (nx, c), and means before each step (k, nx, c).
+        self, mean: Array, measured: Array, shift: Array, push: Array | None = None, keep_means: bool = False
+    ) -> tuple[Array, Array, Array | None]:
+        """Filter all steps: normalized innovations (r, c) and final means (nx, c).
 
+        With `keep_means`, the means before each step (k, nx, c) are returned too.
         `mean` is the mean before all steps, `measured` (r, c) the measurements. `push` (k, m, c) is added to the
         parameters during a step's transition. `shift` (k, nx - ns) is added to the parameters of the first column after
         the step.
         """
         if (library := _library()) is not None:
-            return self._compiled_columns(library, measured, mean, shift, push)
-        white, seen, ns = np.empty_like(measured), np.empty((len(self.moves), *mean.shape)), self.moves.shape[1]
-        for k, (span, step) in enumerate(self._single_steps()):
-            seen[k] = mean
+            seen = np.empty((len(self.moves), *mean.shape)) if keep_means else None
+            return *self._compiled_columns(library, measured, mean, seen, push, shift), seen
+        white, before, ns = np.empty_like(measured), list[Array](), self.moves.shape[1]
+        for span, step in self._single_steps():
+            k = len(before)
+            before.append(mean)
             white[span], mean = step.normalized_innovations_and_next_mean(mean, measured[span])
             if push is not None:
                 mean[:ns] += step.transition.state_rows[:, ns:] @ push[k]
             mean[ns:, 0] += shift[k]
-        return white, mean, seen
+        return white, mean, np.array(before) if keep_means else None
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
         """Smooth all steps: measurement noise (r, c), first costates (nx, c), and costates after each step (k, nx, c).
 
         `white` are the normalized innovations, `costate` is the costate after the last step.
         """
+        seen = np.empty((len(self.moves), *costate.shape))
         if (library := _library()) is not None:
-            return self._compiled_columns(library, white, costate, None, None)
-        noise, seen = np.empty_like(white), np.empty((len(self.moves), *costate.shape))
+            return *self._compiled_columns(library, white, costate, seen), seen
+        noise = np.empty_like(white)
         for k, (span, step) in reversed(list(enumerate(self._single_steps()))):
             seen[k] = costate
             noise[span], costate = step.smoothed_measurement_noise_and_costate(white[span], costate)
         return noise, costate, seen
 
     def _compiled_columns(
-        self, library: ctypes.CDLL, rows: Array, state: Array, shift: Array | None, push: Array | None
-    ) -> tuple[Array, Array, Array]:
-        """Results of the recursion of the mean or, without a shift, of the costate."""
-        rows, state, seen = rows.copy(), state.copy(), np.empty((len(self.moves), *state.shape))
+        self, library: ctypes.CDLL, rows: Array, state: Array, seen: Array | None, *inputs: Array | None
+    ) -> tuple[Array, Array]:
+        """Rows and state after the recursion of the mean, with the inputs push and shift, or of the costate."""
+        rows, state = rows.copy(), state.copy()
         size = np.array([*self.moves.shape, len(state), self.moves.shape[2] - self.noises], np.int32)
         steps: list[NDArray[Any] | None] = [size, np.array(self.row_start, np.int32), self.moves, self.decay, None]
         steps += [self.observation, self.whitening, self.projected_covariance, None]
-        inputs = [None if a is None else np.ascontiguousarray(a) for a in (push, shift)]
-        columns: list[NDArray[Any] | None] = [np.array(state.shape[1:], np.int32), rows, state, seen, *inputs]
-        if not library.yid_kalman_columns(_addresses(steps), _addresses(columns), ctypes.c_int(shift is None)):
+        given = [None if a is None else np.ascontiguousarray(a) for a in inputs or (None, None)]
+        columns: list[NDArray[Any] | None] = [np.array(state.shape[1:], np.int32), rows, state, seen, *given]
+        if not library.yid_kalman_columns(_addresses(steps), _addresses(columns), ctypes.c_int(not inputs)):
             raise out_of_memory_error("the work on one step of a filter", 4 * state.nbytes)
-        return rows, state, seen
+        return rows, state
 
 
 def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_void_p]:

@@ -56,6 +56,7 @@ from yid_ocp.problem.measurements import subtract_estimated_biases
 
 _MIN_TORQUE_GAIN = 0.1  # smallest derivative of applied by recorded torque for conversions of errors
 _MIN_START_SLOPE = 1e-12  # smaller derivatives of an initial state are rounding
+_ROWS_PER_BLOCK = 4096  # rows whose derivatives by torques are expanded at once
 _MAX_ROLLOUTS = 6  # each about the torque offset estimated from the one before
 _TORQUE_BIAS_TOLERANCE = 0.05  # change of the offset in stated standard deviations that ends them
 
@@ -89,7 +90,7 @@ class _SmoothedInputErrors(NamedTuple):
 class WhiteningFilter:
     """Kalman filter that whitens the residual of a recording, linearized along one rollout."""
 
-    filter_steps: tuple[_FilterPart, ...]  # up to the last node
+    filter_steps: tuple[_FilterPart, ...]  # all steps, and the last node
     input_error_model: InputErrorModel  # includes the values of b and w at the linearisation
     initial_covariance: Array  # covariance of (d, w, b) before all measurements, shape (na, na)
     state_mask: BoolArray  # states contained in d, shape (nx,)
@@ -128,6 +129,7 @@ class WhiteningFilter:
         for part in self.filter_steps:
             # without sensor noise there is no innovation; rounding keeps the error bounded
             _, mean, before = self._updated(part, mean, rows[part.rows, None] - noise[part.rows], push, white)
+            assert before is not None
             error[part.first : part.first + len(before), self.state_mask] = before[:, :ns, 0]
         return _SmoothedInputErrors(bias[:, 0], white, error)
 
@@ -140,15 +142,18 @@ class WhiteningFilter:
 
     def _updated(
         self, part: _FilterPart, mean: Array, own: Array, push: Array | None, white: Array | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Innovations of some steps, the mean after them and the means before each, with torque noise `white`."""
+    ) -> tuple[Array, Array, Array | None]:
+        """Innovations of some steps and the mean after them; with torque noise `white` also the means before each."""
         noise = self.input_error_model.torque_noise
         known = None
         if push is not None and part.first < len(push):
-            own = own - np.einsum("ru,ruc->rc", part.by_torque, push[part.step_of_row])
             known = push[part.first : part.first + len(part.kalman.moves)]
+            own = own.copy()
+            for first in range(0, len(own), _ROWS_PER_BLOCK):
+                rows = slice(first, first + _ROWS_PER_BLOCK)
+                own[rows] -= np.einsum("ru,ruc->rc", part.by_torque[rows], push[part.step_of_row[rows]])
         shift = part.fresh_noise(-noise if white is None else white - noise)
-        return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known)
+        return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known, white is not None)
 
 
 def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) -> WhiteningFilter:
@@ -163,7 +168,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
     first = unit @ unit.T
-    made, covariance = _filter_steps(course, errors, kept, slopes, rows_of_node[:-1], first)
+    steps, covariance = _filter_steps(course, errors, kept, slopes, rows_of_node[:-1], first)
     # after the last node there is no motion
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
@@ -171,7 +176,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     kalman, covariance = prepare_kalman_steps(covariance, observe, (0, len(rows)), *still)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
     last = _FilterPart(count, rows, np.full(len(rows), count), kalman, none)
-    return WhiteningFilter((*made, last), errors, first, live, spread)
+    return WhiteningFilter((steps, last), errors, first, live, spread)
 
 
 def _filter_steps(
@@ -181,9 +186,9 @@ def _filter_steps(
     slopes: ResidualDerivativesAtNodes,
     rows_of_node: Sequence[IntArray],
     covariance: Array,
-) -> tuple[list[_FilterPart], Array]:
+) -> tuple[_FilterPart, Array]:
     """Filter over all steps for the kept states, and the covariance after the last step."""
-    (count, nu), ns, made, begun = course.rollout.torque.shape, len(kept), list[_FilterPart](), 0
+    (count, nu), ns, begun = course.rollout.torque.shape, len(kept), 0
     # a new w at each new sample, and the same b
     fresh = np.append(np.diff(errors.sample_of_step) != 0, False)[:, None]
     decay = np.hstack([np.repeat(1.0 - fresh, nu, axis=1), np.ones((count, nu))])
@@ -206,26 +211,32 @@ def _filter_steps(
     ordered = slopes.select_residual_rows(order)
     (before, after), by_effort = ordered.by_state, ordered.by_effort.sum(axis=0)
     ends = np.cumsum([0, *map(len, rows_of_node)])
+    # stepwise matrices of all steps stand together, so that a column is filtered in one call
+    moves, whitening = np.empty((count, ns, len(columns))), list[Array]()
+    observe, by_torque, projected = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu)), np.empty((ends[-1], na))
     for state, effort in step_derivatives_along_rollout(
         course.model_functions.step, course.theta, course.rollout, inputs, feedback
     ):
         span = slice(begun, begun + len(state))
-        move = state if ns == nx else state[:, kept[:, None], columns]
-        starts, own = ends[span.start : span.stop + 1], slice(ends[span.start], ends[span.stop])
-        starts = (starts - starts[0]).tolist()
-        observe, by_torque = np.zeros((starts[-1], na)), np.zeros((starts[-1], nu))
-        for k, rows in enumerate(slice(*pair) for pair in pairwise(starts)):
-            observe[rows, :known] = after[own][rows] @ move[k, :, :known]
+        move = moves[span]
+        move[:] = state if ns == nx else state[:, kept[:, None], columns]
+        own = slice(ends[span.start], ends[span.stop])
+        for k, rows in enumerate(slice(*pair) for pair in pairwise(ends[span.start : span.stop + 1].tolist())):
+            observe[rows, :known] = after[rows] @ move[k, :, :known]
             by_torque[rows] = observe[rows, ns:known]
             if by_effort.shape[1]:
-                observe[rows, :known] += by_effort[own][rows] @ effort[k, : by_effort.shape[1]][:, columns[:known]]
-        observe[:, known:] = observe[:, ns:known]
-        observe[:, :ns] += before[own]
-        noise = (inputs.shape[2] - nu, decay[span], variance[span])
-        steps, covariance = prepare_kalman_steps(covariance, observe, starts, move, *noise)
-        made.append(_FilterPart(begun, order[own], step_of_row[own], steps, by_torque))
+                observe[rows, :known] += by_effort[rows] @ effort[k, : by_effort.shape[1]][:, columns[:known]]
+        observe[own, known:] = observe[own, ns:known]
+        observe[own, :ns] += before[own]
+        starts, noise = (ends[span.start : span.stop + 1] - own.start).tolist(), (inputs.shape[2] - nu, decay[span])
+        steps, covariance = prepare_kalman_steps(covariance, observe[own], starts, move, *noise, variance[span])
+        whitening.append(steps.whitening)
+        projected[own] = steps.projected_covariance
         begun = span.stop
-    return made, covariance
+    kalman = KalmanSteps(
+        ends.tolist(), moves, inputs.shape[2] - nu, decay, observe, np.concatenate(whitening), projected
+    )
+    return _FilterPart(0, order, step_of_row, kalman, by_torque), covariance
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,13 +125,15 @@ class EquilibriumSolver:
             w, error, converged = self._near(equations, start) if guess is not None and m else (start, math.inf, False)
             if not converged:
                 w, error, converged = _damped_newton(equations, start, _REST_TOLERANCE)
-            inner = w[count - nz : count]
-            energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
-            found = (not converged, energy if converged else error, error, w)
-            if best is None or found[:2] < best[:2]:
-                best = found
             if converged and guess is not None:
+                best = (False, 0.0, error, w)
                 break
+            inner = w[count - nz : count]
+            energy = (
+                float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta)) if converged else error
+            )
+            if best is None or (not converged, energy) < best[:2]:
+                best = (not converged, energy, error, w)
         assert best is not None
         failed, _, error, w = best
         if failed and guess is None:
@@ -169,7 +171,7 @@ class EquilibriumSolver:
         w, error, converged = _damped_newton(equations, near, _REST_TOLERANCE)
         return w, error, converged and float(np.max(np.abs(w - start)[:count])) < _NEAR_GUESS
 
-    def _guesses(self, given: Array, guess: ArrayLike | None) -> list[Array]:
+    def _guesses(self, given: Array, guess: ArrayLike | None) -> Iterator[Array]:
         """Starts of the search: the given or undeformed shape, then bent copies (Newton fails for a straight chain)."""
         system = self.step.system
         first = np.zeros(len(self.free_coordinates) + self.step.sizes["nz"] + self.step.sizes["m"])
@@ -177,15 +179,14 @@ class EquilibriumSolver:
         q[list(self.known_coordinates)] = given
         q = q if guess is None else np.asarray(guess, float)
         first[: len(self.free_coordinates)] = q[list(self.free_coordinates)]
-        starts = [first]
+        yield first
         bends = (spring.joint_name for spring in system.elastic_joints if spring.deformation == "bend")
         elastic = set(map(system.mechanism.joint_index, bends))
         bendable = [row for row, index in enumerate(self.free_coordinates) if index in elastic]
         for seed in range(4 if bendable and system.grasps else 0):
             bent = first.copy()
             bent[bendable] += np.random.default_rng(seed).normal(scale=0.05, size=len(bendable))
-            starts.append(bent)
-        return starts
+            yield bent
 
     def _configuration(self, w: Array, given: Array) -> Array:
         q = np.zeros(self.step.system.n_coordinates)
@@ -240,7 +241,7 @@ class EquilibriumSolver:
 
         def by_point(new: Array, old: Array, push: Array) -> Array:
             """By (q, z, lam), both nodes together and torques as they follow the angles."""
-            whole = new[0].copy()
+            whole = new[0]
             whole[:, : n + nz] += old[0]
             whole[:, driven] -= hold.stiffness * push[0]
             return whole
@@ -283,7 +284,7 @@ class EquilibriumSolver:
         driven = list(self.step.system.driven_coordinate_indices)
         push, push_p = hold.stiffness * push, hold.stiffness * push_p
         push[driven, range(nu)] += hold.by_hand
-        push_p[driven, range(nu)] += self.step.clock_scaled_time_step(theta) / 2 * hold.by_hand
+        push_p[driven, range(nu)] += h / 2 * hold.by_hand
         by_other = np.hstack([others, push, rows[:, fixed]])[self._sought]
         change = -_solved(rows[np.ix_(self._sought, self._sought)], by_other)
         state = np.concatenate([self._configuration(w, hold.given), p, w[free : free + nz]])

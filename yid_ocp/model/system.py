@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
-from yid_ocp.model.kinematics import Kinematics
+from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import (
@@ -370,6 +370,12 @@ class System(ReprMixin):
     def unprescribed_coordinate_indices(self) -> tuple[int, ...]:
         """Indices in q of the joints without prescribed motion."""
         return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_coordinate_indices)
+
+    @cached_property
+    def symbolic_kinematics(self) -> tuple[ca.SX, Kinematics]:
+        """Symbols q of a configuration, (n, 1), and the kinematics there, which several functions share."""
+        q = ca.SX.sym("q", self.n_coordinates)
+        return q, forward_kinematics(self.mechanism, q)
 
     @property
     def effect_internal_coordinate_symbols(self) -> dict[str, ca.SX]:

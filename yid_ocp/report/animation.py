@@ -19,7 +19,6 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, json_sha256, read_input_text, write_text
 from yid_ocp.integrator.compiler import private_cache_folder
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint, mesh_sources_sha256
@@ -157,8 +156,7 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
     """Position and quaternion (x, y, z, w) of joints at configurations (F, n), as integers, one row per frame."""
     if not names:
         return []
-    symbols, index = ca.SX.sym("q", system.n_coordinates), system.mechanism.joint_index
-    moved = forward_kinematics(system.mechanism, symbols)
+    (symbols, moved), index = system.symbolic_kinematics, system.mechanism.joint_index
     parts = [ca.horzcat(moved.joint_rotations[index(name)], moved.joint_origins[index(name)]) for name in names]
     function = ca.Function("poses", [symbols, system.parameters.symbols], [ca.densify(ca.horzcat(*parts))])
     found = np.array(function.map(len(q))(q.T, np.tile(theta[:, None], (1, len(q)))))
@@ -191,8 +189,7 @@ class ConfigurationTrajectory:
 def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _AnimatedMotion:
     """Joints, tips and points of a system at configurations q (F, n), and the lines between them."""
     system, tree = told.system, told.system.mechanism
-    symbols, names, owned = ca.SX.sym("q", system.n_coordinates), tree.joint_names, _link_radii(system, told.theta)
-    kinematics = forward_kinematics(tree, symbols)
+    (symbols, kinematics), names, owned = system.symbolic_kinematics, tree.joint_names, _link_radii(system, told.theta)
     origins = list(kinematics.joint_origins)
     pairs = [(joint.parent_index, j, names[j] in owned) for j, joint in enumerate(tree.joints)]
     points: dict[str, int] = {}

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import functools
 import gzip
 import inspect
 import logging
 import os
 import re
-from importlib import util
+from importlib import metadata, util
 from pathlib import Path
 
+from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import write_text
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS
+from yid_ocp.integrator.compiler import private_cache_folder
 from yid_ocp.report.figures import figure_html
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import CodeBlock, SummaryTable
@@ -75,8 +78,9 @@ def _plotly_script() -> tuple[str, str]:
 
 
 def _shared_script(path: Path) -> str:
-    scripts = [folder / _plotly_script()[0] for folder in (path.parent, *path.parent.parents)]
-    found = next(filter(_is_plotly_script, scripts[: _SHARED_SCRIPT_LEVELS + 1]), None)
+    folders = [path.parent, *path.parent.parents][: _SHARED_SCRIPT_LEVELS + 1]
+    scripts = (script for folder in folders for script in sorted(folder.glob("plotly-*.min.js")))
+    found = next(filter(_is_plotly_script, scripts), None)
     return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()
 
 
@@ -88,9 +92,18 @@ def _is_plotly_script(path: Path) -> bool:
 
 @functools.cache
 def _packed_script() -> str:
-    """Plotly's script, compressed to a third of its size; the page decompresses it."""
+    """Plotly's script, compressed to a third of its size, which the user's cache keeps; the page decompresses it."""
+    file: Path | None = None
+    with contextlib.suppress(YidError):  # a page has its script without a cache, too
+        file = private_cache_folder() / f"plotly-{metadata.version('plotly')}.base64"
+    if file and file.is_file():
+        return file.read_text(encoding="ascii")
     small = gzip.compress(_plotly_script()[1].encode(), compresslevel=4, mtime=0)
-    return base64.b64encode(small).decode("ascii")
+    packed = base64.b64encode(small).decode("ascii")
+    with contextlib.suppress(OutputError):
+        if file:
+            write_text(file, packed)
+    return packed
 
 
 def _format_number(value: object, digits: int = 4) -> str:

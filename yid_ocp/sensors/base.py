@@ -14,7 +14,6 @@ from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState, System
 from yid_ocp.options import OptionInfo
@@ -284,7 +283,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     n = system.n_coordinates
     sizes = {"q": n, "v": n, "a": n, "z": len(rows), "load": n, "lam": system.n_constraints}
     at = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    kinematics, scale = forward_kinematics(system.mechanism, at["q"]), system.recorded_time_scale
+    (at["q"], kinematics), scale = system.symbolic_kinematics, system.recorded_time_scale
     true = (at["q"], at["v"] / scale, at["a"] / scale**2, at["z"], at["load"], at["lam"] / scale)
     state = NodeState(system, kinematics, *true, rows, sensor.camera_pose)
     parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
