@@ -19,9 +19,9 @@ HEADER = (
     "held out", "CPU [s]", "lines",
 )  # fmt: skip
 MADE_BY = {
-    "MuJoCo": "recordings by MuJoCo, the engine of `mujoco.sysid` and `least_squares`: an advantage for these two",
+    "MuJoCo": "recordings by MuJoCo",
     "real": "real recordings; the true values are not known",
-    "closed form": "recordings from a formula, no engine",
+    "closed form": "recordings from a formula",
 }
 
 
@@ -84,11 +84,13 @@ def markdown(known: Mapping[str, Any]) -> str:
     for case, entry in known["cases"].items():
         seeds = max(len(own["runs"]) for own in entry["tools"].values())
         real = entry["made_by"] == "real"
-        what = "kinds of motion, each held out once" if real else "repetitions with different noise"
+        what = "kinds of motion, each held out once" if real else "repetitions"
         parts.append(
             f"**{entry['title'][0].upper()}{entry['title'][1:]}** ({seeds} {what}; {MADE_BY[entry['made_by']]})"
         )
         table = [HEADER, ["---"] * len(HEADER), *rows(case, entry)]
+        if not entry["truth"]:
+            table = [[row[0], *row[5:]] for row in table]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in table))
     return "\n\n".join(parts)
 
