@@ -39,9 +39,7 @@ from yid_ocp.model.objects.cable import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
-    constant_position_naive_prediction,
-    interpolated_displacement_naive_prediction,
-    mean_clamp_displacement_naive_prediction,
+    naive_cable_predictions,
     recorded_point_positions,
 )
 from yid_ocp.solvers import GaussNewton, solve
@@ -134,17 +132,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
 def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     """Prediction errors without a model [m]."""
     free, measured = cable.unclamped_vertex_names, recorded_point_positions(recording, cable.unclamped_vertex_names)
-    predictions = {
-        "stay": constant_position_naive_prediction(recording, free),
-        "move_with_clamps": mean_clamp_displacement_naive_prediction(recording, free, cable.clamped_vertex_names),
-        "linear_carry": interpolated_displacement_naive_prediction(
-            recording,
-            free,
-            cable.parent_branch_vertex_names,
-            cable.vertex_names_by_child_branch,
-            cable.clamped_vertex_names,
-        ),
-    }
+    predictions = naive_cable_predictions(recording, cable, free, cable.clamped_vertex_names)
     return {name: _position_rmse(predicted, measured) for name, predicted in predictions.items()}
 
 
@@ -237,8 +225,8 @@ def show(result: Mapping[str, Any], console: Console) -> None:
 
     def row(name: str, entry: Mapping[str, Any], plain: Mapping[str, float]) -> None:
         errors = [
-            plain["stay"],
-            plain["move_with_clamps"],
+            plain["stays"],
+            plain["moves_with_clamps"],
             plain["linear_carry"],
         ]
         errors += [entry["nominal"], entry["undeformed_rest"], entry["error"]]

@@ -10,12 +10,11 @@ from small_problems import PENDULUM, H, pendulum_step, taken
 import yid_ocp as yid
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     _noisy,
-    constant_position_naive_prediction,
-    interpolated_displacement_naive_prediction,
-    mean_clamp_displacement_naive_prediction,
+    naive_cable_predictions,
     recorded_point_positions,
     rmse_unit_and_count_by_channel,
 )
@@ -160,65 +159,56 @@ def recording():
     return Recording(points=(PointGroup("points", NAMES, 0.01 * np.arange(frames), at),), name="made")
 
 
+CABLE = CableTopology(PARENT, CHILDREN, dict.fromkeys(NAMES, (0.0, 0.0, 0.0)))
+
+
 def test_stay_repeats_the_last_given_frame(recording):
-    predicted = constant_position_naive_prediction(recording, NAMES)
+    predicted = naive_cable_predictions(recording, CABLE, NAMES)["stays"]
     np.testing.assert_array_equal(predicted[:2], recorded_point_positions(recording, NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 
 def test_all_points_move_with_the_mean_of_the_clamps(recording):
-    predicted = mean_clamp_displacement_naive_prediction(recording, ("p2", "c1"), ("p0", "p4"))
-    np.testing.assert_allclose(predicted[-1, :, 2], 2e-3 * 9)
+    predicted = naive_cable_predictions(recording, CABLE, ("p2", "c1"))["moves_with_clamps"]
+    # the clamps hold p0, p1, p3 and p4
+    np.testing.assert_allclose(predicted[-1, :, 2], 1e-3 * 9)
     np.testing.assert_allclose(predicted[-1, :, :2], [[0.2, 0.0], [0.2, 0.1]])
-    # with one clamp they move as it does
-    alone = mean_clamp_displacement_naive_prediction(recording, ("p2", "c1"), ("p4",))
-    np.testing.assert_allclose(alone[-1, :, 2], 3e-3 * 9)
 
 
 def test_linear_carry_interpolates_along_the_arc_and_children_follow_their_junction(recording):
-    predicted = interpolated_displacement_naive_prediction(recording, ("p1", "p2", "p3", "c1", "c2"), PARENT, CHILDREN)
+    predicted = naive_cable_predictions(recording, CABLE, ("p1", "p2", "p3", "c1", "c2"))["linear_carry"]
     # arc length as in the last given frame; the ends' heights differ by 2 mm there, which lengthens the chain by 1e-5
     np.testing.assert_allclose(predicted[-1, :, 2] / 9e-3, [1.4, 1.8, 2.6, 1.8, 1.8], rtol=1e-3)
 
 
 def test_linear_carry_between_inner_points_holds_the_ends_beyond_them(recording):
-    predicted = interpolated_displacement_naive_prediction(
-        recording, ("p2",), PARENT, CHILDREN, clamped=("p0", "p1", "p4")
-    )
+    predicted = naive_cable_predictions(recording, CABLE, ("p2",), ("p0", "p1", "p4"))["linear_carry"]
     np.testing.assert_allclose(predicted[-1, 0, 2], 3 * 9e-3 * 0.25, rtol=1e-3)
 
 
 def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
     seen = recording.points[0].position.copy()
-    seen[2:, 1:4] += 7.0
+    seen[2:, 2] += 7.0
     seen[2:, 5:] += 7.0
     other = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="other")
-    free = ("p1", "p2", "p3", "c1", "c2")
-    for method in (
-        lambda r: constant_position_naive_prediction(r, free),
-        lambda r: mean_clamp_displacement_naive_prediction(r, free, ("p0", "p4")),
-        lambda r: interpolated_displacement_naive_prediction(r, free, PARENT, CHILDREN),
-    ):
-        np.testing.assert_array_equal(method(recording)[2:], method(other)[2:])
+    free = ("p2", "c1", "c2")
+    found, expected = (naive_cable_predictions(which, CABLE, free) for which in (other, recording))
+    assert set(found) == {"stays", "moves_with_clamps", "linear_carry"}
+    for name, predicted in found.items():
+        np.testing.assert_array_equal(predicted[2:], expected[name][2:])
 
 
-@pytest.mark.parametrize(
-    ("call", "text"),
-    [
-        (lambda r: constant_position_naive_prediction(r, ("p9",)), "not recorded"),
-        (lambda r: constant_position_naive_prediction(r, ("p1",), given=0), "given = 0"),
-        (lambda r: constant_position_naive_prediction(r, ("p1",), given=11), "given = 11"),
-        (lambda r: interpolated_displacement_naive_prediction(r, ("c1",), PARENT), "belongs to no branch"),
-    ],
-)
-def test_what_cannot_be_predicted_is_said(recording, call, text):
-    with pytest.raises(DataError, match=text):
-        call(recording)
-    seen = recording.points[0].position.copy()
+def test_what_cannot_be_predicted_is_said(recording):
+    with pytest.raises(DataError, match="not recorded"):
+        naive_cable_predictions(recording, CABLE, ("p9",))
+    seen, t = recording.points[0].position.copy(), recording.points[0].t
+    short = Recording(points=(PointGroup("points", NAMES, t[:2], seen[:2]),), name="short")
+    with pytest.raises(DataError, match="there are 2 frames"):
+        naive_cable_predictions(short, CABLE, ("p2",))
     seen[1, 2] = np.nan
-    hidden = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="hidden")
+    hidden = Recording(points=(PointGroup("points", NAMES, t, seen),), name="hidden")
     with pytest.raises(DataError, match="'p2' is not seen"):
-        constant_position_naive_prediction(hidden, ("p2",))
+        naive_cable_predictions(hidden, CABLE, ("p2",))
 
 
 @pytest.fixture

@@ -21,11 +21,11 @@ from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import free_estimates_marked_not_trusted, typical_parameter_magnitudes
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import MEMORY_HALVING_SPEED_PARAMETER_NAME, START_SPEED_PARAMETER_NAME
-from yid_ocp.problem import EstimationProblem, predictions
+from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
+from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_and_count_by_channel
 from yid_ocp.sensors.base import Sensor
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers import base as solvers
@@ -264,7 +264,6 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
 
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
 _N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the torques
-_START_FRAMES = 2  # frames from which the baselines of a cable start, as its own start state does
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
@@ -424,18 +423,9 @@ def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableTopolo
     if sensor.naive_prediction == "zero":
         return {"zero": np.zeros_like(samples.value)}
     if cable is not None and sensor.point_names and set(sensor.point_names) <= set(cable.vertex_names):
-        recording, held, points = episode.recording, cable.clamped_vertex_names, sensor.point_names
-        group = next(group for group in recording.points if group.name == sensor.group_name)
+        group = next(group for group in episode.recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
-        parents, children = cable.parent_branch_vertex_names, cable.vertex_names_by_child_branch
-        carried = predictions.interpolated_displacement_naive_prediction
-        arrays = {
-            "stays": predictions.constant_position_naive_prediction(recording, points, _START_FRAMES),
-            "moves_with_clamps": predictions.mean_clamp_displacement_naive_prediction(
-                recording, points, held, _START_FRAMES
-            ),
-            "linear_carry": carried(recording, points, parents, children, given=_START_FRAMES),
-        }
+        arrays = naive_cable_predictions(episode.recording, cable, sensor.point_names)
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
     if not len(samples.value):
         return {}

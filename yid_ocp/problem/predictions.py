@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin
 from yid_ocp.errors import DataError, failed_rollout_error, unknown_name_error_arguments
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -40,58 +41,38 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
     raise DataError(what, where=where, **said)
 
 
-def constant_position_naive_prediction(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
-    """Predict, as a baseline without a model, that every point stays at its position in the last given frame.
+_GIVEN_FRAMES = 2  # frames that the predictions of a cable without a model start from, as its own start state does
 
-    Returns positions (M, len(points), 3) [m]; the first `given` frames are as measured. Raises `DataError` if a point
-    is not recorded or not measured in the last given frame, or if there are too few frames.
+
+def naive_cable_predictions(
+    recording: Recording, cable: CableTopology, points: Sequence[str], knots: Sequence[str] | None = None
+) -> dict[str, Array]:
+    """Predict positions (M, len(points), 3) [m] of cable points without a model, from two frames and the clamps' paths.
+
+    With `stays`, every point stays at its position in the second frame. With `moves_with_clamps`, it moves by the mean
+    displacement of the clamped points since then. With `linear_carry`, displacements are interpolated along the arc
+    length of the parent branch between its points `knots` (default: its two ends), and children move with their
+    junction. The first two frames are as measured. Raises `DataError` if a point is not recorded or not measured in the
+    second frame, or if there are fewer than three frames.
     """
-    return _carried(recording, points, (), given, np.zeros((len(points), 0)))
-
-
-def mean_clamp_displacement_naive_prediction(
-    recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2
-) -> Array:
-    """Predict, as a baseline without a model, that every point moves by the mean displacement of the clamped points.
-
-    Displacements count from the last given frame. The path of the `clamped` points is known. Shape and errors are as in
-    `constant_position_naive_prediction`.
-    """
-    share = np.full((len(points), len(clamped)), 1.0 / max(len(clamped), 1))
-    return _carried(recording, points, clamped, given, share)
-
-
-def interpolated_displacement_naive_prediction(
-    recording: Recording,
-    points: Sequence[str],
-    parent: Sequence[str],
-    children: Mapping[str, Sequence[str]] | None = None,
-    clamped: Sequence[str] | None = None,
-    given: int = 2,
-) -> Array:
-    """Predict displacements, as a baseline without a model, by interpolation along the arc length of the parent branch.
-
-    `parent` lists its points from end to end. Displacements are interpolated between its points `clamped` (default: its
-    two ends). Children move with their junction: each child starts with the parent point of its junction. Shape and
-    errors are as in `constant_position_naive_prediction`; a point without a branch also raises `DataError`.
-    """
-    known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
-    at = _given_frame(recording, parent, given)
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
-    place = dict(zip(parent, arc, strict=True))
-    knots = sorted(known, key=lambda point: place[point])
-    positions = [place[point] for point in knots]
-    leaves = {point: branch[0] for branch in (children or {}).values() for point in branch[1:]}
-
-    def weights(point: str) -> Array:
-        carrier = leaves.get(point, point)
-        if carrier not in place:
-            said = unknown_name_error_arguments(point, [*place, *leaves])
-            raise DataError(f"point '{point}' belongs to no branch", where="branches of the object", **said)
-        return np.array([np.interp(place[carrier], positions, row) for row in np.eye(len(knots))])
-
-    share = np.array([weights(point) for point in points])
-    return _carried(recording, points, knots, given, share)
+    start, parent, held = _start_frame(recording, points), cable.parent_branch_vertex_names, cable.clamped_vertex_names
+    line = np.cumsum(np.linalg.norm(np.diff(_start_frame(recording, parent), axis=0), axis=1))
+    arc = dict(zip(parent, [0.0, *line], strict=True))
+    junction = {point: branch[0] for branch in cable.vertex_names_by_child_branch.values() for point in branch[1:]}
+    ends = sorted(knots or (parent[0], parent[-1]), key=arc.__getitem__)
+    places, between = [arc[junction.get(point, point)] for point in points], [arc[point] for point in ends]
+    shares = {
+        "moves_with_clamps": (held, np.full((len(points), len(held)), 1.0 / len(held))),
+        "linear_carry": (ends, np.stack([np.interp(places, between, row) for row in np.eye(len(ends))], axis=1)),
+    }
+    found = {"stays": np.array(recorded_point_positions(recording, points))}
+    found |= {name: found["stays"].copy() for name in shares}
+    for predicted in found.values():
+        predicted[_GIVEN_FRAMES:] = start
+    for name, (known, share) in shares.items():
+        moved = recorded_point_positions(recording, known) - _start_frame(recording, known)
+        found[name][_GIVEN_FRAMES:] += np.einsum("pk,mkx->mpx", share, moved)[_GIVEN_FRAMES:]
+    return found
 
 
 def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
@@ -100,33 +81,19 @@ def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Arr
     return group.position[:, [group.names.index(point) for point in points]]
 
 
-def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Array:
-    at = recorded_point_positions(recording, points)
-    if not 1 <= given < len(at):
-        raise DataError(
-            f"given = {given} frames are not possible with the {len(at)} frames of recording '{recording.name}'",
-            where="argument `given`, the number of frames that the predictor may read",
-            allowed=f"1 to {len(at) - 1}",
-            hint="give fewer frames, so that at least one is left to predict",
-        )
-    if not np.all(np.isfinite(at[given - 1])):
-        hidden = points[int(np.argmin(np.isfinite(at[given - 1]).all(axis=1)))]
-        what, allowed = f"point '{hidden}' is not seen in the last given frame, {given - 1}", "a frame with all points"
-        hint = "choose another count of given frames, or leave the point out"
-        raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
-    return np.asarray(at[given - 1])
-
-
-def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], given: int, share: Array) -> Array:
-    """Given frames as measured, then the last given frame plus each point's share of the known displacements."""
-    here = _given_frame(recording, points, given)
-    result = np.array(recorded_point_positions(recording, points))
-    moved = np.zeros((len(result), len(points), 3))
-    if known:
-        paths = recorded_point_positions(recording, known)
-        moved = np.einsum("pk,mkx->mpx", share, paths - _given_frame(recording, known, given))
-    result[given:] = here + moved[given:]
-    return result
+def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
+    """Positions (len(points), 3) [m] in the last of the frames that predictions without a model start from."""
+    at, where = recorded_point_positions(recording, points), f"recording '{recording.name}'"
+    if len(at) <= _GIVEN_FRAMES:
+        what, allowed = f"there are {len(at)} frames of the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
+        raise DataError(what, where=where, allowed=allowed, hint="leave the recording out")
+    start = np.asarray(at[_GIVEN_FRAMES - 1])
+    if not np.all(np.isfinite(start)):
+        hidden = points[int(np.argmin(np.isfinite(start).all(axis=1)))]
+        what, allowed = f"point '{hidden}' is not seen in frame {_GIVEN_FRAMES}", "a frame with all points"
+        hint = "begin the recording where all points are seen, or leave the point out"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
+    return start
 
 
 @dataclass(frozen=True, eq=False, repr=False)
