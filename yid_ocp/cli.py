@@ -29,7 +29,6 @@ from yid_ocp.errors import (
     InsufficientMemoryError,
     OutputError,
     YidError,
-    missing_package_error,
     unknown_name_error_arguments,
 )
 
@@ -251,11 +250,6 @@ def _report(parser: argparse.ArgumentParser) -> None:
     _printing(parser, "folder's path")
 
 
-def _completion(parser: argparse.ArgumentParser) -> None:
-    text = 'run `eval "$(yid-ocp completion bash)"` in ~/.bashrc, or ~/.zshrc with zsh; in fish pipe it to `source`'
-    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help=text)
-
-
 def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
@@ -271,14 +265,6 @@ def _print_schema(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         write_text(Path(arguments.out), text + "\n")
     print(text if arguments.out is None else arguments.out)
-    return 0
-
-
-def _print_completion_script(arguments: argparse.Namespace) -> int:
-    try:
-        print(import_module("argcomplete").shellcode(["yid-ocp"], shell=arguments.shell).strip())
-    except ImportError as error:
-        raise missing_package_error(ConfigError, "completion needs the package argcomplete", "completion") from error
     return 0
 
 
@@ -319,7 +305,6 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and experiments that would determine more"
 _SAID_BLIND = "test the diagnosis on synthetic recordings with sealed effects; resumes an interrupted test"
 _SAID_REPORT = "compare runs of one model: changed parameters, deviating runs; overlay two of the same recordings"
-_SAID_COMPLETION = "print a script that completes commands, options, files and settings in a shell"
 _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"
 COMMANDS = tuple(
     _CliCommand(*row)
@@ -340,7 +325,6 @@ COMMANDS = tuple(
         ("track", "measure the object's points in the frames of a depth camera", "track", _track),
         ("import", "turn a file of another tool into a recording", "import_recording", _import),
         ("export", _SAID_EXPORT, "export", _export),
-        ("completion", _SAID_COMPLETION, _print_completion_script, _completion),
         ("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
     )
 )

@@ -7,7 +7,6 @@ import logging
 import os
 import pathlib
 import re
-import shutil
 import subprocess
 import sys
 
@@ -385,17 +384,6 @@ def test_schema_is_the_one_beside_the_configurations(cli, repository, tmp_path):
 FILE = "model: {object: {kind: foam_y}}\nparameters:\n  T1.bend: {free: true}\n  T1.twist: {}\n"
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_every_shell_has_its_script(cli, shell):
-    pytest.importorskip("argcomplete")
-    done = cli("completion", shell)
-    assert (done.code, done.err) == (0, "")
-    assert "yid-ocp" in done.out
-    if program := shutil.which(shell):
-        checked = subprocess.run([program, "-n"], input=done.out, text=True, capture_output=True, check=False)
-        assert (checked.returncode, checked.stderr) == (0, "")
-
-
 def asked(line, tmp_path):
     """What may stand at the end of a line, by the protocol of the scripts."""
     pytest.importorskip("argcomplete")
@@ -432,10 +420,3 @@ def test_keys_that_may_be_set(tmp_path):
     assert "model.object.links=" in settable_keys_with_prefix("model.object.l", file)
     method = "compare.methods.multiple_shooting."
     assert f"{method}condensing=" in settable_keys_with_prefix(method)
-
-
-def test_without_the_package_the_command_says_so_and_the_shell_gets_nothing(cli, monkeypatch):
-    monkeypatch.setitem(sys.modules, "argcomplete", None)
-    done = cli("completion", "bash")
-    assert done.code == 2
-    assert "pip install 'yid-ocp[completion]'" in done.err
