@@ -146,12 +146,11 @@ def _linearised(step: Step, point: _LinearisationPoint) -> tuple[dict[str, Array
     """Jacobians A, B_u and B_theta of the step at a point, and the linearised equations of the step."""
     n, path = step.sizes["n"], point.prescribed_positions
     q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
-    try:
-        found = step.jacobians(q, p, point.torque, point.theta, (path, path) if len(path) else None, z)
-    except np.linalg.LinAlgError as error:
+    found = step.jacobians(q, p, point.torque, point.theta, (path, path) if len(path) else None, z)
+    if not all(np.isfinite(matrix).all() for matrix in found):
         what, allowed = "the step cannot be linearised: its equations are singular", "a model with regular equations"
         hint = "give massless links a mass, or remove redundant grasps"
-        raise ModelError(what, where=point.description, allowed=allowed, hint=hint) from error
+        raise ModelError(what, where=point.description, allowed=allowed, hint=hint)
     rows = step_diagnostics.linearise_step_equations(step, point.state, point.torque, point.theta, path)
     return dict(zip(("A", "B_u", "B_theta"), found, strict=True)), rows
 
