@@ -66,6 +66,15 @@ def test_an_estimate_moves_to_where_a_linear_finer_model_fits_best(factor):
     assert shifts(coarse, finer, {"a": factor}) == pytest.approx({"a": 0.3, "b": -0.2})
 
 
+def test_a_finer_model_that_is_far_away_is_fitted_and_not_followed_along_a_tangent():
+    """One linear step from 3 leaves the second row at 10; the fit at 4 leaves nothing."""
+    coarse = problem(lambda x: [x["a"] - 3.0, 0.5], {"a": 3.0}, bounds=OPEN)
+    finer = problem(lambda x: [10 * (x["a"] - 4.0), 10 * ((x["a"] - 3.0) ** 2 - 1.0)], {"a": 3.0}, bounds=OPEN)
+    x = coarse.initial_unknowns
+    left = predicted_refit_residual_at_finer_step(finer, coarse, x, coarse.evaluate(x))
+    assert left == pytest.approx(np.zeros(2), abs=1e-3)
+
+
 def test_a_point_that_is_no_estimate_counts_the_difference_of_the_models_alone():
     """At 2 the coarse model wants to go to 3 and the finer one to 3.3."""
     coarse = problem(lambda x: [2 * (x["a"] - 3.0)], {"a": 2.0}, bounds=OPEN)

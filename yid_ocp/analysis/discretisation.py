@@ -26,6 +26,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.options import DiscretisationName
+from yid_ocp.solvers import GaussNewton
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
@@ -133,10 +134,22 @@ def predicted_refit_residual_at_finer_step(
     """Predict the whitened residual of a fit with a shorter time step, or return None if the prediction fails.
 
     `fine` is the problem with the shorter time step. One Gauss-Newton step is made from the coarse fit `x` (nx,), where
-    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used.
+    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without, `fine` is
+    fitted if the shorter step changes predictions by more than the residual, which is too much for one linear step.
     """
-    made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
-    return None if isinstance(made, str) else made[1]
+    refined = _FinerDiscretisationProblem(fine)
+    made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)
+    if isinstance(made, str) or coarse.has_process_noise:
+        return None if isinstance(made, str) else made[1]
+    start = refined._unknowns(coarse.unknown_names, x)
+    before = fine.evaluate(start, False, at_x.equilibrium_guesses)
+    changed = (
+        before.residual - at_x.residual if before.ok and len(before.residual) == len(at_x.residual) else np.zeros(1)
+    )
+    if changed @ changed <= at_x.residual @ at_x.residual:
+        return made[1]
+    fitted = fine.evaluate(GaussNewton().minimize_cost(fine, start, None).x, False, at_x.equilibrium_guesses)
+    return fitted.residual if fitted.ok and fitted.cost < before.cost else made[1]
 
 
 def longest_accurate_time_step(problem: EstimationProblem) -> float:
