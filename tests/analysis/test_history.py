@@ -162,6 +162,9 @@ def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():
     assert simplest_fit_within_std_error([rough, good, best], KINDS) is good
     far = fit_of("stribeck", 1, 1, 1.1, 0.9)
     assert simplest_fit_within_std_error([rough, good, far], KINDS) is far
+    # the best has by chance the same error everywhere; the difference from it is less sure
+    even, uneven = fit_of("stribeck", 2, 2, 2, 2), fit_of("coulomb", 1.7, 1.7, 2.1, 2.4)
+    assert simplest_fit_within_std_error([rough, uneven, even], KINDS) is uneven
     failed = fit_of("coulomb", float("nan"), 1, 1, 1)
     assert simplest_fit_within_std_error([rough, failed, far], KINDS) is far
 

@@ -92,11 +92,19 @@ def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping
 
     Returns the first of `fits` whose mean error over the `kinds` of motion is within one standard error of the smallest
     error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
-    doi:10.1007/978-0-387-84858-7).
+    doi:10.1007/978-0-387-84858-7). The larger of two standard errors counts: that of the smallest error, and that of the
+    difference from it.
     """
-    sizes = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds) for fit in fits]
-    least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))
-    return next((fit for fit, (mean, _) in zip(fits, sizes, strict=True) if mean <= least + error), fits[0])
+    means = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)[0] for fit in fits]
+    best = fits[int(np.argmin(np.where(np.isfinite(means), means, np.inf)))]
+    _, error = mean_and_std_error_over_motion_kinds(best.left_out_errors, kinds)
+
+    def is_near(fit: FrictionLawFit) -> bool:
+        beyond = {name: own - best.left_out_errors[name] for name, own in fit.left_out_errors.items()}
+        difference, paired = mean_and_std_error_over_motion_kinds(beyond, kinds)
+        return difference <= max(error, paired)
+
+    return next((fit for fit in fits if is_near(fit)), fits[0])
 
 
 @dataclass(frozen=True)

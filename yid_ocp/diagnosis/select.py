@@ -21,6 +21,8 @@ from yid_ocp.errors import SolverError
 
 _MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not noise
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
+_RESPONSE_RTOL = 0.05  # relative error of a model's response to an effect: links and time step are finite
+_MIN_CHI2_FRACTION = _RESPONSE_RTOL**2  # of what effects explain; such an error leaves it, so less proves nothing
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
@@ -102,17 +104,20 @@ def _chi2(fit: RefitStatistics) -> float:
     return fit.held_out_loss.chi2_per_sample
 
 
-def _near_best_models(fits: Sequence[RefitStatistics], limits: Thresholds) -> list[RefitStatistics]:
+def _near_best_models(
+    nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
+) -> list[RefitStatistics]:
     """Models that the recordings cannot distinguish from the best one: plausible models first, each group best first.
 
     If the best model leaves only noise, all recordings form one likelihood, and models with odds against them are
-    dropped. Otherwise the held-out prediction error counts, relative to the residual; of equally good models the
-    simplest is best.
+    dropped, unless errors of the models' responses could turn these odds. Otherwise the held-out prediction error
+    counts, relative to the residual; of equally good models the simplest is best.
     """
     best = min(fits, key=_chi2)
     if _is_noise(best.held_out_loss, limits):
         best = min(fits, key=lambda fit: bic_difference(fit, best))
-        near = [fit for fit in fits if bic_difference(fit, best) <= 2 * limits.min_log_bayes_factor]
+        most = max(2 * limits.min_log_bayes_factor, _MIN_CHI2_FRACTION * bic_difference(nominal, best))
+        near = [fit for fit in fits if bic_difference(fit, best) <= most]
         near.sort(key=lambda fit: bic_difference(fit, best))
     else:
         near = [fit for fit in fits if _is_predicting_as_well(fit, best)]
@@ -158,18 +163,32 @@ def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds
     return fit.p_values[effect.label] <= math.erfc(limits.min_z / math.sqrt(2.0))
 
 
-def _is_needed(without: RefitStatistics, fit: RefitStatistics, effect: EffectBase, limits: Thresholds) -> bool:
-    """Whether an effect is significant, and held-out recordings are predicted clearly worse without it."""
+def _is_needed(
+    nominal: RefitStatistics, without: RefitStatistics, fit: RefitStatistics, effect: EffectBase, limits: Thresholds
+) -> bool:
+    """Whether an effect is significant, and held-out recordings are predicted clearly worse without it.
+
+    An effect beside others must close more of the whole gap than errors in the response to these can leave.
+    """
     before, after = without.held_out_loss, fit.held_out_loss
     (gained, error), gap = held_out_improvement(before, after), before.excess_chi2_per_sample
     is_open = gap > 0 and not _is_explained(without, limits)
     closes = is_open and gained > error and gained >= limits.min_gap_closed * gap
-    return (closes or _lr_decisive(before, after, limits)) and _is_significant(effect, fit, limits)
+    least = (_MIN_CHI2_FRACTION if is_open else limits.min_gap_closed) if without.effects else 0.0
+    is_clear = closes or _lr_decisive(before, after, limits)
+    is_enough = gained >= least * nominal.held_out_loss.excess_chi2_per_sample
+    return is_clear and is_enough and _is_significant(effect, fit, limits)
 
 
 def _is_explained(fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether a fit has effects and leaves little but noise; without effects, even a gap that small remains one."""
     return bool(fit.effects) and _is_noise(fit.held_out_loss, limits)
+
+
+def _is_too_little(nominal: RefitStatistics, screened: ScreeningResult, limits: Thresholds) -> bool:
+    """Whether no candidate beside effects that leave only noise is predicted to close enough of the whole gap."""
+    most = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=0.0)
+    return most < limits.min_gap_closed * (2 * nominal.cost - nominal.residual_count)
 
 
 # -- several effects --------------------------------------------------------------------------------------------------
@@ -244,7 +263,9 @@ def select_effects(
             screened = search.screen(base, current.values, f"beside {beside}")
             # a candidate can show a residual gap that the whole residual does not
             p_value = bonferroni_corrected_min_candidate_p_value(screened.candidate_scores)
-            if _is_explained(current, limits) and p_value >= limits.gap_significance_level:
+            if _is_explained(current, limits) and (
+                p_value >= limits.gap_significance_level or _is_too_little(nominal, screened, limits)
+            ):
                 break
             if len(base) == 1 and _futile(search, [nominal, current, *first], alone, screened):
                 break
@@ -265,9 +286,9 @@ def select_effects(
             ]
         # an effect of implausible size would correct errors of earlier effects
         fits = [fit for fit in fits if not base or _has_plausible_sizes(fit, base, limits)]
-        near = _near_best_models(fits, limits) if fits else []
+        near = _near_best_models(nominal, fits, limits) if fits else []
         first = first or [*near[:1], *sorted((fit for fit in fits if fit is not near[0]), key=_chi2)]
-        better = next((fit for fit in near if _is_needed(current, fit, fit.effects[-1], limits)), None)
+        better = next((fit for fit in near if _is_needed(nominal, current, fit, fit.effects[-1], limits)), None)
         if better is None:
             break
         # untried confusable candidates cannot be excluded yet
@@ -278,7 +299,7 @@ def select_effects(
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss, limits).fraction
         said = "" if math.isnan(closed) else f": {100 * closed:.3g} % of the held-out gap closed"
         search.progress.begin_stage(f"explained by {join_effect_labels(better.effects)}{said}")
-    chosen = _reconsidered(search, chosen, before)
+    chosen = _reconsidered(search, nominal, chosen, before)
     if len(chosen.fit.effects) == 1:
         # its last fit may differ from its first one
         first = [chosen.fit, *(fit for fit in first if fit.effects != chosen.fit.effects)]
@@ -300,7 +321,7 @@ class _Choice:
         return _Choice(fit, kept | {last.label: tuple(known.values())})
 
 
-def _reconsidered(search: RefitContext, chosen: _Choice, before: RefitStatistics) -> _Choice:
+def _reconsidered(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, before: RefitStatistics) -> _Choice:
     """Try each effect's position again with all others present: without it, and with other effects instead."""
     is_added = chosen.fit.effects[:-1] == before.effects
     tried = {frozenset(effect.label for effect in before.effects)} if is_added else set()
@@ -310,11 +331,11 @@ def _reconsidered(search: RefitContext, chosen: _Choice, before: RefitStatistics
         if own is None or search.record_skip_if_past_deadline("each effect without the others' company"):
             break
         tried.add(labels - {own.label})
-        chosen = _revised(search, chosen, own)
+        chosen = _revised(search, nominal, chosen, own)
     return chosen
 
 
-def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choice:
+def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, effect: EffectBase) -> _Choice:
     """The choice without one effect, or with it or another effect last, and the equivalent effects there."""
     limits, full, label = search.thresholds, chosen.fit, effect.label
     rest = tuple(other for other in full.effects if other is not effect)
@@ -322,7 +343,7 @@ def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choi
     without = search.refit(rest, full.values, f"{join_effect_labels(full.effects)} without {label}")
     if without is None:
         return chosen
-    if not _is_needed(without, full, effect, limits):
+    if not _is_needed(nominal, without, full, effect, limits):
         search.progress.begin_stage(f"left {label} out again: the others do as well")
         return replace(chosen, fit=without)
     search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
@@ -332,8 +353,10 @@ def _revised(search: RefitContext, chosen: _Choice, effect: EffectBase) -> _Choi
     tried = [pair for pair in tried if pair[0][0].label != label]
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
-    near = _near_best_models([own, *(fit for fit in others if _has_plausible_sizes(fit, rest, limits))], limits)
-    better = next((fit for fit in near if _is_needed(without, fit, fit.effects[-1], limits)), own)
+    near = _near_best_models(
+        nominal, [own, *(fit for fit in others if _has_plausible_sizes(fit, rest, limits))], limits
+    )
+    better = next((fit for fit in near if _is_needed(nominal, without, fit, fit.effects[-1], limits)), own)
     if better is not own:
         search.progress.begin_stage(f"put {better.effects[-1].label} in the place of {label}")
     found = chosen.replaced(better, [fit.effects[-1] for fit in near])
