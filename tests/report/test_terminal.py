@@ -115,11 +115,13 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
     first += "`yid-ocp diagnose`"
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    numbers = "beyond this model these values are meaningful, with a ± that includes the misfit: a = 2 ± 0.1 N m/rad"
+    numbers = (
+        "values known to within 10 % with the misfit in their ±, if no missing effect biases them: a = 2 ± 0.1 N m/rad"
+    )
     assert lines[:2] == [first, numbers]
     unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
-    assert "beyond this model no value is meaningful" in told("yid-solve/1", unsure)[1]
-    assert "beyond this model" not in told("yid-solve/1", unsure | {"fit": BAD | {"believed": False}})[1]
+    assert "no value is known to within 10 %" in told("yid-solve/1", unsure)[1]
+    assert "to within 10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"believed": False}})[1]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
     lines = told("yid-solve/1", said)
     assert lines[0] == "worse than a guess without a model: w_T2 of run, 50 mm against 20 mm (stays)"

@@ -92,7 +92,7 @@ def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping
 
     Returns the first of `fits` whose mean error over the `kinds` of motion is within one standard error of the smallest
     error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
-    doi:10.1007/978-0-387-84858-7). The larger of two standard errors counts: that of the smallest error, and that of the
+    doi:10.1007/978-0-387-84858-7). The larger of two standard errors counts: of the smallest error, or of the
     difference from it.
     """
     means = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)[0] for fit in fits]

@@ -81,7 +81,7 @@ class GapLaw:
                 sizes.append(f"{ends} between {low:.2g} and {high:.2g} {unit}")
         gap = "of the held-out gap that the effects leave" if self.has_accepted_effects else "of the held-out gap"
         closed = f"it closes {100 * self.closure.fraction:.3g} % {gap}"
-        return f"{head} ({', '.join(sizes)}); {closed}. It is not in the library."
+        return f"{head} ({', '.join(sizes)}); {closed}. No accepted effect describes it."
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the law to a dictionary: location, depends_on, table, closure, visited_range, runner_up."""

@@ -157,8 +157,8 @@ def misfit_summary_blocks(
                     known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "beyond this model no value is meaningful: with the misfit each is uncertain by more than 10 %"
-            said = f"beyond this model these values are meaningful, with a ± that includes the misfit: {shown}"
+            none = "no value is known to within 10 %, because each ± includes the misfit"
+            said = f"values known to within 10 % with the misfit in their ±, if no missing effect biases them: {shown}"
             yield SummaryStatement(said if known else none, "conclusion")
 
 
