@@ -45,7 +45,8 @@ from yid_ocp.data.readers import read_any
 from yid_ocp.errors import YidError
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import FrameSequence, look_at_pose, read_frames, write_frame_folder
+from yid_ocp.vision import FrameSequence, look_at_pose, write_frame_folder
+from yid_ocp.vision.frame_reading import read_frames
 
 PATIENCE = 20.0  # [s]
 LATE = "not done after"

@@ -45,17 +45,10 @@ from yid_ocp.virtual.joint_motion import (
 )
 from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.vision import (
-    CameraIntrinsics,
-    FrameSequence,
-    ObservedScene,
-    TrackOptions,
-    TrackResult,
-    look_at_pose,
-    track_object,
-)
+from yid_ocp.vision import CameraIntrinsics, FrameSequence, ObservedScene, TrackOptions, TrackResult, look_at_pose
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint
+from yid_ocp.vision.track import track_object
 
 Array = NDArray[np.float64]
 

@@ -70,7 +70,7 @@ class MadeUp:
             path_cutoff=np.inf,
             multivariate_prior=MultivariateGaussianPrior(),
         )
-        self.has_process_noise, self.whitening_filters = False, ()
+        self.has_process_noise = False
         values = [*self.initial_unknowns, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
         self.system = SimpleNamespace(parameters=Parameters(entries[::-1]), effects=())

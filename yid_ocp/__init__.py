@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from yid_ocp.analysis.what_if import what_if as what_if
     from yid_ocp.config.reader import load_config as load_config
     from yid_ocp.data import Recording as Recording
-    from yid_ocp.data import read_any as read_any
     from yid_ocp.data import read_recording as read_recording
     from yid_ocp.data import write_recording as write_recording
+    from yid_ocp.data.readers import read_any as read_any
     from yid_ocp.diagnosis.diagnose import diagnose as diagnose
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult as DiagnosisResult
     from yid_ocp.errors import YidError as YidError
@@ -48,7 +48,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.identifiability": ("identifiability",),
     "analysis.what_if": ("what_if",),
     "config.reader": ("load_config",),
-    "data": ("Recording", "read_any", "read_recording", "write_recording"),
+    "data": ("Recording", "read_recording", "write_recording"),
+    "data.readers": ("read_any",),
     "diagnosis.diagnose": ("diagnose",),
     "diagnosis.diagnosis_result": ("DiagnosisResult",),
     "errors": ("YidError",),

@@ -12,7 +12,8 @@ from recording_examples import joints_of
 from ros_bags import SECOND, START, Bag
 
 from yid_ocp.cli import main
-from yid_ocp.data import preview_file, read_any, read_recording
+from yid_ocp.data import read_recording
+from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.errors import DataError
 
 DEFINITIONS = {

@@ -16,7 +16,8 @@ from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from yid_ocp.data import JointGroup, PointGroup, Recording, read_any
+from yid_ocp.data import JointGroup, PointGroup, Recording
+from yid_ocp.data.readers import read_any
 from yid_ocp.data.readers.csv import read_csv
 from yid_ocp.errors import OutputError
 from yid_ocp.export.signals import (

@@ -210,7 +210,6 @@ class Disturbed(MadeUp):
     def problem_with_whitening_at(self, x, warm=None, predictions=()):
         self.frozen.append((np.asarray(x).tolist(), warm))
         made = Disturbed(self._rows, self.initial_unknowns, asked=self.frozen)
-        made.whitening_filters = ("filter",)
         made.frozen_at = np.asarray(x).tolist()
         return made
 
@@ -291,17 +290,18 @@ class Coarse(Carrying):
 
 
 @pytest.mark.parametrize(
-    ("ended", "weighed", "kept"),
-    [(2.402, [], 2.4), (2.45, [[2.45]], 2.45), (2.58, [[4.0], [2.58]], 2.58)],
-    ids=["no better", "a little further down", "in another minimum"],
+    ("ended", "tolerance", "weighed"),
+    [(2.402, 0.0, []), (2.45, 0.0, [[4.0], [2.45]]), (2.45, 1.0, []), (2.58, 1.0, [[4.0], [2.58]])],
+    ids=["no better", "better", "better by less than the solver's tolerance", "in another minimum"],
 )
-def test_a_start_that_leads_further_down_a_known_minimum_is_weighed_from_its_end(ended, weighed, kept):
-    """The standard deviation is 0.5, the optimum 2.5; the first search ends at 2.4."""
+def test_another_start_is_weighed_anew_where_it_gains_more_than_the_solver_can_tell(ended, tolerance, weighed):
+    """The standard deviation is 0.5, the optimum 2.5; the first search ends at 2.4, where the cost is 0.02."""
     problem = Disturbed(linear(2.0 * np.eye(1), [-5.0]))
     solver = Coarse([[1.0], [2.4]], [[2.4]], [[4.0], [ended]], [[ended]], [[ended]])
+    solver.cost_tolerance = tolerance
     solution = solve(problem, solver)
     assert [at for at, _ in problem.frozen[2:]] == weighed
-    assert solution.x.tolist() == [kept]
+    assert solution.x.tolist() == [ended if weighed else 2.4]
 
 
 def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby():

@@ -5,7 +5,8 @@ import pytest
 from ros_bags import START, Bag
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision import CameraIntrinsics, look_at_pose, read_frames
+from yid_ocp.vision import CameraIntrinsics, look_at_pose
+from yid_ocp.vision.frame_reading import read_frames
 
 POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
 CLOUDS = [np.random.default_rng(i).uniform(0.5, 2.0, (5 + i, 3)).astype(np.float32) for i in range(3)]

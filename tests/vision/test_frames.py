@@ -11,7 +11,8 @@ import pytest
 
 from yid_ocp import vision
 from yid_ocp.errors import DataError
-from yid_ocp.vision import CameraIntrinsics, FrameSequence, look_at_pose, read_frames, write_frame_folder
+from yid_ocp.vision import CameraIntrinsics, FrameSequence, look_at_pose, write_frame_folder
+from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import OcclusionMap
 
 CLOUD = np.array([[0.1, -0.2, 2.0], [0.0, 0.3, 1.5], [-0.4, 0.1, 2.25]])

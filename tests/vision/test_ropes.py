@@ -12,8 +12,9 @@ from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.system import System
-from yid_ocp.vision import FrameSequence, ObservedScene, TrackOptions, look_at_pose, track_object
+from yid_ocp.vision import FrameSequence, ObservedScene, TrackOptions, look_at_pose
 from yid_ocp.vision.frame_selection import is_shape_self_touching
+from yid_ocp.vision.track import track_object
 
 MILLIMETRE = 1e-3
 RADIUS = 0.006

@@ -8,9 +8,9 @@ from yid_ocp import vision
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import ObservedScene, TrackOptions, track_object
+from yid_ocp.vision import ObservedScene, TrackOptions
 from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
-from yid_ocp.vision.track import FrameTracker
+from yid_ocp.vision.track import FrameTracker, track_object
 
 MILLIMETRE = 1e-3
 LATENCY, CALIBRATION_FRAMES = 0.06, 5

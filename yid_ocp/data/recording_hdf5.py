@@ -58,7 +58,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     path = Path(path)
     digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
-    hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
+    hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.read_any"
     raise_data_error_unless(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
     with open_hdf5_after_read_check(path) as file:
         recording = _from_file(file, path, digest)

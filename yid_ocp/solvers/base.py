@@ -439,32 +439,21 @@ class _MultiStartSearch:
         self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
 
     def _no_better_minimum(self, x: Array, note: str) -> _Fit | None:
-        """The best fit, where under its weights a start leads to it or to a worse one; else None.
-
-        A start that leads a little further down the same minimum is weighed anew from there.
-        """
+        """The best fit, where under its weights a start leads to it or to a worse one; else None."""
         best, coarse = self._best, getattr(self._solver, "with_coarse_tolerances", None)
         if coarse is None or not (best.evaluation.ok and self._problem.has_process_noise):
             return None
-        noted = _noting(self._callback, note)
-        near = _minimize_cost(coarse, best.weighted, x, noted)
-        cost, distance = (
-            near.history[-1].cost if near.history else 0.0,
-            _stds_apart(best.evaluation, near.x - best.result.x),
-        )
-        is_same = distance < _SAME_MINIMUM_STDS
+        near = _minimize_cost(coarse, best.weighted, x, _noting(self._callback, note))
+        cost = near.history[-1].cost if near.history else 0.0
+        distance = _stds_apart(best.evaluation, near.x - best.result.x)
+        is_worse = cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
         # along an unknown that the data hardly inform the better end counts, beyond the solver's own tolerance
         least = max(_MIN_COST_GAIN_OF_START, getattr(self._solver, "cost_tolerance", 0.0) * best.evaluation.cost)
-        is_no_better = is_same and cost > best.evaluation.cost - least
-        is_no_better |= cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
-        if near.status == Status.FAILED or not (is_same or is_no_better or near.stopped_by_callback):
+        is_same = distance < _SAME_MINIMUM_STDS and cost > best.evaluation.cost - least
+        if near.status == Status.FAILED or not (is_worse or is_same or near.stopped_by_callback):
             return None
-        if is_no_better or near.stopped_by_callback:
-            same = replace(best.result, stopped_by_callback=near.stopped_by_callback)
-            return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
-        again = _fit_from(best.weighted, self._solver, near.x, noted, self._fits)
-        count, history = near.n_evaluations + again.n_evaluations, [*near.history, *again.history]
-        return replace(again, n_evaluations=count, history=history)
+        same = replace(best.result, stopped_by_callback=near.stopped_by_callback)
+        return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
 
     def solution(self, limits: ExcessResidualCriteria, verdicts: bool) -> Solution:
         """Solution of the best fit, with its uncertainty."""
@@ -545,7 +534,7 @@ def _fit_from(
             if known_at_x.ok:
                 break
     passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
-    weighted, is_weighted = problem, any(problem.whitening_filters)
+    weighted = problem
     for number in range(passes):
         predictions = () if known_at_x is None else known_at_x.episode_predictions
         weighted = problem_with_whitening_at(weighted, x, warm, predictions) if passes > 1 else problem
@@ -559,10 +548,8 @@ def _fit_from(
             # far from its end a pass need not be exact, as the next one weighs anew
             if result.stopped_by_callback or (moved > _SAME_MINIMUM_STDS and number < passes - 1):
                 break
-        # the first weights are about torque offsets that are guessed
-        if (
-            (number or is_weighted) and (len(result.history) < 2 or moved < _SAME_FIT_STDS)
-        ) or result.stopped_by_callback:
+        # the second pass is the first about torque offsets that are not guessed
+        if (number and (len(result.history) < 2 or moved < _SAME_FIT_STDS)) or result.stopped_by_callback:
             break
         # a search that reaches a known fit is not whitened again
         same = [fit for fit in known if passes > 1 and _stds_apart(fit.evaluation, x - fit.result.x) < _SAME_FIT_STDS]

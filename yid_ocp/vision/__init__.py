@@ -3,11 +3,6 @@
 Letters in shapes: N points of a cloud, K links or skeleton nodes, np points of the model, M frames, s tubes.
 """
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
 from yid_ocp.vision.calibration import CameraCalibration as CameraCalibration
 from yid_ocp.vision.calibration import CameraCalibrationOptions as CameraCalibrationOptions
 from yid_ocp.vision.calibration import CameraClockOptions as CameraClockOptions
@@ -30,15 +25,3 @@ from yid_ocp.vision.surface_meshes import VirtualFramesWithTruth as VirtualFrame
 from yid_ocp.vision.surface_meshes import render_virtual_frames as render_virtual_frames
 from yid_ocp.vision.track_result import FrameReport as FrameReport
 from yid_ocp.vision.track_result import TrackResult as TrackResult
-
-if TYPE_CHECKING:
-    from yid_ocp.vision.frame_reading import read_frames as read_frames
-    from yid_ocp.vision.track import track_object as track_object
-
-
-def __getattr__(name: str) -> Any:
-    # settings of all commands contain options of this package, only some read and track frames
-    homes = {"read_frames": "frame_reading", "track_object": "track"}
-    if name in homes:
-        return getattr(import_module(f"{__name__}.{homes[name]}"), name)
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

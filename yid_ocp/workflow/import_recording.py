@@ -12,10 +12,10 @@ from typing import Any
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ImportSettings
-from yid_ocp.data import Recording, preview_file, read_any, write_recording
+from yid_ocp.data import Recording, write_recording
 from yid_ocp.data.checks import recording_quality_issues
 from yid_ocp.data.merge import merge_recordings
-from yid_ocp.data.readers import reader_option_names
+from yid_ocp.data.readers import preview_file, read_any, reader_option_names
 from yid_ocp.data.readers.base import (
     MOTOR_CURRENT_UNITS,
     SelectionAndUnitOptions,
