@@ -80,7 +80,7 @@ def test_a_recording_comes_back_number_by_number(recording, tmp_path):
     np.testing.assert_array_equal(xyz(found["/points/camera/mid"], "point"), points.position[:, 1])
     assert found["/points/camera/mid"][0][2].header.frame_id == "base"
     topics = {"/points/camera/tip": "tip", "/points/camera/mid": "mid"}
-    again = read_any(file, joint_topics=("/joint_states",), points=topics)
+    again = read_any(file, joint_topics=("/joint_states",), point_names=topics)
     np.testing.assert_array_equal(again.joints.position, recording.joints.position)
     assert {name for group in again.points for name in group.names} == {"tip", "mid"}
 
