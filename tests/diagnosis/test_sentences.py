@@ -27,6 +27,7 @@ from factories import (
     loss,
     outcome,
     place,
+    score,
     screening,
     smoothed,
     visible,
@@ -140,6 +141,10 @@ def unknown():
     for reason in REASONS:
         none = {"gap_closure": closed(math.nan, math.nan, math.nan), "transfer_checks": (carried(),)}
         yield f"no held-out gap, {reason}", finding("unknown", unknown_reason=reason, **none)
+    joints = [effect(f"friction@{name}") for name in ("elbow", "wrist", "waist")]
+    for of, p_values in (("two joints", (1e-9, 3e-5, 4e-5)), ("one joint", (1e-9, 4e-5, 4e-5))):
+        seen = screening([score(own, p=p) for own, p in zip(joints, p_values, strict=True)])
+        yield f"significant at {of}", finding("unknown", unknown_reason="little", screening=seen)
     hurried = {"search_seconds": 12.54, "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
     yield (

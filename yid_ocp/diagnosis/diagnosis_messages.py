@@ -122,7 +122,8 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         tests = (result.nominal_test, result.nominal_held_out_test)
         exceeds = residuals_exceed_noise(tests, result.thresholds.null_test_limits)
         size = _model_error(result) if exceeds else ""
-        text += [_nameless(result), f"What remains is model error{size}." if size else ""]
+        text += [_nameless(result), _significant_locations(result)]
+        text.append(f"What remains is model error{size}." if size else "")
     text.append("" if result.law is None else result.law.sentence)
     if result.untried:
         rest = ", ".join(result.untried[:8]) + (", ..." if len(result.untried) > 8 else "")
@@ -203,6 +204,17 @@ def _nameless(finding: DiagnosisResult) -> str:
         apart="; ".join(apart[:2]),
         no="No effect tried so far" if finding.untried else "No known effect",
     )
+
+
+def _significant_locations(finding: DiagnosisResult) -> str:
+    """Sentence on the kind of the best effect, if it is significant at several locations."""
+    ranked, best = finding.screening.candidate_scores, [fit.effects[0] for fit in finding.single_effect_models[:1]]
+    level = finding.thresholds.gap_significance_level / max(len(ranked), 1)
+    same = [s.effect for s in ranked if s.p_value < level and s.effect.kind in {effect.kind for effect in best}]
+    if len(same) < 2 or same[0].is_local:
+        return ""
+    places, advice = ", ".join(effect.location for effect in same), "add it to the model at all of them"
+    return f"{same[0].kind} is significant at {places}: {advice} (`model.effects`, or `yid-ocp friction` for friction)."
 
 
 def _effects(finding: DiagnosisResult) -> list[str]:
