@@ -39,7 +39,8 @@ _MAX_RUN_DIFFERENCE = 2  # between two runs, from which on a parameter is named 
 @register_summary("yid-diagnosis/2")
 def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
-    yield SummaryStatement(result["summary"], "verdict")
+    verdict = result["verdict"].replace("_", " ")
+    yield SummaryStatement(f"Verdict: {verdict}. {result['summary']}", "verdict")
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
     for channel, error in before["rmse"].items():
@@ -85,7 +86,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["next_plan"] is not None:
         yield "to separate these effects, plan a motion:"
         yield CodeBlock(_planning_command(result["next_plan"]))
-    yield f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
+    yield f"verdict: {verdict} ({sum(result['seconds'].values()):.1f} s)"
 
 
 def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
