@@ -26,6 +26,9 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 RECORDINGS = REPOSITORY.parent / "shared" / "recordings"
 _PANDA = ("diagnosis.max_effects=1", "model.frames={}")
 _SERVO = RECORDINGS / "servo_pendulum"
+_ROTOR_ESTIMATE = (
+    *("sines_100", "sines_400", "sweep_100", "lift_100", "lift_400", "drop_400", "up_down_100", "up_down_400"),
+)
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,44 @@ QUESTIONS: Mapping[str, Question] = {
             f"recordings.estimate={_files('sines_400', 'sweep_400', 'lift_400', 'drop_400')}",
             f"recordings.held_out={_files('up_down_400')}",
         ),
+    ),
+    "servo, 0.30 kg of 0.49": Question(
+        "servo_pendulum.yaml",
+        "servo_pendulum",
+        (
+            f"recordings.estimate={_files('sines_400', 'sweep_100', 'lift_400', 'drop_100')}",
+            f"recordings.held_out={_files('up_down_100')}",
+            'parameters={"joint.mass": {initial: 0.30}}',
+        ),
+        "payload.mass",
+        (0.19, 0.19),
+        (
+            f"recordings.estimate={_files('sines_100', 'sweep_400', 'lift_100', 'drop_400', 'up_down_400')}",
+            "recordings.held_out=[]",
+        ),
+    ),
+    "servo, 0.30 kg of 0.49, no baseline": Question(
+        "servo_pendulum.yaml",
+        "servo_pendulum",
+        ('parameters={"joint.mass": {initial: 0.30}}',),
+        "payload.mass",
+        (0.19, 0.19),
+    ),
+    "servo, rotor inertia withheld": Question(
+        "servo_pendulum.yaml",
+        "servo_pendulum",
+        (
+            "model.effects=[{kind: encoder_offset, location: joint}]",
+            "parameters={}",
+            "parameters={joint.servo_gain: {free: true}, joint.servo_damping: {free: true}}",
+            "parameters={joint.servo_delay: {free: true}, joint.servo_torque_limit: {free: true}}",
+            "parameters={encoder_offset@joint.offset: {free: true, initial: -0.03}}",
+            f"recordings.estimate={_files(*_ROTOR_ESTIMATE)}",
+            f"recordings.held_out={_files('sweep_400', 'drop_100')}",  # fast enough to feel the inertia
+            "diagnosis.max_effects=1",
+        ),
+        "rotor_inertia.armature",
+        (0.0015, 0.0022),
     ),
     "servo, nothing withheld": Question("servo_pendulum.yaml", "servo_pendulum"),
     "baxter": Question("baxter_arm.yaml", "baxter"),
