@@ -255,10 +255,10 @@ def ten_goals(folder: Path, count: int, noise: int) -> None:
     print("|" + "---|" * (2 + len(names)))
     ratios = []
     for i, shift in enumerate(goals(step, count)):
-        options = replace(run.plan, target_offset_from_start=shift, start_joint_positions=posture)
+        options = replace(run.plan, point_target_offset_from_start=shift, start_joint_positions=posture)
         best = plan_motion_to_target(step, options, true)
         # the same place in the world, whatever a model believes of where the tip rests
-        there = replace(options, target_offset_from_start=None, target_position=tuple(best.target_position))
+        there = replace(options, point_target_offset_from_start=None, target_position=tuple(best.target_position))
         plans = [plan_motion_to_target(step, there, theta), best, plan_motion_to_target(step, there, guess)]
         cells = [carried_out(twin, TRUTH, movement(one), one, one) for one in plans]
         first = np.array([posture[name] for name in step.system.prescribed])
@@ -297,7 +297,9 @@ def withheld_effect(folder: Path) -> None:
         values, step = found(chosen, folder / name)
         made = plan_motion_to_target(
             step,
-            replace(run.plan, target_offset_from_start=None, target_position=(x, y, z), start_joint_positions=posture),
+            replace(
+                run.plan, point_target_offset_from_start=None, target_position=(x, y, z), start_joint_positions=posture
+            ),
             values,
         )
         error, swing = carried_out(twin, TRUTH, movement(made), made, made)
@@ -307,7 +309,7 @@ def withheld_effect(folder: Path) -> None:
 def two_hands() -> None:
     """Print what becomes of plans for two arms, beside a smooth motion of every joint to the same posture."""
     truth = ", ".join(f"{name}: {{initial: {value}}}" for name, value in TRUTH.items())
-    way = "plan={point: w_T1, target_offset_from_start: [0.03, 0.03, 0.0], duration: 0.8}"
+    way = "plan={point: w_T1, point_target_offset_from_start: [0.03, 0.03, 0.0], duration: 0.8}"
     print("| held by two arms | plan: error [mm], swing [mm/s] | same posture, smoothly |\n|---|---|---|")
     for name, config, more in (
         ("junction of the Y", "dual_arm_vision", ["parameters={}", f"parameters={{{truth}}}", way]),

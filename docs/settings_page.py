@@ -248,7 +248,7 @@ track:
 plan:
   goal: place
   point: w_T3
-  target_offset_from_start: [0.05, 0.0, 0.1]                    # [m]
+  point_target_offset_from_start: [0.05, 0.0, 0.1]              # [m]
   duration: 1.0                              # [s]
   parameter_run_folder: runs/my_solve
 """,

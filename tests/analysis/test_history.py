@@ -25,7 +25,7 @@ from yid_ocp.analysis.friction_ladder import (
     recording_names_by_name_stem,
     simplest_fit_within_std_error,
 )
-from yid_ocp.model.servos_and_springs import PositionServoOptions
+from yid_ocp.model.servos_and_springs import ServoModelOptions
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
 
@@ -180,7 +180,7 @@ TRUTH = {
 def dry(urdf_folder) -> EstimationProblem:
     """Three kinds of motion of an arm with dry friction, as its own model has them, and one with motors off."""
     friction = [("joint_coulomb", "shoulder", {})]
-    step = pendulum_step(urdf_folder, friction, driven=PENDULUM, servos=PositionServoOptions())
+    step = pendulum_step(urdf_folder, friction, driven=PENDULUM, servos=ServoModelOptions())
     made = []
     t = 0.01 * np.arange(81)
     for name, rate in (("slow_1", 4.0), ("slow_2", 5.0), ("fast_1", 11.0), ("turn_1", 7.0)):

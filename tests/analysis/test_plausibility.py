@@ -158,7 +158,7 @@ def assert_issues(found, expected):
     named = [(cause, f"effort.{joint}" if joint else "effort") for cause, joint, *_ in expected]
     assert [(doubt.cause, doubt.channel) for doubt in found] == named
     for doubt, (*_, ratio, words) in zip(found, expected, strict=True):
-        assert doubt.evidence_ratio == pytest.approx(ratio, rel=2e-3)
+        assert doubt.limit_violation_ratio == pytest.approx(ratio, rel=2e-3)
         assert words in doubt.what
 
 
@@ -237,7 +237,7 @@ def test_motion_of_another_robot_or_with_a_counterbalance(arms, runs):
     # nothing else can load an arm that holds nothing
     for arm, many, times_off, ratio in ((arms[1], 4, "4.3", 1.425), (free, 7, "6.6", 2.212)):
         (doubt,) = inverse_dynamics_effort_issues(arm, quick)
-        assert (doubt.cause, doubt.evidence_ratio) == ("effort_unlike", pytest.approx(ratio, rel=2e-3))
+        assert (doubt.cause, doubt.limit_violation_ratio) == ("effort_unlike", pytest.approx(ratio, rel=2e-3))
         assert f"efforts of {many} of 7 joints do not match this robot" in doubt.what
         assert f"{times_off} times the usual model error" in doubt.what
     balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
@@ -263,13 +263,21 @@ def test_limits_of_joints(arms, runs):
         wide = with_joints(run, position=lambda j, by=shift: j.position + by * (np.arange(7) == 3))
         (doubt,) = joint_limit_issues(arm, wide)
         assert (doubt.cause, doubt.channel, doubt.group) == ("angle_limits", "position.left_e1", "joints")
-        assert (doubt.evidence_ratio, doubt.recording) == (pytest.approx(ratio, rel=1e-3), run.name)
+        assert (doubt.limit_violation_ratio, doubt.recording) == (pytest.approx(ratio, rel=1e-3), run.name)
         assert f"left_e1 goes {past} rad beyond its limits of -0.05 to 2.62" in doubt.what
     (doubt,) = joint_limit_issues(arm, with_joints(run, position=lambda j: np.degrees(j.position)))
-    assert (doubt.cause, doubt.weight, doubt.evidence_ratio) == ("degrees", "refused", pytest.approx(754.1, rel=1e-3))
+    assert (doubt.cause, doubt.weight, doubt.limit_violation_ratio) == (
+        "degrees",
+        "refused",
+        pytest.approx(754.1, rel=1e-3),
+    )
     assert "angles reach 78 rad" in doubt.what
     (doubt,) = joint_limit_issues(arm, with_joints(run, t=lambda j: j.t / 30))
-    assert (doubt.cause, doubt.channel, doubt.evidence_ratio) == ("speed_limits", "t", pytest.approx(6.959, rel=1e-3))
+    assert (doubt.cause, doubt.channel, doubt.limit_violation_ratio) == (
+        "speed_limits",
+        "t",
+        pytest.approx(6.959, rel=1e-3),
+    )
     assert "left_e1 turns 10.4 times as fast as it can (1.5 rad/s)" in doubt.what
 
 
@@ -302,7 +310,10 @@ def test_points_that_the_arm_holds(arms, runs, case):
         assert doubt.what.endswith("explains it" if case == "walking away" else f"it is 0.001{6 + count} m")
         seen = next(group.position for group in runs[count].points if group.name == "points_arm")
         apart = np.sqrt(np.nanmean(np.sum((change(seen) - seen) ** 2, axis=2)))
-        assert (doubt.group, doubt.evidence_ratio) == ("points_arm", pytest.approx(min(apart / 0.01, 1e3), rel=5e-3))
+        assert (doubt.group, doubt.limit_violation_ratio) == (
+            "points_arm",
+            pytest.approx(min(apart / 0.01, 1e3), rel=5e-3),
+        )
 
 
 @pytest.mark.parametrize("joint", [1, 3, 5])
@@ -345,10 +356,10 @@ def test_clocks_that_are_far_apart(arms, runs):
     assert "taken +0.202 s from the joints, by a clock that runs -52.4 parts per thousand fast" in doubt.what
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
     (doubt,) = robot_held_point_issues(arms[2], replace(runs[2], points=tuple(groups)), usual)
-    assert (doubt.cause, doubt.evidence_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
+    assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
     assert ("taken +0.4 s" in doubt.what, doubt.advice) == (True, "subtract 0.4 s from their times")
     (doubt,) = robot_held_point_issues(arms[1], stamped(runs[1], drift=0.05), usual)
-    assert (doubt.cause, doubt.evidence_ratio) == ("clock_drift", pytest.approx(1.392, rel=2e-3))
+    assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_drift", pytest.approx(1.392, rel=2e-3))
     assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
     late, drift, middle = map(float, re.search(r"by t (\S+) (\S+) \(t - (\S+)\)", doubt.advice).groups())
     assert (late, drift, middle) == (pytest.approx(0.0, abs=2e-4), pytest.approx(-0.05 / 1.05, rel=5e-3), 2.5)
@@ -387,7 +398,7 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
         assert doubt.setting == "sensors.points_arm.use: false"
         # over the limit of half a period of both, at the end of the recording for a drift
         whole = 5.0 * drift if drift else late
-        assert doubt.evidence_ratio == pytest.approx(abs(whole) / 0.01, rel=0.03)
+        assert doubt.limit_violation_ratio == pytest.approx(abs(whole) / 0.01, rel=0.03)
         if drift:
             begin, end = map(float, re.findall(r"([-+][.\d]+) ms", doubt.what))
             assert (end - begin, end + begin) == pytest.approx((5e3 * drift, 2e3 * late), abs=2.0)
@@ -422,7 +433,7 @@ def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
     found = point_distance_issues(arms[1], arms[1].system, arms[1].theta, recording, usual)
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
-        assert doubt.evidence_ratio == pytest.approx(ratio, rel=1e-3)
+        assert doubt.limit_violation_ratio == pytest.approx(ratio, rel=1e-3)
         assert re.fullmatch(r"w_T1 from the object's root is \S+ m, 0.813 m along the object", doubt.what)
 
 
@@ -460,7 +471,7 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
     for doubt in found:
         apart = np.sqrt(np.mean(np.sum((change(place) - place) ** 2, axis=2)))
         assert (doubt.recording, doubt.group, doubt.weight) == ("run", "points_camera", "not_trusted")
-        assert doubt.evidence_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
+        assert doubt.limit_violation_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
         assert words in doubt.what
     assert list(object_point_rollout_issues(episode, result, 0.0)) == []
 
@@ -502,7 +513,11 @@ def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words, ratio):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert words in doubt.what
-        assert (doubt.recording, doubt.group, doubt.evidence_ratio) == ("c", "points", pytest.approx(ratio, rel=5e-3))
+        assert (doubt.recording, doubt.group, doubt.limit_violation_ratio) == (
+            "c",
+            "points",
+            pytest.approx(ratio, rel=5e-3),
+        )
 
 
 def test_a_cable_of_which_a_point_is_missing_is_judged_by_the_others():
@@ -538,7 +553,7 @@ def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
         found = list(inertial_effort_excitation_issues(drives, recording, USUAL))
         assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
         for doubt in found:
-            assert doubt.evidence_ratio == pytest.approx(5.0 / seen, rel=0.02)
+            assert doubt.limit_violation_ratio == pytest.approx(5.0 / seen, rel=0.02)
             assert (doubt.group, doubt.channel) == ("joints", "position")
 
 
@@ -559,14 +574,14 @@ def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):
     (doubt,) = joint_excitation_issues([held], asked, USUAL)
     assert (doubt.cause, doubt.channel, doubt.recording) == ("weak_excitation", "position.elbow", "held")
     assert doubt.setting == "parameters.elbow.stiffness.free: false; parameters.elbow.damping.free: false"
-    assert doubt.evidence_ratio == pytest.approx(QUALITY_LIMITS.min_joint_motion / 0.006, rel=1e-3)
+    assert doubt.limit_violation_ratio == pytest.approx(QUALITY_LIMITS.min_joint_motion / 0.006, rel=1e-3)
     assert "elbow turns by 0.006 rad at most, in held" in doubt.what
     assert list(joint_excitation_issues([held, recording], asked, USUAL)) == []
     assert list(joint_excitation_issues([recording, held], asked, USUAL)) == []
     assert list(joint_excitation_issues([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
     coarse = replace(USUAL, std=0.2)
     (doubt,) = joint_excitation_issues([held, recording], asked, coarse)
-    assert (doubt.recording, doubt.evidence_ratio) == ("run", pytest.approx(6 * 0.2 / 0.6, rel=1e-3))
+    assert (doubt.recording, doubt.limit_violation_ratio) == ("run", pytest.approx(6 * 0.2 / 0.6, rel=1e-3))
 
 
 @pytest.fixture(scope="module")
@@ -628,6 +643,6 @@ def test_noise_that_settings_state_ten_times_too_large(springs):
     name, value = doubt.setting.split(": ")
     assert name == "sensors.points_camera.std"
     assert float(value) == pytest.approx(1e-3, rel=0.15)
-    assert np.isclose(doubt.evidence_ratio, 1e-2 / (5 * float(value)), rtol=0.05)
+    assert np.isclose(doubt.limit_violation_ratio, 1e-2 / (5 * float(value)), rtol=0.05)
     # what lasts for long counts as what it sums up to
     assert doubts(springs, std=1e-2, slow=2e-3) == []

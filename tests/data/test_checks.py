@@ -52,7 +52,9 @@ def column(values, j, change):
 def causes(recording, **sensors) -> set[str]:
     chosen = {name.replace("_", "."): options for name, options in sensors.items()}
     found = recording_quality_issues(recording, lambda group: chosen.get(group, SensorOptions()))
-    assert all(doubt.recording == recording.name and doubt.advice and doubt.evidence_ratio >= 1 for doubt in found)
+    assert all(
+        doubt.recording == recording.name and doubt.advice and doubt.limit_violation_ratio >= 1 for doubt in found
+    )
     return {doubt.cause for doubt in found}
 
 

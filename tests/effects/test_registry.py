@@ -12,7 +12,7 @@ from yid_ocp.effects import base as places
 from yid_ocp.effects.base import REQUIRED_EXCITATION_PHRASES
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Segment, System, flexible_object
-from yid_ocp.model.servos_and_springs import MotorOptions, PositionServoOptions
+from yid_ocp.model.servos_and_springs import MotorOptions, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
@@ -53,7 +53,7 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     table = {row[0]: row for row in rows[2:]}
     described = {kind.strip() for name in table for kind in name.split(",")}
     assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
-    system, options = baxter_foam_y_system(1), PositionServoOptions(motor=MotorOptions("dc", "sts3215"))
+    system, options = baxter_foam_y_system(1), ServoModelOptions(motor=MotorOptions("dc", "sts3215"))
     servos = System.build(system.mechanism, driven=system.driven, servos=options, grasps=system.grasps)
     places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, SIGNALS)}
     places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, SIGNALS)}

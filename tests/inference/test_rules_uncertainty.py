@@ -42,7 +42,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.problem.signal_filters import twice_applied_effort_filter
+from yid_ocp.problem.signal_filters import effort_low_pass_filter
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 
@@ -462,7 +462,7 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
 def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_folder):
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
     problem = EstimationProblem(step, [taken(step, 1, steps=90)], ("elbow.mass",), ProblemOptions(path_cutoff=15.0))
-    low_pass, own = twice_applied_effort_filter(15.0), residual_channels(problem)
+    low_pass, own = effort_low_pass_filter(15.0), residual_channels(problem)
     found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
     noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
     lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)

@@ -232,7 +232,7 @@ def test_mass_and_centre_are_those_of_a_frustum() -> None:
 
 def test_without_taper_its_links_are_cylinders() -> None:
     item = rod(3, tip_radius=0.006)
-    plain = flexible_object(item.build_segments(0.02), gravity_fraction=0.0)
+    plain = flexible_object(item.segment_definitions(0.02), gravity_fraction=0.0)
     for one, other in zip(bodies(item.build(0.02)), bodies(plain), strict=True):
         tensors = [numbers(body.inertia_about_com) for body in (one, other)]
         assert tensors[0] == pytest.approx(tensors[1], rel=1e-12, abs=1e-15)

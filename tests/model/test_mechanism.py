@@ -81,7 +81,7 @@ def test_points_stay_when_the_tree_is_put_together():
     found = places(tree, ["B:50%", "T1:40%"])
     np.testing.assert_allclose(found[0][:3, 3], [0.0, 0.0, 0.15], atol=1e-12)
     np.testing.assert_allclose(found[1][:3, 3], [1.1, 0.2, 0.15 + 0.3 + 0.32], atol=1e-12)
-    more = tree.with_inserted_joints(2, [replace(tree.joints[0], name="extra")])
+    more = tree.with_joint_chain_added_at_index(2, [replace(tree.joints[0], name="extra")])
     [again] = places(more, ["T1:40%"])
     np.testing.assert_allclose(again, found[1], atol=1e-12)
 

@@ -67,7 +67,7 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.3))
     "more",
     [
         {"goal": "place", "effort_weight": 0.5, "limits": PlanLimits(max_spring_angle=0.5)},
-        {"goal": "path", "waypoint_offsets_from_start": ((0.0, 0.1, 0.0),)},
+        {"goal": "path", "point_waypoint_offsets_from_start": ((0.0, 0.1, 0.0),)},
         {"goal": "box", "box": BOX},
     ],
     ids=["place", "path", "box"],
@@ -164,7 +164,7 @@ def test_a_path_is_followed(moved, wanted):
     begin = point_at(moved, START)
     via = tuple(tuple(float(x) for x in point_at(moved, angle) - begin) for angle in (0.45, 0.8))
     more = {"duration": 1.5, "n_spline_coefficients": 12, "position_tolerance": 5e-3}
-    options = replace(wanted, goal="path", waypoint_offsets_from_start=via, **more)
+    options = replace(wanted, goal="path", point_waypoint_offsets_from_start=via, **more)
     followed = plan_motion_to_target(moved, options)
     assert followed.is_successful, followed.message
     direct = plan_motion_to_target(moved, replace(options, goal="place")).point_trajectories["tip"]
@@ -224,7 +224,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"target_position": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "nearer target")),
         ({"point": "tipp"}, ("no frame 'tipp'",)),
         ({"point": None}, ("plan.point is missing",)),
-        ({"target_offset_from_start": (0.0, 0.1, 0.0)}, ("is given twice", "either plan.target_position")),
+        ({"point_target_offset_from_start": (0.0, 0.1, 0.0)}, ("is given twice", "either plan.target_position")),
         ({"target_position": None}, ("the target of the point is not given",)),
         ({"start_joint_positions": {"shoulder": 1.5}}, ("starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2")),
         ({"start_joint_positions": {"sholder": 0.5}}, ("'sholder' is not a joint", "did you mean 'shoulder'?")),

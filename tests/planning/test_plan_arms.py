@@ -15,7 +15,7 @@ from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {
-    "plan_place": ("model.object.links=2", "plan.target_offset_from_start=[-0.01, 0.02, 0.015]"),
+    "plan_place": ("model.object.links=2", "plan.point_target_offset_from_start=[-0.01, 0.02, 0.015]"),
     "plan_cable": ("model.object.segments.cable.links=4",),
 }
 
@@ -62,22 +62,29 @@ def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
 
 
 def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
-    path = "goal=path", "waypoint_offsets_from_start=[[-0.01, 0.01, 0.02]]", "duration=1.6", "n_spline_coefficients=8"
+    path = (
+        "goal=path",
+        "point_waypoint_offsets_from_start=[[-0.01, 0.01, 0.02]]",
+        "duration=1.6",
+        "n_spline_coefficients=8",
+    )
     more = (f"plan.{entry}" for entry in (*path, "position_tolerance=0.004"))
     run, outcome = planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], *more)
     assert outcome.is_successful, outcome.result["message"]
     tip, t = outcome.output.point_trajectories["w_T3"], outcome.output.t
     halfway = tip[int(np.argmin(np.abs(t - 0.8)))] - tip[0]
-    off = np.linalg.norm(halfway - run.plan.waypoint_offsets_from_start[0])
+    off = np.linalg.norm(halfway - run.plan.point_waypoint_offsets_from_start[0])
     assert off <= outcome.result["off_path"] + 1e-9
     assert outcome.result["off_path"] < 0.01
-    aside = np.linalg.norm(run.plan.waypoint_offsets_from_start[0] - 0.5 * (outcome.output.target_position - tip[0]))
+    aside = np.linalg.norm(
+        run.plan.point_waypoint_offsets_from_start[0] - 0.5 * (outcome.output.target_position - tip[0])
+    )
     assert aside > 0.01, "the way must not lead there by itself"
 
 
 def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, tmp_path):
     name = "dual_arm_vision"
-    way = "plan={point: w_T1, target_offset_from_start: [0.03, 0.03, 0.0], duration: 0.8, hold_duration: 0.3}"
+    way = "plan={point: w_T1, point_target_offset_from_start: [0.03, 0.03, 0.0], duration: 0.8, hold_duration: 0.3}"
     run, outcome = planned(repository, tmp_path, name, "model.object.links=2", STIFF, way)
     assert outcome.is_successful, outcome.result["message"]
     assert outcome.result["swing"] < run.plan.point_rest_speed_tolerance
@@ -117,7 +124,7 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
     run = load_config(file)
     if not resolve_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
-    way = "plan={point: p6, target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
+    way = "plan={point: p6, point_target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
     fewer = (
         "vertex_names_by_child_branch={}",
         "branch_properties={}",

@@ -24,8 +24,8 @@ from yid_ocp.workflow.simulate import run_simulate
 
 PLAN = """\
 problem: {path_cutoff: .inf}
-plan: {point: tip, target_offset_from_start: [0.0, 0.15, 0.04], start_joint_positions: {shoulder: 0.2}, duration: 0.7,
-  hold_duration: 0.3, position_tolerance: 0.02}
+plan: {point: tip, point_target_offset_from_start: [0.0, 0.15, 0.04], start_joint_positions: {shoulder: 0.2},
+  duration: 0.7, hold_duration: 0.3, position_tolerance: 0.02}
 """
 INFORMATION = """\
   elbow.damping: {free: true}

@@ -21,7 +21,7 @@ from yid_ocp.data.recording import validated_recording
 from yid_ocp.effects import candidate_kinds_and_locations
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import input_or_servo_torques_of_rollout, simulate
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorOptions, PositionServoOptions
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorOptions, ServoModelOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
 
@@ -30,8 +30,8 @@ VALUES = {
     "shoulder.servo_gain_factor": 100.0, "elbow.servo_gain": 0.25, "elbow.servo_damping": 1.5,
     "elbow.servo_torque_limit": 3.0, "elbow.servo_gain_factor": 100.0,
 }  # fmt: skip
-DC = PositionServoOptions(motor=MotorOptions("dc"))
-FIRMWARE = PositionServoOptions(motor=MotorOptions("dc", "mx64"), extra_controller_terms=("derivative", "dead_band"))
+DC = ServoModelOptions(motor=MotorOptions("dc"))
+FIRMWARE = ServoModelOptions(motor=MotorOptions("dc", "mx64"), extra_controller_terms=("derivative", "dead_band"))
 INTEGRATING = replace(FIRMWARE, extra_controller_terms=("integral", "derivative", "dead_band"))
 TERMS = {"integral": 3.0, "derivative": 0.7, "dead_band": 0.02}
 FIRMWARE_VALUES = VALUES | {f"{joint}.servo_{term}": value for joint in PENDULUM for term, value in TERMS.items()}
@@ -59,7 +59,7 @@ def test_a_firmware_damps_within_its_duty_and_ignores_small_errors(urdf_folder) 
     assert torque([-0.1, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == pytest.approx(-60 * 0.08, abs=1e-3)
     assert torque([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == 0.0
     with pytest.raises(ConfigError, match="has a derivative term already"):
-        PositionServoOptions(extra_controller_terms=("derivative",))
+        ServoModelOptions(extra_controller_terms=("derivative",))
 
 
 def test_an_integral_takes_the_sag_away_and_stands_still_while_the_motor_is_off(urdf_folder) -> None:

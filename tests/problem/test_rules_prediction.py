@@ -250,7 +250,7 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
     none, shifted = (
         np.zeros(problem.step.sizes["nx"]),
-        problem.predictor.inputs_with_effect_momentum_in_tracking_reference,
+        problem.predictor.corrected_inputs_with_effect_momentum,
     )
     assert shifted(episode, vector(neutral), (), none).momentum_shift is None
     name = "rotor_inertia@shoulder.armature"

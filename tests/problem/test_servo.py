@@ -22,7 +22,7 @@ from yid_ocp.effects import _SENSOR_KINDS, candidate_kinds_and_locations, make_e
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import input_or_servo_torques_of_rollout, simulate
-from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, PositionServoOptions
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, ServoModelOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import mean_step_inputs
@@ -48,7 +48,7 @@ def step(urdf_folder):
 
 
 def servo_step(folder, effects=(), commands="held", gravity_compensation=False):
-    return pendulum_step(folder, effects, driven=PENDULUM, servos=PositionServoOptions(commands, gravity_compensation))
+    return pendulum_step(folder, effects, driven=PENDULUM, servos=ServoModelOptions(commands, gravity_compensation))
 
 
 def commanded(steps: int = 40, period: float = H, position=None, command=None) -> Recording:

@@ -223,7 +223,7 @@ def test_the_best_guess_counts():
     said["baselines"]["stays"] = {"points.p": 0.1}
     (doubt,) = estimation._worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
-    assert doubt.evidence_ratio == pytest.approx(0.2 / 0.105)
+    assert doubt.limit_violation_ratio == pytest.approx(0.2 / 0.105)
 
 
 @pytest.mark.parametrize(("factor", "believed"), [(1.0, True), (0.4, False)])

@@ -489,7 +489,7 @@ def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> Al
         begin = predictor.initial_state_of_episode(episode, theta, offset, ())
         if begin.failure_message:
             continue
-        inputs = predictor.inputs_with_effect_momentum_in_tracking_reference(episode, theta, (), begin.state)
+        inputs = predictor.corrected_inputs_with_effect_momentum(episode, theta, (), begin.state)
         feedback = inputs.feedback_with_corrected_reference(
             episode.tracking_feedback, system.driven_coordinate_indices, episode.measured_driven_angles
         )

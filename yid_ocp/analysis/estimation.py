@@ -13,7 +13,7 @@ from yid_ocp.analysis.clock_checks import drift_and_overstated_noise_issues
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import MAX_ISSUE_EVIDENCE_RATIO, Issue
+from yid_ocp.data.channel_checks import MAX_REPORTED_LIMIT_VIOLATION_RATIO, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_by_name
 from yid_ocp.inference.linearized_residual import solve_step_within_unknown_sizes
@@ -399,7 +399,7 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
                 best, guess, error = better
                 unit = units[channels[0]]
                 what = f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by"
-                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_ISSUE_EVIDENCE_RATIO
+                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_REPORTED_LIMIT_VIOLATION_RATIO
                 advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)

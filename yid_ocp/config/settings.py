@@ -24,7 +24,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.model.objects import OBJECT_KINDS, ObjectBuilder
 from yid_ocp.model.objects.base import MountSettings
-from yid_ocp.model.servos_and_springs import PositionServoOptions
+from yid_ocp.model.servos_and_springs import ServoModelOptions
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
 from yid_ocp.planning.joint_paths import PlanOptions
 from yid_ocp.problem.options import ExcessResidualCriteria, ProblemOptions, SensorOptions
@@ -109,8 +109,8 @@ class _JointActuationSettings:
             "their encoders correct"
         ),
     ] = "driven"
-    servo: Annotated[PositionServoOptions, OptionInfo("position servos of the mode servo")] = field(
-        default_factory=PositionServoOptions
+    servo: Annotated[ServoModelOptions, OptionInfo("position servos of the mode servo")] = field(
+        default_factory=ServoModelOptions
     )
     passive_joints: Annotated[_Names, OptionInfo("moving joints without a drive, in any mode")] = ()
     locked_joints: Annotated[Mapping[str, float], OptionInfo("position of joints that do not move", "rad or m")] = (

@@ -264,8 +264,8 @@ def _measured_positions(recording: Recording, point: str) -> Array:
 
 Severity = Literal["warning", "not_trusted", "refused"]
 
-MAX_ISSUE_EVIDENCE_RATIO = 1e3
-"""Largest value of `Issue.evidence_ratio`; larger ratios are clipped."""
+MAX_REPORTED_LIMIT_VIOLATION_RATIO = 1e3
+"""Largest value of `Issue.limit_violation_ratio`; larger ratios are clipped."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
 """Smallest number of differences between samples from which a channel's noise is estimated."""
@@ -304,7 +304,8 @@ class Issue:
     what: str  # sentence on the cause, with numbers
     # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
     weight: Severity
-    evidence_ratio: float  # observed value over the detection limit, 1 to `MAX_ISSUE_EVIDENCE_RATIO`
+    # observed value over the detection limit (inverse for a lower limit), 1 to `MAX_REPORTED_LIMIT_VIOLATION_RATIO`
+    limit_violation_ratio: float
     advice: str  # recommended action
     # location; empty means all
     recording: str
@@ -318,12 +319,18 @@ class Issue:
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSE_DESCRIPTIONS:
             raise ValueError(f"there is no cause '{self.cause}'")
-        object.__setattr__(self, "evidence_ratio", float(min(max(self.evidence_ratio, 1.0), MAX_ISSUE_EVIDENCE_RATIO)))
+        object.__setattr__(
+            self,
+            "limit_violation_ratio",
+            float(min(max(self.limit_violation_ratio, 1.0), MAX_REPORTED_LIMIT_VIOLATION_RATIO)),
+        )
 
     @property
     def certainty_word(self) -> str:
         """Certainty of the issue: `perhaps`, `likely` or `certain`."""
-        return "perhaps" if self.evidence_ratio < 1.5 else "likely" if self.evidence_ratio < 3 else "certain"
+        return (
+            "perhaps" if self.limit_violation_ratio < 1.5 else "likely" if self.limit_violation_ratio < 3 else "certain"
+        )
 
     @property
     def location_text(self) -> str:

@@ -237,14 +237,14 @@ def _broken(where: str, allowed: str) -> DataError:
     return DataError(what, where=where, allowed=f"{_ALLOWED}: {allowed}", hint="export it again with its header")
 
 
-JOINT_MESSAGE_TYPES = (
+OTHER_JOINT_MESSAGE_TYPES = (
     "franka_msgs/msg/FrankaState",
     "franka_msgs/msg/FrankaRobotState",
     "control_msgs/msg/DynamicJointState",
     "control_msgs/msg/JointTrajectoryControllerState",
     "ur_msgs/msg/RobotStateRTMsg",
 )
-"""Message types with joint values that can be read, in addition to JointState."""
+"""Message types with joint values that can be read, other than JointState."""
 
 
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -253,17 +253,17 @@ ESTIMATED_WRENCH_GROUP_NAME = "wrist_estimated"
 
 
 def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
-    """Read joint names and values from a message of `JOINT_MESSAGE_TYPES`. Absent channels are omitted.
+    """Read joint names and values from a message of `OTHER_JOINT_MESSAGE_TYPES`. Absent channels are omitted.
 
     If the driver estimates an external wrench, `wrench` has its frame and its `values` by quantity.
     """
-    if kind == JOINT_MESSAGE_TYPES[0]:
+    if kind == OTHER_JOINT_MESSAGE_TYPES[0]:
         return _franka_state(content)
-    if kind == JOINT_MESSAGE_TYPES[1]:
+    if kind == OTHER_JOINT_MESSAGE_TYPES[1]:
         return _franka_robot_state(content)
-    if kind == JOINT_MESSAGE_TYPES[2]:
+    if kind == OTHER_JOINT_MESSAGE_TYPES[2]:
         return _dynamic_joint_state(content)
-    if kind == JOINT_MESSAGE_TYPES[4]:
+    if kind == OTHER_JOINT_MESSAGE_TYPES[4]:
         own = {"position": content.q_actual, "velocity": content.qd_actual, "position_command": content.q_target}
         return _values([f"{name}_joint" for name in _UR_JOINTS], own)
     measured = getattr(content, "feedback", None) or content.actual

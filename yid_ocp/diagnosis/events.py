@@ -43,7 +43,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.signal_filters import twice_applied_effort_filter
+from yid_ocp.problem.signal_filters import effort_low_pass_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 from yid_ocp.sensors.joints import quantization_step
 
@@ -186,7 +186,7 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
 
 def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """A history up to the recording's overspeed, without the ends distorted by a filter; None if too short."""
-    until = ends._end_of(history.recording) - twice_applied_effort_filter(history.filter_cutoff).settling_time
+    until = ends._end_of(history.recording) - effort_low_pass_filter(history.filter_cutoff).settling_time
     keep = np.flatnonzero(history.t <= until)
     return None if len(keep) < 10 else history.subset_at_indices(keep)
 
@@ -473,7 +473,7 @@ def _counting(
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(end) and is_effort:
-        hidden |= t > end - twice_applied_effort_filter(cutoff).settling_time
+        hidden |= t > end - effort_low_pass_filter(cutoff).settling_time
     smear = 1 / cutoff if is_effort else 0.0
     for event in own:
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)

@@ -31,7 +31,7 @@ from yid_ocp.integrator.step import Step, input_or_servo_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState, System
-from yid_ocp.problem.signal_filters import twice_applied_effort_filter
+from yid_ocp.problem.signal_filters import effort_low_pass_filter
 
 _STANDSTILL_SPEED = 0.1  # speed below which friction can stick [rad/s or m/s]
 
@@ -223,7 +223,7 @@ class _Filter:
         delay = np.asarray(0.1 / cutoff * np.arange(-length, length + 1), float)
         impulse = np.zeros((len(delay), 1))
         impulse[length] = 1.0
-        weight = twice_applied_effort_filter(cutoff)(delay, impulse)[:, 0]
+        weight = effort_low_pass_filter(cutoff)(delay, impulse)[:, 0]
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:

@@ -59,7 +59,7 @@ class _JointInsertion(EffectBase):
             Joint(f"{label}_x", "revolute", carrier, place, AXIS_UNIT_VECTORS["x"]),
             Joint(f"{label}_y", "revolute", carrier, Placement.identity(), AXIS_UNIT_VECTORS["y"]),
         ]
-        tree = tree.with_inserted_joints(first, chain)
+        tree = tree.with_joint_chain_added_at_index(first, chain)
         joints = list(tree.joints)
         for index in (tree.joint_index(name) for name in hung):
             rest = Placement.identity() if at is None else inverse @ joints[index].placement

@@ -21,7 +21,7 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import LowPassFilter, twice_applied_effort_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_low_pass_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, joint_angle_noise_std
 from yid_ocp.sensors.mounted import MountedSensor
 
@@ -258,7 +258,7 @@ def residual_channels(problem: EstimationProblem) -> tuple[ResidualChannel, ...]
             is_smoothed = isinstance(samples.sensor, MountedSensor) and problem.system.prescribed
             if samples.sensor.effort_joints or is_smoothed:
                 cutoff, step = problem.options.path_cutoff, episode.grid.time_step
-                low_pass = LowPassFilter(cutoff) if is_smoothed else twice_applied_effort_filter(cutoff)
+                low_pass = LowPassFilter(cutoff) if is_smoothed else effort_low_pass_filter(cutoff)
                 stride = low_pass.decorrelation_stride(step)
                 autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.channel_name_per_output):

@@ -294,7 +294,7 @@ def _about_smoothed(
     errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
-        inputs = predictor.inputs_with_effect_momentum_in_tracking_reference(episode, own, (), result.rollout.state[0])
+        inputs = predictor.corrected_inputs_with_effect_momentum(episode, own, (), result.rollout.state[0])
         driven = predictor.system.driven_coordinate_indices
         guided = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         assert guided is not None
@@ -395,7 +395,7 @@ def problem_with_relinearized_held_out_whitening(
 
 
 def problem_with_sensor_noise_only(problem: EstimationProblem) -> EstimationProblem:
-    """Whiten a problem by sensor noise alone. Torque offsets estimated so far are kept."""
+    """Whiten a problem by sensor noise, not by noise of the recorded inputs. Estimated torque offsets are kept."""
     return _with_errors(problem, lambda errors: errors.torque_bias_part)
 
 

@@ -42,8 +42,8 @@ class StepFunctions:
         )
 
     @property
-    def jacobian_parts(self) -> ca.Function:
-        """Function that returns the parts of the step's Jacobians.
+    def sparse_jacobian_parts_function(self) -> ca.Function:
+        """Function that returns the parts of the step's sparse Jacobians.
 
         Its outputs are the vectors per joint, then the nonzeros of the remaining entries of the residual, of p1 and of
         the constraints, and the curvature. The curvature is the derivative of the midpoint's constraint force with

@@ -340,12 +340,12 @@ def moving_observable_state_mask(
     seen: BoolArray | None = None,
     disturbed: BoolArray | None = None,
 ) -> BoolArray:
-    """Mask (nx,) of the states that move and affect other states, efforts or sensors.
+    """Mask (nx,) of the states that depend on any state or input and that affect measurements, directly or indirectly.
 
-    Internal states of a neutral effect are thus excluded. Only the first and the last step of the rollout are examined.
-    `loads` are extra excitations as in `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend
-    on directly. `disturbed` (nx,) marks states with an initial error; if given, states are also excluded that neither
-    these errors nor torque errors reach.
+    Prescribed coordinates and internal states of a neutral effect are excluded. Other coordinates and momenta count as
+    measured. Only the first and the last step are examined. `loads` are extra excitations as in
+    `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend on directly. `disturbed` (nx,) marks
+    states with an initial error; if given, states are also excluded that neither these errors nor torque errors reach.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     chosen = (slice(0, 1), slice(count - 1, count))

@@ -246,8 +246,8 @@ class Mechanism(ReprMixin):
         mapped: Mechanism = map_expressions(self, number)
         return replace(mapped, parameters=Parameters())
 
-    def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """Return a copy with a chain of joints inserted at `index`. Other joints and frames stay attached as before.
+    def with_joint_chain_added_at_index(self, index: int, chain: Sequence[Joint]) -> Mechanism:
+        """Return a copy with a chain of joints added at list index `index`. Other joints keep their parents.
 
         The first joint's parent must precede `index`. The parent of each further joint is the previous joint of the
         chain.

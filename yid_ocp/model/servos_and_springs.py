@@ -132,8 +132,8 @@ class RobotJointSpring:
 
 
 @dataclass(frozen=True)
-class PositionServoOptions:
-    """Settings of all position servos. Their gains are parameters, not settings."""
+class ServoModelOptions:
+    """Settings of the model of all position servos. Their gains are parameters, not settings."""
 
     command_interpolation: Annotated[
         _CommandInterpolation,
@@ -224,7 +224,7 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJoin
 
 
 def build_joint_servos(
-    tree: Mechanism, joints: Sequence[str], options: PositionServoOptions
+    tree: Mechanism, joints: Sequence[str], options: ServoModelOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
     """Build a servo for every named joint. Returns the servos and their parameters, such as `JOINT.servo_gain`.
 

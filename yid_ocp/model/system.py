@@ -20,8 +20,8 @@ from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expr
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import (
     PositionServo,
-    PositionServoOptions,
     RobotJointSpring,
+    ServoModelOptions,
     build_joint_servos,
     mechanism_without_gravity,
     stiffness_and_rest_parameters,
@@ -249,7 +249,7 @@ class SystemBuildArguments(TypedDict, total=False):
     """Frames that sensors may measure, or points of a segment such as `T1:40%`; default: the segment tips `w_*`."""
     springs: Mapping[str, RobotJointSpring]
     """Springs by robot joint; they become the parameters `JOINT.stiffness` and `JOINT.rest`."""
-    servos: PositionServoOptions | None
+    servos: ServoModelOptions | None
     """Servos whose commands are the inputs of driven joints; adds `JOINT.servo_gain`, `JOINT.servo_damping`, ..."""
 
 

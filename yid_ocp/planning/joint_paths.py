@@ -53,10 +53,10 @@ class PlanOptions:
     ] = "place"
     point: Annotated[str | None, OptionInfo("frame to move: a tip of the object, T3:50%, a gripper")] = None
     target_position: Annotated[_Vector3 | None, OptionInfo("position in the world; or give an offset", "m")] = None
-    target_offset_from_start: Annotated[
+    point_target_offset_from_start: Annotated[
         _Vector3 | None, OptionInfo("target position relative to the point's equilibrium position at the start", "m")
     ] = None
-    waypoint_offsets_from_start: Annotated[
+    point_waypoint_offsets_from_start: Annotated[
         tuple[_Vector3, ...], OptionInfo("waypoints of a path, relative to the start, passed at equal times", "m")
     ] = ()
     box: Annotated[tuple[_Vector3, _Vector3] | None, OptionInfo("lowest and highest corner in the world", "m")] = None
@@ -412,7 +412,9 @@ def solve_equilibrium_at_point_target(
         limits = f", with {names} at the joint's limit" if names else ""
         what = f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
         where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in target)} m in the world)"
-        hint = "choose a nearer target, a smaller plan.target_offset_from_start, or other plan.start_joint_positions"
+        hint = (
+            "choose a nearer target, a smaller plan.point_target_offset_from_start, or other plan.start_joint_positions"
+        )
         raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest
 

@@ -132,19 +132,19 @@ def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluato
 
 
 def _place(options: PlanOptions, begin: Array) -> Array:
-    if (options.target_position is None) == (options.target_offset_from_start is None):
+    if (options.target_position is None) == (options.point_target_offset_from_start is None):
         what, hint = "the target of the point is not given", "set one of the two"
         if options.target_position is not None:
             what, hint = "the target of the point is given twice", "set one of the two to null"
-        allowed, where = "either plan.target_position or plan.target_offset_from_start", "plan.target_position"
+        allowed, where = "either plan.target_position or plan.point_target_offset_from_start", "plan.target_position"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
-    if options.goal == "path" and not options.waypoint_offsets_from_start:
-        what, where = "the path has no waypoints", "plan.waypoint_offsets_from_start"
+    if options.goal == "path" and not options.point_waypoint_offsets_from_start:
+        what, where = "the path has no waypoints", "plan.point_waypoint_offsets_from_start"
         hint = "list waypoints, such as [[0, 0, 0.1]]"
         raise ConfigError(what, where=where, allowed="one or more offsets from the start [m]", hint=hint)
     if options.target_position is not None:
         return np.array(options.target_position, float)
-    return begin + np.array(options.target_offset_from_start, float)
+    return begin + np.array(options.point_target_offset_from_start, float)
 
 
 def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, place: Array) -> None:

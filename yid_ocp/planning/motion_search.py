@@ -76,7 +76,7 @@ class PlanResidualAndLimitFunctions:
         begin = self.simulator.start_configuration[None]
         first = self.point.positions_and_jacobian(begin, self.simulator.theta)[0][0, :3]
         places = np.vstack(
-            [first, *(first + np.asarray(via) for via in self.options.waypoint_offsets_from_start), self.target]
+            [first, *(first + np.asarray(via) for via in self.options.point_waypoint_offsets_from_start), self.target]
         )
         at = np.linspace(0.0, self.simulator.path.duration, len(places))
         # clamped ends, so that the reference motion starts and stops smoothly

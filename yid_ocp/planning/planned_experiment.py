@@ -35,7 +35,7 @@ from yid_ocp.planning.joint_paths import (
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.problem.signal_filters import twice_applied_effort_filter
+from yid_ocp.problem.signal_filters import effort_low_pass_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 
 _PLANNED_RECORDING_NAME = "planned"
@@ -316,7 +316,7 @@ class SplineMotionExperiment:
 
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Raise `ConfigError` if the motion is too short for the low-pass filter of its efforts."""
-    joints, low_pass = problem.episodes[0].recording.joints, twice_applied_effort_filter(problem.options.path_cutoff)
+    joints, low_pass = problem.episodes[0].recording.joints, effort_low_pass_filter(problem.options.path_cutoff)
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:

@@ -159,7 +159,7 @@ class EpisodePredictor:
         """Whether the tracking filter of the driven joints feeds back momenta too."""
         return bool(self.system.driven) and not self.system.servos and self.options.arm_tracking_feedback == "lqr"
 
-    def inputs_with_effect_momentum_in_tracking_reference(
+    def corrected_inputs_with_effect_momentum(
         self, episode: Episode, theta: Array, names: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
         """Corrected inputs of an episode, with the momentum that effects add to the tracking filter's reference.
@@ -254,7 +254,7 @@ class EpisodePredictor:
         if start.failure_message:
             return start.failure_message
         by_start = start.state_sensitivity
-        inputs = self.inputs_with_effect_momentum_in_tracking_reference(episode, theta, wanted, start.state, by_start)
+        inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, start.state, by_start)
         feedback, driven = episode.feedback_about_smoother_estimate, self.system.driven_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
@@ -431,7 +431,7 @@ class EpisodePredictor:
         partials = (by_state, by_lam, by_effort)
         by_inputs = self.integrator_step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
         start = self.initial_state_of_episode(episode, theta, offset, wanted, result.equilibrium_guess)
-        inputs = self.inputs_with_effect_momentum_in_tracking_reference(
+        inputs = self.corrected_inputs_with_effect_momentum(
             episode, theta, wanted, start.state, start.state_sensitivity
         )
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])

@@ -35,7 +35,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles_at_nodes,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, twice_applied_effort_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_low_pass_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
@@ -304,7 +304,7 @@ def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]
-    pairs = np.array(step.functions.jacobian_parts(*state, theta, step.time_step)[0]).ravel()
+    pairs = np.array(step.functions.sparse_jacobian_parts_function(*state, theta, step.time_step)[0]).ravel()
     plus, _, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
     mass = np.sum(plus * (upper - lower), axis=0) * step.time_step / 2
     return np.asarray(mass[[step.system.mechanism.joint_index(name) for name in names]])
@@ -334,7 +334,7 @@ def _samples(
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.node_times,
         grid.time_step,
-        twice_applied_effort_filter(options.path_cutoff),
+        effort_low_pass_filter(options.path_cutoff),
         LowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
         has_uncertain_clocks,

@@ -338,7 +338,7 @@ class EstimationProblem(ReprMixin):
         return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """Episode, theta and initial state offset for each held-out prediction; a fitted initial state is included."""
+        """Episode (with a fitted initial state, if any), theta and initial state deviation per held-out prediction."""
         x = np.asarray(x, float)
         theta, found = self.held_out_theta(x), []
         for held in self.held_out:

@@ -128,7 +128,7 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def twice_applied_effort_filter(cutoff: float) -> LowPassFilter:
+def effort_low_pass_filter(cutoff: float) -> LowPassFilter:
     """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
     return LowPassFilter(cutoff, 2)
 

@@ -85,7 +85,7 @@ def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
     near = (body.scaled_by(ca.SX(-1)) for body in frame.proximal_bodies)
     bodies = tuple(body.transformed_by(back) for body in (*tree.joints[before].bodies, *near))
     chain[-1] = replace(chain[-1], bodies=bodies)
-    wide = tree.with_inserted_joints(first, chain)
+    wide = tree.with_joint_chain_added_at_index(first, chain)
     joints = list(wide.joints)
     for i, joint in enumerate(wide.joints[last + 1 :], last + 1):
         if joint.parent_index == before and joint.name not in frame.proximal_names:

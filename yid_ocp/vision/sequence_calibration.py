@@ -94,7 +94,7 @@ class ForeignObject:
     text: str  # location and advice
 
 
-def group_foreign_clusters(
+def foreign_objects_from_clusters(
     clusters: Sequence[tuple[float, Sequence[ForeignCluster]]],
     noise: float,
     box: tuple[Array, Array],
@@ -102,7 +102,7 @@ def group_foreign_clusters(
     coloured: bool,
     background: bool = False,
 ) -> tuple[ForeignObject, ...]:
-    """Group the foreign clusters of all frames, each with its time [s], into foreign objects with advice.
+    """Foreign objects, with advice, from the clusters of all frames, each with its time [s]; rare ones are left out.
 
     `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
     `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already

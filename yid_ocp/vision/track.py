@@ -359,7 +359,7 @@ class FrameTracker:
         box = corners.min(axis=0) - self._widest, corners.max(axis=0) + self._widest
         seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.shape_fit.surface_noise_std
         coloured, still = self.sequence.load_colours is not None, self.options.background_estimation == "frames"
-        return sequence_calibration.group_foreign_clusters(seen, noise, box, self._links, coloured, still)
+        return sequence_calibration.foreign_objects_from_clusters(seen, noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
         if self.robot_surfaces is None:

@@ -367,13 +367,13 @@ def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
 
 
 def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
-    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence_ratio))
+    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.limit_violation_ratio))
 
 
 def issues_to_plain_data(issues: Sequence[Issue]) -> list[dict[str, Any]]:
     """Convert data quality issues to JSON-ready dicts, gravest first, for the key `issues` of a result."""
     found = []
     for doubt in _gravest_first(issues):
-        own = {"evidence" if key == "evidence_ratio" else key: value for key, value in asdict(doubt).items()}
+        own = {"evidence" if key == "limit_violation_ratio" else key: value for key, value in asdict(doubt).items()}
         found.append(own | {"sure": doubt.certainty_word, "where": doubt.location_text})
     return found

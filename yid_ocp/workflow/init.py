@@ -46,7 +46,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     with stderr_progress_display(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
-    segments, grasps = [] if item is None else item.settings.build_segments(), _grasps(arguments.grasp)
+    segments, grasps = [] if item is None else item.settings.segment_definitions(), _grasps(arguments.grasp)
     asked = {"holder": arguments.holder, "grasps": grasps, "standing": item is not None and item.stands_in_world}
     proposal = propose_config_choices(robot, recordings, segments, **asked)
     made = _split(made, recordings, proposal, out)
@@ -292,7 +292,7 @@ def _wrapped_list(values: Iterable[str], column: int) -> str:
 
 def _of_object(item: InitCommandObject, proposal: ProposedConfigChoices) -> dict[str, Any]:
     """Initial dampings of an object, frames of points whose places are uncertain, and further frames for sensors."""
-    tips = [f"w_{segment.name}" for segment in item.settings.build_segments()]
+    tips = [f"w_{segment.name}" for segment in item.settings.segment_definitions()]
     of_points = [places for group, places in proposal.point_placements.items() if "." not in group]
     marked = [place for places in of_points for place in places if place.frame]
     wanted = dict.fromkeys([*tips, *(place.model_frame for place in marked), *proposal.grasps.values()])

@@ -17,7 +17,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.foreign_formats import (
     ESTIMATED_WRENCH_GROUP_NAME,
-    JOINT_MESSAGE_TYPES,
+    OTHER_JOINT_MESSAGE_TYPES,
     joint_values_at_field_paths,
     joint_values_of_message,
 )
@@ -36,7 +36,7 @@ _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PLACES = (_POINT_STAMPED, *_POSES)
 _WRENCH, _IMU = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Imu"
 _MOUNTED = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
-_JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *JOINT_MESSAGE_TYPES)
+_JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *OTHER_JOINT_MESSAGE_TYPES)
 _KNOWN = (*_JOINT_TYPES, *_PLACES, *_MOUNTED)
 # last parts of topics that name a message type, not the measured object
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu", "data", "data_raw")
@@ -309,7 +309,7 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
 
 def _default_joint_topics(bag: OpenBag) -> list[str]:
     """Topics of joint states or, without any, of other messages with joints."""
-    return bag.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE) or bag.topic_names_of_types(*JOINT_MESSAGE_TYPES)
+    return bag.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE) or bag.topic_names_of_types(*OTHER_JOINT_MESSAGE_TYPES)
 
 
 def _stamp(content: Any) -> int:
@@ -322,7 +322,7 @@ def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
-    if kind in JOINT_MESSAGE_TYPES:
+    if kind in OTHER_JOINT_MESSAGE_TYPES:
         return joint_values_of_message(content, kind)
     frame = str(content.header.frame_id)
     if kind == JOINT_STATE_MESSAGE_TYPE:
@@ -564,7 +564,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
     becomes, note = "", "not a type that is understood; joint values: --field position=TOPIC.FIELD"
-    if topic.kind in JOINT_MESSAGE_TYPES and topic.name not in _default_joint_topics(bag.file):
+    if topic.kind in OTHER_JOINT_MESSAGE_TYPES and topic.name not in _default_joint_topics(bag.file):
         note = f"joints, left out beside joint states: --joint-topic {topic.name}"
     elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))

@@ -175,7 +175,9 @@ def parse_comma_separated_numbers(text: str, count: int, flag: str) -> list[floa
     return values
 
 
-def initial_rigidity_and_damping(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
+def initial_parameters_with_comments(
+    segments: Sequence[Segment], rigidity_ratio: float
+) -> dict[str, tuple[float, str]]:
     """Initial bending rigidity (`rigidity_ratio` x weight x length^2) and damping of `segments`, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
@@ -189,7 +191,7 @@ def initial_rigidity_and_damping(segments: Sequence[Segment], rigidity_ratio: fl
 class ObjectBuilder:
     """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
-    A subclass overrides `kind`, and `build_segments` or `build`. A kind that is a whole system is also a
+    A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that is a whole system is also a
     `ClampedObject`.
     """
 
@@ -200,13 +202,13 @@ class ObjectBuilder:
 
     kind: Annotated[str, OptionInfo("kind of object")]
 
-    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Build the segments, parents first. `damping` is per joint; each link is split into `link_division` links."""
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+        """Define the segments, parents first. `damping` is per joint; each link is split into `link_division` links."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         """Build the flexible object without placing it. Each link is divided into `link_division` links."""
-        return flexible_object(self.build_segments(damping, link_division))
+        return flexible_object(self.segment_definitions(damping, link_division))
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
@@ -221,13 +223,13 @@ class ObjectBuilder:
     @property
     def n_links_per_segment_or_total(self) -> int | None:
         """Number of links per segment, or the total if segments differ. None without such segments."""
-        counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.build_segments()]
+        counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.segment_definitions()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Factor on a per-joint parameter that preserves segment stiffness if links are divided; else 1."""
         owner, _, quantity = parameter.rpartition(".")
-        per_joint = {segment.name for segment in self.build_segments() if not segment.stiffness_given_as_rigidity}
+        per_joint = {segment.name for segment in self.segment_definitions() if not segment.stiffness_given_as_rigidity}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
@@ -269,7 +271,7 @@ class MountedObjectBuilder(ObjectBuilder):
     mount: Annotated[MountSettings | None, OptionInfo("pose of the root; default: the world's origin")] = None
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        return flexible_object(self.build_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
+        return flexible_object(self.segment_definitions(damping, link_division), gravity_fraction=self.gravity_fraction)
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:

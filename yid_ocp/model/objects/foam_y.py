@@ -65,7 +65,7 @@ model:
     kind: Annotated[Literal["foam_y"], OptionInfo("kind of object")] = "foam_y"
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of rigid links of every tube")] = 4
 
-    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Build the three tubes of the foam Y. Nominal joint stiffnesses are those for four links with any `links`."""
         n = link_division
         links = self.links * n
@@ -75,4 +75,6 @@ model:
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         root = _FOOT_POSE if self.mount is None else None
-        return flexible_object(self.build_segments(damping, link_division), root, "y_object", self.gravity_fraction)
+        return flexible_object(
+            self.segment_definitions(damping, link_division), root, "y_object", self.gravity_fraction
+        )

@@ -97,7 +97,9 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
 
 def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
     item = _SegmentedObject(segments=segments)
-    return InitCommandObject(item, base.initial_rigidity_and_damping(item.build_segments(), _RIGIDITY_RATIO[word]))
+    return InitCommandObject(
+        item, base.initial_parameters_with_comments(item.segment_definitions(), _RIGIDITY_RATIO[word])
+    )
 
 
 def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
@@ -211,5 +213,5 @@ stiffness_given_as_rigidity: true, clamped_at_base: true}
         default_factory=dict
     )
 
-    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         return [s._build_segment(name, damping, link_division) for name, s in self.segments.items()]

@@ -26,7 +26,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
         "a tapered rod", numbers, base.SIZE_AND_MASS_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitCommandObject(item, base.initial_rigidity_and_damping(item.build_segments(), 1.0))
+    return InitCommandObject(item, base.initial_parameters_with_comments(item.segment_definitions(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
@@ -59,7 +59,7 @@ parameters:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 8
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
 
-    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Build the rod as one segment with the radius of its base. `build` then tapers the links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
         rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_given_as_rigidity=True, clamped_at_base=True)
