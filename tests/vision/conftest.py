@@ -17,6 +17,7 @@ from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import System
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
+from yid_ocp.vision.track import track_object
 
 DATA = Path(__file__).parent / "data"
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
@@ -89,7 +90,7 @@ def tracked(system, run, recording, shape):
             calibration=vision.CameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames
         )
         made.sequence.stamps[list(late)] += 0.15
-        found = vision.track_object(scene, recording, made.sequence, options)
+        found = track_object(scene, recording, made.sequence, options)
         were = np.array([shape.points_at_configuration(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
         return SimpleNamespace(made=made, track=found, errors=errors)

@@ -16,6 +16,7 @@ from yid_ocp import vision
 from yid_ocp.model.mechanism import homogeneous_transform
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.surface_meshes import TriangleMesh
+from yid_ocp.vision.track import track_object
 
 PINHOLE = vision.CameraIntrinsics.from_field_of_view(320, 240, np.radians(50.0))
 EYE, TARGET = (2.6, 0.0, 0.3), (0.85, 0.0, -0.15)
@@ -134,7 +135,7 @@ def filmed(object_: SmoothY, frames, things=lambda k: [], *, seed=0, rate=4.0, b
 def measured(alone, sequence, truth, extra=(), empty=None, **options):
     """A track of a filmed sequence, and its errors [m]."""
     chosen = vision.TrackOptions(tracked_points=alone.point_frames, **options)
-    found = vision.track_object(vision.ObservedScene(alone, extra_meshes=extra), None, sequence, chosen, empty=empty)
+    found = track_object(vision.ObservedScene(alone, extra_meshes=extra), None, sequence, chosen, empty=empty)
     good = [frame.index for frame in found.frame_reports if frame.is_good]
     order = [("w_T1", "w_T2", "w_T3").index(name) for name in found.point_names]
     return found, found.position - truth[good][:, order]
