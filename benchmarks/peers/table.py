@@ -54,10 +54,12 @@ def figures(runs: list[dict[str, Any]], truth: Mapping[str, float]) -> dict[str,
 def rows(case: str, entry: Mapping[str, Any]) -> list[list[str]]:
     scale, unit = HELD_OUT.get(case, (1.0, "N m"))
     lines = []
+    most = max(len(own["runs"]) for own in entry["tools"].values())
     for tool, own in entry["tools"].items():
-        found = figures(own["runs"], entry["truth"])
+        found, count = figures(own["runs"], entry["truth"]), len(own["runs"])
+        name = f"`{tool}`" if count == most else f"`{tool}` ({count} repetitions)"
         if not found:
-            lines.append([f"`{tool}`", *["failed"] * 5, "", str(own.get("lines", ""))])
+            lines.append([name, *["failed"] * 5, "", str(own.get("lines", ""))])
             continue
         cells = ["-"] * 4
         if entry["truth"]:
@@ -73,7 +75,7 @@ def rows(case: str, entry: Mapping[str, Any]) -> list[list[str]]:
                     f"{found['holding']} of {found['stated']}" if found["stated"] else "none stated",
                 ]
         last = [f"{scale * found['held_out']:.2g} {unit}", f"{found['cpu']:.2g}", str(own["lines"])]
-        lines.append([f"`{tool}`", *cells, *last])
+        lines.append([name, *cells, *last])
     return lines
 
 
