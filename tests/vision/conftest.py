@@ -16,6 +16,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import System
 from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 from yid_ocp.vision.track import track_object
 
@@ -109,8 +110,8 @@ def small(system):
     truth = json.loads((DATA / "truth.json").read_text())
     assert tuple(truth["points"]) == system.point_frames
     return SimpleNamespace(
-        sequence=vision.read_frames(DATA / "frames"),
+        sequence=read_frames(DATA / "frames"),
         recording=read_recording(DATA / "joints.h5"),
         truth=np.array(truth["position"]),
-        clouds=[vision.read_frames(DATA / "frames").load_cloud(i) for i in range(3)],
+        clouds=[read_frames(DATA / "frames").load_cloud(i) for i in range(3)],
     )
