@@ -397,9 +397,8 @@ class _MultiStartSearch:
             self._try_multiple(first, factor, most)
         if not _good_fit(self._problem, self._best.evaluation):
             evaluate = self._best.weighted.evaluate
-            cost = {factor: evaluate(self._multiple(first, factor), False).cost for factor in _FAR_FACTORS}
-            factor = min(cost, key=lambda entry: cost[entry])
-            if cost[factor] < self._best.evaluation.cost:
+            cost, factor = min((evaluate(self._multiple(first, far), False).cost, far) for far in _FAR_FACTORS)
+            if cost < self._best.evaluation.cost:
                 self._try_multiple(first, factor, self._n_starts + 1)
         once = len(self._fits) == 1 and noisy and _accounts_for_process_noise(self._solver)
         if once and np.any(_doubtful(self._best, first)):
