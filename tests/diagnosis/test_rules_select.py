@@ -467,9 +467,9 @@ def test_a_rest_is_left_unless_it_is_large_or_shows_along_a_candidate(monkeypatc
 def test_a_rest_that_errors_in_the_response_to_an_effect_can_leave_is_left(monkeypatch, whole, chosen):
     """0.09 are closed beside noise: more than a twentieth of 1.7, less than one of 2.0."""
     assert Rounds(monkeypatch, LITTLE | {"": whole}, left=1e-9).compose()[1] == chosen
-    # beside more than noise a 400th: 0.2 of 79 and of 81
-    more = {"": (80.0, 80.0), "a": (1.3, 1.5), "b": (9.0, 9.0), "c": (9.0, 9.0), "ab": (1.1, 1.3), "ac": (1.3, 1.5)}
-    for nominal, found in ((80.0, ["a", "b"]), (82.0, ["a"])):
+    # beside more than noise a 2500th: 0.2 of 490 and of 510
+    more = {"": (491.0, 491.0), "a": (1.3, 1.5), "b": (9.0, 9.0), "c": (9.0, 9.0), "ab": (1.1, 1.3), "ac": (1.3, 1.5)}
+    for nominal, found in ((491.0, ["a", "b"]), (511.0, ["a"])):
         assert Rounds(monkeypatch, more | {"": (nominal, nominal)}).compose()[1] == found
 
 

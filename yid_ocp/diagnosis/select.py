@@ -23,6 +23,7 @@ _MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not n
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
 _RESPONSE_RTOL = 0.05  # relative error of a model's response to an effect: links and time step are finite
 _MIN_CHI2_FRACTION = _RESPONSE_RTOL**2  # of what effects explain; such an error leaves it, so less proves nothing
+_MIN_ADDED_GAP_FRACTION = 4e-4  # of the whole gap, by an effect beside others: it can close a sixth of such an error
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
@@ -174,7 +175,7 @@ def _is_needed(
     (gained, error), gap = held_out_improvement(before, after), before.excess_chi2_per_sample
     is_open = gap > 0 and not _is_explained(without, limits)
     closes = is_open and gained > error and gained >= limits.min_gap_closed * gap
-    least = (_MIN_CHI2_FRACTION if is_open else limits.min_gap_closed) if without.effects else 0.0
+    least = (_MIN_ADDED_GAP_FRACTION if is_open else limits.min_gap_closed) if without.effects else 0.0
     is_clear = closes or _lr_decisive(before, after, limits)
     is_enough = gained >= least * nominal.held_out_loss.excess_chi2_per_sample
     return is_clear and is_enough and _is_significant(effect, fit, limits)
