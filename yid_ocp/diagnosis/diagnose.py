@@ -121,7 +121,7 @@ def diagnose(
     DiagnosisResult
         Verdict, effects with parameters in their own units, and fractions of the gap [1]; `to_dict` has all with units.
     """
-    with threadpoolctl.threadpool_limits(1):
+    with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         clock = {"": time.perf_counter()}
         told = progress or LoggingProgress(log)
         known = known_fits or NominalSolutionAndRefitStore()

@@ -241,7 +241,7 @@ class Solver(Protocol):
     Optional class attributes, with their defaults: `needs_rollout` (True), whether the rollout must succeed at the
     start; `uses_process_noise_covariance` (False), whether the solver can whiten residuals by process noise;
     `estimates_torque_errors` (False), whether torque errors are unknowns; `with_coarse_tolerances` (the solver itself),
-    a quicker solver for the early passes of a fit beside torque noise.
+    a quicker solver for the early passes of a fit beside torque noise; `cost_tolerance` (0), a relative change of cost.
     """
 
     @property
