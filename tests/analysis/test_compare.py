@@ -22,7 +22,7 @@ from yid_ocp.analysis.estimation import (
     prediction_errors_and_units,
 )
 from yid_ocp.cli import main
-from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME
+from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
 from yid_ocp.solvers.base import StopSearch
@@ -342,7 +342,7 @@ class Means:
     @staticmethod
     def _episode(value, speed):
         samples = SimpleNamespace(whitened_residual=lambda predicted: predicted - value, n_residuals=1)
-        start = None if speed is None else SimpleNamespace(fitted_parameters={START_SPEED_PARAMETER_NAME: speed})
+        start = None if speed is None else SimpleNamespace(fitted_parameters={INITIAL_RMS_SPEED_PARAMETER: speed})
         return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
 
     def theta_and_initial_state_deviation(self, x, i):

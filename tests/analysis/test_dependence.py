@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.analysis.discretisation import min_grasp_frame_distances, step_map_natural_frequencies
+from yid_ocp.analysis.discretisation import smallest_possible_grasp_gaps, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
     linearise_step_equations,
     parameter_influences,
@@ -284,7 +284,7 @@ def reaching(urdf_folder):
 )
 def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
     system = reaching(x)
-    found = min_grasp_frame_distances(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
+    found = smallest_possible_grasp_gaps(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
     assert set(found) == {"hand"}
     assert found["hand"] == pytest.approx(gap, abs=2e-3)
 
@@ -292,8 +292,8 @@ def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
 def test_each_grasp_has_its_gap_and_no_grasp_none(reaching):
     """Tip at 0.3 m and elbow at 0.7 m above the ground, of a rod of 0.6 m whose middle link ends at 0.4 m."""
     system = reaching(grasps=2)
-    found = min_grasp_frame_distances(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    found = smallest_possible_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05
     system = reaching(grasps=0)
-    assert min_grasp_frame_distances(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
+    assert smallest_possible_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}

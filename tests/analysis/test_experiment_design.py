@@ -18,10 +18,10 @@ from yid_ocp.analysis.experiment_design import (
     CAMERA_GROUP,
     ExperimentVariantSensitivities,
     ExperimentVariantSensitivityBuilder,
-    FrameObservationSchedule,
+    PointObservationSchedule,
     RecordedExperiment,
-    extended_step_and_observable_frames,
-    observable_frames,
+    extended_step_and_measurable_points,
+    measurable_points,
 )
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
@@ -104,7 +104,7 @@ def sloped():
 
 
 def view(times, std, frame="a"):
-    return FrameObservationSchedule("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
+    return PointObservationSchedule("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
 
 
 TIMES = [(0.0, {0: 1.0}), (0.5, {1: 1.0}), (0.75, {1: 0.5, 2: 0.5}), (1.6, {3: 0.8, 4: 0.2}), (2.0, {4: 1.0})]
@@ -138,7 +138,7 @@ def test_views_add_up_over_frames_times_and_recordings(sloped):
 @pytest.mark.parametrize(("links", "middle"), [(1, []), (2, ["T1_0_tip"]), (3, ["T1_1_tip"]), (4, ["T1_1_tip"])])
 def test_a_segment_has_a_tip_a_middle_and_a_marker(links, middle):
     tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
-    *there, marker = observable_frames(System.build(None, objects=[(tube, None, None)]))
+    *there, marker = measurable_points(System.build(None, objects=[(tube, None, None)]))
     assert [sight.name for sight in (*there, marker)] == ["w_T1", *middle, "T1_marker"]
     assert not any(sight.is_arm_measurable for sight in (*there, marker))
     assert all(sight.added_frame is None for sight in there)
@@ -147,7 +147,7 @@ def test_a_segment_has_a_tip_a_middle_and_a_marker(links, middle):
 
 def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(urdf_folder):
     holding = holding_pendulum(urdf_folder)
-    found = observable_frames(holding)
+    found = measurable_points(holding)
     assert {sight.name for sight in found if sight.is_arm_measurable} == {"T1_marker"}
     tip, beside = places(holding, ["w_T1", found[-1].added_frame], np.zeros(holding.n_coordinates))
     np.testing.assert_allclose(beside - tip, [MARKER_DISTANCE, 0.0, 0.0], atol=1e-12)
@@ -162,7 +162,7 @@ def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
     robot = chain_of_motors(tmp_path, turn=turn, slide=("prismatic", "1 0 0"))
     springs = {"turn": RobotJointSpring(1.0), "slide": RobotJointSpring(1.0)}
     system = System.build(robot, springs=springs, point_frames=["hand"])
-    *moving, marker = observable_frames(system)
+    *moving, marker = measurable_points(system)
     there = [name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0]
     assert [sight.name for sight in moving] == there
     assert (marker.name, marker.description) == ("turn_marker", "a marker 3 cm off the axis of turn")
@@ -268,11 +268,11 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
     [episode] = built(swung())[1].problem.episodes
     assert [points.name for points in episode.recording.points] == [CAMERA_GROUP]
     camera = episode.recording.points[0]
-    assert set(camera.names) == {sight.name for sight in observable_frames(swung().system)}
+    assert set(camera.names) == {sight.name for sight in measurable_points(swung().system)}
     np.testing.assert_allclose(camera.t, episode.grid.node_times)
     assert np.all(camera.std == 1.0)
     step = swung().step
-    more, seen = extended_step_and_observable_frames(step)
+    more, seen = extended_step_and_measurable_points(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel

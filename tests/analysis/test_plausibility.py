@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
-from yid_ocp.analysis.clock_checks import _by_clock, _clock_error, drift_and_overstated_noise_issues
+from yid_ocp.analysis.clock_checks import _by_clock, _clock_error, clock_drift_and_overstated_noise_issues
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
     inertial_effort_excitation_issues,
@@ -21,9 +21,9 @@ from yid_ocp.analysis.joint_checks import (
 )
 from yid_ocp.analysis.point_checks import (
     cable_point_geometry_issues,
+    forward_kinematics_issues,
     object_point_rollout_issues,
     point_distance_issues,
-    robot_held_point_issues,
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
@@ -251,7 +251,7 @@ def test_too_little_of_a_recording_says_nothing(arms, runs, drives):
     for check in (inverse_dynamics_effort_issues, lambda *given: inertial_effort_excitation_issues(*given, USUAL)):
         assert [list(check(arm, run)) for run in (few, blind, deaf)] == [[], [], []]
     assert list(joint_limit_issues(arm, with_joints(few, t=lambda j: j.t / 30))) == []
-    assert list(joint_limit_issues(arm, blind)) == list(robot_held_point_issues(arm, blind, usual)) == []
+    assert list(joint_limit_issues(arm, blind)) == list(forward_kinematics_issues(arm, blind, usual)) == []
     assert list(joint_excitation_issues([blind, runs[1]], {"else": ("else.damping",)}, USUAL)) == []
     assert list(inertial_effort_excitation_issues(drives, swung(drives, size=1e-3, **SLOW), USUAL)) == []
 
@@ -303,7 +303,7 @@ for unit in (1e-3, 1e-2, 0.0254, 0.1, 0.3048):
 @pytest.mark.parametrize("case", HELD)
 def test_points_that_the_arm_holds(arms, runs, case):
     count, change, cause, words = HELD[case]
-    found = list(robot_held_point_issues(arms[count], with_points(runs[count], "points_arm", change), usual))
+    found = list(forward_kinematics_issues(arms[count], with_points(runs[count], "points_arm", change), usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert words in doubt.what
@@ -320,7 +320,7 @@ def test_points_that_the_arm_holds(arms, runs, case):
 @pytest.mark.parametrize("offset", [0.05, -0.03])
 def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, offset):
     moved = with_joints(runs[1], position=lambda j: j.position + offset * (np.arange(7) == joint))
-    (doubt,) = robot_held_point_issues(arms[1], moved, usual)
+    (doubt,) = forward_kinematics_issues(arms[1], moved, usual)
     name = arms[1].joint_names[joint]
     assert (doubt.cause, doubt.group, doubt.channel) == ("encoder_offset", "joints", f"position.{name}")
     size, found = re.search(r"([-+\d.]+) rad more.*location: (\S+, .*)}}", f"{doubt.what} {doubt.setting}").groups()
@@ -335,7 +335,7 @@ def test_points_may_be_as_far_off_as_they_are_said_to_be(arms, runs, std, is_kno
         return replace(group, position=group.position + np.array([0.06, 0.0, 0.0]), std=level)
 
     groups = tuple(moved(g) if g.name == "points_arm" else g for g in runs[1].points)
-    found = list(robot_held_point_issues(arms[1], replace(runs[1], points=groups), usual))
+    found = list(forward_kinematics_issues(arms[1], replace(runs[1], points=groups), usual))
     assert [doubt.cause for doubt in found] == (["point_frame"] if is_known else [])
 
 
@@ -352,13 +352,13 @@ def test_a_clocks_offset_is_known_no_better_than_the_errors_that_look_like_it():
 
 
 def test_clocks_that_are_far_apart(arms, runs):
-    (doubt,) = robot_held_point_issues(arms[2], stamped(runs[2], 0.2, -0.05), usual)
+    (doubt,) = forward_kinematics_issues(arms[2], stamped(runs[2], 0.2, -0.05), usual)
     assert "taken +0.202 s from the joints, by a clock that runs -52.4 parts per thousand fast" in doubt.what
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
-    (doubt,) = robot_held_point_issues(arms[2], replace(runs[2], points=tuple(groups)), usual)
+    (doubt,) = forward_kinematics_issues(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
     assert ("taken +0.4 s" in doubt.what, doubt.advice) == (True, "subtract 0.4 s from their times")
-    (doubt,) = robot_held_point_issues(arms[1], stamped(runs[1], drift=0.05), usual)
+    (doubt,) = forward_kinematics_issues(arms[1], stamped(runs[1], drift=0.05), usual)
     assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_drift", pytest.approx(1.392, rel=2e-3))
     assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
     late, drift, middle = map(float, re.search(r"by t (\S+) (\S+) \(t - (\S+)\)", doubt.advice).groups())
@@ -388,7 +388,7 @@ CLOCKS = {
 def test_a_clock_that_is_a_little_off(arms, runs, case):
     count, late, drift, cause = CLOCKS[case]
     gaps = with_points(stamped(runs[count], late, drift), "points_arm", lambda p: np.where(KEPT[: len(p)], p, np.nan))
-    found = list(robot_held_point_issues(arms[count], gaps, usual))
+    found = list(forward_kinematics_issues(arms[count], gaps, usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
@@ -407,7 +407,7 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
 def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
     (group,) = stamped(runs[1], 0.03).points[:1]
     seen = replace(group, name="points_camera", sensor="camera")
-    (doubt,) = robot_held_point_issues(arms[1], replace(runs[1], points=(seen,)), usual)
+    (doubt,) = forward_kinematics_issues(arms[1], replace(runs[1], points=(seen,)), usual)
     assert re.search(r"kind: camera_latency, location: camera, values: {delay: 0.03\d*}", doubt.setting)
 
 
@@ -417,11 +417,11 @@ def test_what_is_a_little_off_or_at_rest_is_no_wrong_clock(arms, runs):
     place = arms[1].frame_positions_and_jacobians(("left_gripper",), joints.position[:1])[0]
     rng = np.random.default_rng(0)
     at_rest = with_points(still, "points_arm", lambda p: place + 1e-3 * rng.standard_normal(p.shape))
-    assert list(robot_held_point_issues(arms[1], stamped(at_rest, 0.5), usual)) == []
+    assert list(forward_kinematics_issues(arms[1], stamped(at_rest, 0.5), usual)) == []
     short = runs[1].time_slice(-1.0, float(joints.t[200]))
     for run, off in ((runs[1], 1), (short, 0), (short, 4)):
         moved = with_joints(run, position=lambda j, off=off: j.position + 0.005 * (np.arange(7) == off))
-        assert list(robot_held_point_issues(arms[1], moved, usual)) == []
+        assert list(forward_kinematics_issues(arms[1], moved, usual)) == []
 
 
 @pytest.mark.parametrize(
@@ -605,7 +605,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0):
         options = replace(options, sensors={**options.sensors, group.name: own})
     made = EstimationProblem(problem.step, [replace(recording, points=(moved,))], problem.free, options)
     solution = solve(made, run.solver)
-    return drift_and_overstated_noise_issues(solution.problem or made, solution.x, solution.evaluation)
+    return clock_drift_and_overstated_noise_issues(solution.problem or made, solution.x, solution.evaluation)
 
 
 def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a_diagnosis(springs):
@@ -631,7 +631,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
     problem = EstimationProblem(step, [replace(made, points=(moved,))], ["elbow.stiffness"])
     solution = solve(problem, GaussNewton(), restarts=False)
     assert solution.problem.has_process_noise
-    (doubt,) = drift_and_overstated_noise_issues(solution.problem, solution.x, solution.evaluation)
+    (doubt,) = clock_drift_and_overstated_noise_issues(solution.problem, solution.x, solution.evaluation)
     assert (doubt.cause, doubt.group) == ("clock_drift", "points_camera")
     assert "its clock runs 20 ± 0.4 parts per thousand too fast" in doubt.what
 

@@ -15,7 +15,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import blind as module
 from yid_ocp.diagnosis.blind import (
     _OUT_OF_LIBRARY_SIZES,
-    MAX_CASE_DRAWS,
+    MAX_DRAWS_PER_CASE,
     BlindCaseGenerator,
     CaseGroundTruth,
     PlannedBlindCase,
@@ -177,10 +177,10 @@ def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn):
     drawn.made.clear()
     assert of_category(drawn(failures=3), "null")[1].truth != told.truth
     drawn.made.clear()
-    of_category(drawn(failures=MAX_CASE_DRAWS - 1), "null")
+    of_category(drawn(failures=MAX_DRAWS_PER_CASE - 1), "null")
     drawn.made.clear()
     with pytest.raises(ModelError, match=r"none of 64 motions(.|\n)*case_\d+ of one(.|\n)*another --seed"):
-        of_category(drawn(failures=MAX_CASE_DRAWS), "null")
+        of_category(drawn(failures=MAX_DRAWS_PER_CASE), "null")
 
 
 def test_a_case_is_the_same_whatever_was_drawn_before(drawn):

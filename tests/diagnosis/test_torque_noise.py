@@ -26,7 +26,7 @@ from yid_ocp.inference.whitening import (
     problem_with_whitening_at,
     problem_without_input_errors,
 )
-from yid_ocp.integrator.step import Step, compile_step, moving_observable_state_mask, simulate
+from yid_ocp.integrator.step import Step, compile_step, dynamic_observable_state_mask, simulate
 from yid_ocp.model import System
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -158,8 +158,8 @@ def test_states_that_no_error_reaches_are_left_out_of_a_filter():
     joints = np.array(["@" not in name for name in mounted.system.mechanism.joint_names])
     own, theta = np.tile(joints, 2), mounted.system.parameters.vector()
     swept = simulate(mounted, theta, np.where(own, 0.01, 0.0), 20)
-    assert moving_observable_state_mask(mounted, theta, swept).all()
-    found = moving_observable_state_mask(mounted, theta, swept, disturbed=own)
+    assert dynamic_observable_state_mask(mounted, theta, swept).all()
+    found = dynamic_observable_state_mask(mounted, theta, swept, disturbed=own)
     assert found.tolist() == own.tolist()
     assert not own.all()
 

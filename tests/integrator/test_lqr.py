@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 from yid_ocp.effects import make_effect
-from yid_ocp.effects.bodies import add_link_mass_parameters
+from yid_ocp.effects.bodies import system_with_link_mass_factors
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import (
@@ -159,7 +159,7 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
 
 
 def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(plain):
-    step = compile_step(add_link_mass_parameters(plain, "mass_scale"), TIME_STEP, use_compiler=False)
+    step = compile_step(system_with_link_mass_factors(plain, "mass_scale"), TIME_STEP, use_compiler=False)
     names = {"shoulder.mass_scale": 1.1, "elbow.mass_scale": 0.8, "elbow.damping": 0.4}
     theta = step.system.parameters.vector(names)
     state, torque, internal = moved(step, theta)

@@ -13,7 +13,7 @@ from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
     is_stationary_point,
     predicted_cost_reduction,
-    solve_step_within_unknown_sizes,
+    size_limited_damped_step,
 )
 from yid_ocp.problem.evaluation import soft_logarithm_and_slope
 from yid_ocp.solvers import GaussNewton, base
@@ -498,7 +498,7 @@ def test_a_step_does_not_depend_on_the_unit_of_the_residual():
 @pytest.mark.parametrize(("pull", "expected"), [(9.0, -0.1), (-9.0, 0.2), (0.05, -0.05)])
 def test_a_step_ends_at_the_bounds(pull, expected):
     problem = MadeUp(linear([[1.0]], [0.0]), (0.5,), lower=0.4, upper=0.7, scales=(0.01,))
-    step = solve_step_within_unknown_sizes(problem, np.array([0.5]), np.eye(1), np.array([pull]), 1e-14)
+    step = size_limited_damped_step(problem, np.array([0.5]), np.eye(1), np.array([pull]), 1e-14)
     assert step[0] == pytest.approx(expected)
 
 

@@ -15,7 +15,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.effects import EffectBase, make_effect
-from yid_ocp.effects.friction import set_sign_smoothing_speed
+from yid_ocp.effects.friction import effect_with_sign_smoothing_speed
 from yid_ocp.errors import ModelError
 from yid_ocp.export.models import format_support_by_effect, format_support_by_parameter
 from yid_ocp.integrator.step import compile_step
@@ -60,7 +60,7 @@ def fitted(
 ) -> dict[str, tuple[float, float]]:
     """Value and standard deviation of an effect's quantities, fitted beside the dampings."""
     system = arm(mode)
-    effect = set_sign_smoothing_speed(make_effect(kind, place, system), 0.005)
+    effect = effect_with_sign_smoothing_speed(make_effect(kind, place, system), 0.005)
     assert isinstance(effect, EffectBase)
     step = compile_step(system.with_effects([effect]), 0.01, use_compiler=is_compiled)
     free = (*effect.parameters.names, "shoulder.damping", "elbow.damping")

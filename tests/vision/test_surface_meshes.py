@@ -86,7 +86,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
     camera = vision.VirtualCameraSetup(pose, timing=vision.CameraTimingModel(mean_rate=2.0))
     one, two = (
-        vision.render_virtual_frames(vision.ObservedScene(system), run.t, run.q, replace(camera, seed=seed))
+        vision.render_virtual_frames(vision.SceneModel(system), run.t, run.q, replace(camera, seed=seed))
         for seed in (3, 4)
     )
     first = one.sequence.load_cloud(1)
@@ -101,7 +101,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert np.median(away) < 0.006
     assert len(away) > 5000
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        vision.render_virtual_frames(vision.ObservedScene(system), run.t, run.q, replace(camera, pose=None))
+        vision.render_virtual_frames(vision.SceneModel(system), run.t, run.q, replace(camera, pose=None))
 
 
 @pytest.fixture(scope="module")

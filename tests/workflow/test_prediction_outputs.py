@@ -274,7 +274,9 @@ def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
 def test_a_group_without_a_sample_has_no_expected_error():
     sensor = SimpleNamespace(channel_names=("points.p",), outputs_per_channel=3)
     empty = np.zeros((0, 3))
-    nothing = SimpleNamespace(sensor=sensor, value=empty, std=empty, output_changes_per_error_std=np.zeros((0, 3, 1)))
+    nothing = SimpleNamespace(
+        sensor=sensor, value=empty, std=empty, output_changes_per_bias_and_clock_std=np.zeros((0, 3, 1))
+    )
     outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
 

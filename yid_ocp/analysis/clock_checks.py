@@ -24,7 +24,7 @@ from yid_ocp.data.channel_checks import (
     MIN_DIFFERENCES_FOR_NOISE_STD,
     QUALITY_LIMITS,
     Issue,
-    Severity,
+    IssueSeverity,
     median_sample_period,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup
@@ -145,7 +145,7 @@ def robot_held_point_clock_issues(
     assert more is not None
     found = replace(more, delay=late, drift=drift)
     moved, limit = float(np.sqrt(np.mean(np.sum(speed**2, axis=2)))), _offset_tolerance(joints, group)
-    severity: Severity = "not_trusted" if moved * max(abs(late), abs(found.whole_drift)) > noise else "warning"
+    severity: IssueSeverity = "not_trusted" if moved * max(abs(late), abs(found.whole_drift)) > noise else "warning"
     if found.drifts_beyond(limit):
         yield _drift_issue(found, group.name, limit, severity)
     elif abs(late) > _MIN_Z * found.delay_std and abs(late) > limit:
@@ -159,7 +159,7 @@ def robot_held_point_clock_issues(
         yield Issue("clock_offset", words, severity, abs(late) / limit, advice, "", group.name, "t", setting=setting)
 
 
-def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severity) -> Issue:
+def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSeverity) -> Issue:
     late, drift, whole = found.delay, found.drift, found.whole_drift
     begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
     size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
@@ -209,7 +209,9 @@ def search_clock_offset_and_drift(
     return float(fine.x[0]), float(fine.x[1]) / span
 
 
-def drift_and_overstated_noise_issues(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
+def clock_drift_and_overstated_noise_issues(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation
+) -> list[Issue]:
     """Find drifting clocks and overstated noise in the residuals of a fit.
 
     Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has

@@ -25,7 +25,7 @@ from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
-from yid_ocp.problem.options import DiscretisationName
+from yid_ocp.problem.options import RefinedDiscretisation
 from yid_ocp.solvers import GaussNewton
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
@@ -216,7 +216,7 @@ def measure_discretisation_shifts(
     problem: EstimationProblem,
     x: Array,
     at_x: Evaluation,
-    kinds: Sequence[DiscretisationName],
+    kinds: Sequence[RefinedDiscretisation],
     progress: Progress = NULL_PROGRESS,
     *,
     model_difference_only: bool = False,
@@ -250,7 +250,7 @@ def measure_discretisation_shifts(
     return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _refined_problem(problem: EstimationProblem, what: DiscretisationName) -> _FinerDiscretisationProblem:
+def _refined_problem(problem: EstimationProblem, what: RefinedDiscretisation) -> _FinerDiscretisationProblem:
     options = problem.options
     if what == "time_step" or options.divided_links_model is None:
         return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
@@ -359,7 +359,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def min_grasp_frame_distances(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
+def smallest_possible_grasp_gaps(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
     `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths.

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis import discretisation
-from yid_ocp.analysis.clock_checks import drift_and_overstated_noise_issues
+from yid_ocp.analysis.clock_checks import clock_drift_and_overstated_noise_issues
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import MAX_REPORTED_LIMIT_VIOLATION_RATIO, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_by_name
-from yid_ocp.inference.linearized_residual import solve_step_within_unknown_sizes
+from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import free_estimates_marked_not_trusted, typical_parameter_magnitudes
 from yid_ocp.model.objects.base import CableTopology
-from yid_ocp.model.objects.cable import MEMORY_HALVING_SPEED_PARAMETER_NAME, START_SPEED_PARAMETER_NAME
+from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import SensorMeasurements
@@ -143,7 +143,7 @@ def _checked_solution_and_issues(
     if solution.evaluation is None:
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_and_units(problem, solution, held_out)
-    found = drift_and_overstated_noise_issues(problem, solution.x, solution.evaluation)
+    found = clock_drift_and_overstated_noise_issues(problem, solution.x, solution.evaluation)
     found += _worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
@@ -225,7 +225,7 @@ def choose_cable_memory_fit(
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
     """Return the problem with the cable's memory parameters fixed at zero."""
     memory = _memory_parameters(problem)
-    free = tuple(name for name in problem.free if name not in (*memory, MEMORY_HALVING_SPEED_PARAMETER_NAME))
+    free = tuple(name for name in problem.free if name not in (*memory, SHAPE_MEMORY_HALVING_SPEED_PARAMETER))
     return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))
 
 
@@ -235,7 +235,7 @@ def _memory_parameters(problem: EstimationProblem) -> list[str]:
 
 def _moving(problem: EstimationProblem) -> list[int]:
     starts = [episode.fixed_initial_state for episode in problem.episodes]
-    speeds = [0.0 if s is None else s.fitted_parameters.get(START_SPEED_PARAMETER_NAME, 0.0) for s in starts]
+    speeds = [0.0 if s is None else s.fitted_parameters.get(INITIAL_RMS_SPEED_PARAMETER, 0.0) for s in starts]
     return [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]
 
 
@@ -248,7 +248,7 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
     for i in moving:
         own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.residual_rows.measurements[i]])
         kept = np.setdiff1d(np.arange(len(evaluation.residual)), own)
-        step = solve_step_within_unknown_sizes(
+        step = size_limited_damped_step(
             problem, solution.x, evaluation.jacobian[kept], evaluation.residual[kept], 1e-10
         )
         x = np.clip(solution.x + step, *problem.bounds)

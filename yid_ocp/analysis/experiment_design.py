@@ -42,14 +42,14 @@ CAMERA_GROUP, ARM_GROUP = "points_camera", "points_arm"
 _MARKER_AXIS_DISTANCE = 0.03  # distance of a marker from the axis [m]
 _DEFAULT_CAMERA_STD, _DEFAULT_CAMERA_RATE = 5e-3, 3.0  # of a hypothetical camera [m], [Hz]
 _DEFAULT_ARM_POINT_STD = 1e-3  # of hypothetical points measured by an arm [m]
-DEFAULT_TORQUE_STD = 0.1  # of joint torques without stated noise [N m]
+ASSUMED_TORQUE_NOISE_STD = 0.1  # of joint torques without stated noise [N m]
 _MOTION_SEED = 11  # of alternative motions
 # Offsets of two grippers towards each other and away from the robot: a fully stretched branched tube snaps through [m].
 _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 
 @dataclass(frozen=True)
-class FrameObservationSchedule:
+class PointObservationSchedule:
     """Sample times and standard deviations of one frame that a point group observes."""
 
     point_group: str
@@ -91,7 +91,7 @@ class RecordedExperiment:
             return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
         return None, times, std
 
-    def existing_point_observation_schedules(self, episode: Episode) -> list[FrameObservationSchedule]:
+    def existing_point_observation_schedules(self, episode: Episode) -> list[PointObservationSchedule]:
         """Observation schedule of every point measured in a recording."""
         found = []
         for group in _used_point_groups(self.problem, episode):
@@ -102,7 +102,7 @@ class RecordedExperiment:
                 if self.problem.system.mechanism.has_frame(frame):
                     at = group.names.index(point)
                     seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                    found.append(FrameObservationSchedule(group.name, frame, t[seen], std[seen, at]))
+                    found.append(PointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def _std(self, group: PointGroup) -> Array:
@@ -124,7 +124,7 @@ def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
-class _ObservableFrame(NamedTuple):
+class _MeasurablePoint(NamedTuple):
     """A frame that a camera or also an arm could measure. `added_frame` is set if the mechanism lacks it."""
 
     name: str
@@ -133,21 +133,21 @@ class _ObservableFrame(NamedTuple):
     added_frame: Frame | None = None
 
 
-def observable_frames(system: System) -> list[_ObservableFrame]:
+def measurable_points(system: System) -> list[_MeasurablePoint]:
     """Measurable frames: segment tips, midpoints and markers near the tips; without segments, links and markers."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
-    found: list[_ObservableFrame] = []
+    found: list[_MeasurablePoint] = []
     for segment in system.segment_layouts:
         name, count, tip = segment.name, len(segment.link_joints), f"w_{segment.name}"
-        found.append(_ObservableFrame(tip, f"the end of {name}", False))
+        found.append(_MeasurablePoint(tip, f"the end of {name}", False))
         if count > 1:
-            found.append(_ObservableFrame(f"{name}_{(count - 1) // 2}_tip", f"the middle of {name}", False))
+            found.append(_MeasurablePoint(f"{name}_{(count - 1) // 2}_tip", f"the middle of {name}", False))
         beside = _displaced(tree.frame(tip), (_MARKER_AXIS_DISTANCE, 0.0, 0.0))
-        found.append(_ObservableFrame(f"{name}_marker", f"{off_axis} at the end of {name}", tip in held, beside))
+        found.append(_MeasurablePoint(f"{name}_marker", f"{off_axis} at the end of {name}", tip in held, beside))
     if system.segment_layouts:
         return found
-    found = [_ObservableFrame(name, name, False) for name, frame in tree.frames.items() if frame.joint_index >= 0]
+    found = [_MeasurablePoint(name, name, False) for name, frame in tree.frames.items() if frame.joint_index >= 0]
     for spring in system.elastic_joints:
         index, name = tree.joint_index(spring.joint_name), spring.joint_name
         if tree.joints[index].kind == "revolute":
@@ -156,7 +156,7 @@ def observable_frames(system: System) -> list[_ObservableFrame]:
             across -= axis * float(across @ axis)
             across *= _MARKER_AXIS_DISTANCE / float(np.linalg.norm(across))
             frame = _displaced(Frame(index, Placement.identity()), across)
-            found.append(_ObservableFrame(f"{name}_marker", f"{off_axis} of {name}", False, frame))
+            found.append(_MeasurablePoint(f"{name}_marker", f"{off_axis} of {name}", False, frame))
     return found
 
 
@@ -165,9 +165,9 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def extended_step_and_observable_frames(step: Step) -> tuple[Step, list[_ObservableFrame]]:
+def extended_step_and_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
     """Return the step with all measurable frames in its mechanism, and these frames. The equations stay the same."""
-    mechanism, seen = step.system.mechanism, observable_frames(step.system)
+    mechanism, seen = step.system.mechanism, measurable_points(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
     return replace(step, model=replace(step.model, system=system)), seen
@@ -192,7 +192,7 @@ class ExperimentVariantSensitivities:
     feasibility_notes: tuple[str, ...] = ()  # obstacles on a real robot, such as joint limits
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
-    def fisher_information_with_prior(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
+    def fisher_information_with_prior(self, views: Sequence[Sequence[PointObservationSchedule]]) -> Array:
         """Fisher information (nx, nx) of observations plus that of the prior. `views` has one list per recording."""
         total = self.prior_information.copy()
         nx = len(total)
@@ -206,7 +206,7 @@ class ExperimentVariantSensitivities:
                 total -= own[:nx, nx:] @ scipy.linalg.solve(own[nx:, nx:], own[nx:, :nx], assume_a="pos")
         return total
 
-    def _of(self, episode: int, grid: TimeGrid, view: FrameObservationSchedule) -> Array:
+    def _of(self, episode: int, grid: TimeGrid, view: PointObservationSchedule) -> Array:
         key = (episode, view.point_group, view.frame, view.times.tobytes(), view.std.tobytes())
         if key not in self._known:
             inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)
@@ -265,7 +265,7 @@ class ExperimentVariantSensitivityBuilder:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
-        step, seen = extended_step_and_observable_frames(step)
+        step, seen = extended_step_and_measurable_points(step)
         wide = add_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
@@ -302,7 +302,7 @@ class ExperimentVariantSensitivityBuilder:
             joints = self.setting.problem.episodes[0].recording.joints
             said = None if joints is None else joints.effort_std
             stated = said is not None and bool(np.all(np.asarray(said) > 0))
-            sensors[JOINT_EFFORT_GROUP_NAME] = SensorOptions(std=None if stated else DEFAULT_TORQUE_STD)
+            sensors[JOINT_EFFORT_GROUP_NAME] = SensorOptions(std=None if stated else ASSUMED_TORQUE_NOISE_STD)
         return sensors
 
     def _finest(self, episode: Episode) -> dict[str, float]:
@@ -415,7 +415,7 @@ class ExperimentVariantSensitivityBuilder:
         notes = [f"beyond the {what} of {joints_beyond}" for what, joints_beyond in names.items()]
         return Recording(joints, source="what if", name=episode.name), notes
 
-    def _dense(self, recording: Recording, index: int, seen: Sequence[_ObservableFrame], torque: bool) -> Recording:
+    def _dense(self, recording: Recording, index: int, seen: Sequence[_MeasurablePoint], torque: bool) -> Recording:
         """The recording with every frame seen at every node with unit standard deviation, and with efforts."""
         setting, base = self.setting, self.setting.problem
         episode, joints = base.episodes[index % len(base.episodes)], recording.joints

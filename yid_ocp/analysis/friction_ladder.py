@@ -87,7 +87,7 @@ def mean_and_std_error_over_motion_kinds(
     return float(np.mean(by_kind)), float(np.std(by_kind, ddof=1) / np.sqrt(len(by_kind)))
 
 
-def error_difference_and_std_error(
+def prediction_error_difference_and_std_error(
     fit: FrictionLawFit, other: FrictionLawFit, kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
     """Mean over kinds of motion by which one fit's errors exceed another's, and its standard error."""
@@ -108,7 +108,7 @@ def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping
     _, error = mean_and_std_error_over_motion_kinds(best.left_out_errors, kinds)
 
     def is_near(fit: FrictionLawFit) -> bool:
-        difference, paired = error_difference_and_std_error(fit, best, kinds)
+        difference, paired = prediction_error_difference_and_std_error(fit, best, kinds)
         return difference <= max(error, paired)
 
     return next((fit for fit in fits if is_near(fit)), fits[0])

@@ -27,7 +27,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.sensors import SensorOptions
 
-_SensorChoices = Callable[[str], SensorOptions]
+_Choices = Callable[[str], SensorOptions]
 
 _HELD_POINT_TOLERANCE = 0.01  # from the position by the arm: errors of calibration and tool size [m]
 # Fraction of the object's length by which points may differ from a model with unknown stiffness.
@@ -57,7 +57,7 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
 
 
-def robot_held_point_issues(arm: RecordedJointsModel, recording: Recording, options: _SensorChoices) -> Iterator[Issue]:
+def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, options: _Choices) -> Iterator[Issue]:
     """Yield issues about points that disagree with forward kinematics; `options` returns a group's sensor options."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
@@ -230,7 +230,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 
 
 def point_distance_issues(
-    arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, options: _SensorChoices
+    arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, options: _Choices
 ) -> Iterator[Issue]:
     """Yield issues about points farther apart, or farther from the root, than the object's length allows."""
     mechanism = system.mechanism

@@ -16,9 +16,9 @@ from yid_ocp.analysis.experiment_design import (
     MECHANICAL_CHANGE_DESCRIPTIONS,
     ExperimentVariantSensitivities,
     ExperimentVariantSensitivityBuilder,
-    FrameObservationSchedule,
+    PointObservationSchedule,
     RecordedExperiment,
-    observable_frames,
+    measurable_points,
     uniform_sample_times,
 )
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
@@ -203,7 +203,7 @@ class _Outcomes:
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
         names = self.builder.applicable_mechanical_changes()
         changes = [ExperimentChange(name, MECHANICAL_CHANGE_DESCRIPTIONS[name], name) for name in names]
-        for sight in observable_frames(setting.problem.system):
+        for sight in measurable_points(setting.problem.system):
             name, words = sight.name, sight.description
             if name not in looked | felt:
                 changes.append(ExperimentChange(f"camera:{name}", f"{words}, seen by the camera", camera_frame=name))
@@ -246,7 +246,7 @@ class _Outcomes:
 
     def _views(
         self, episode: Episode, changes: Sequence[ExperimentChange], layout: ExperimentVariantSensitivities
-    ) -> list[FrameObservationSchedule]:
+    ) -> list[PointObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_point_group_times_and_std(episode)
         arm, arm_times, arm_std = setting.arm_point_group_times_and_std(episode)
@@ -255,8 +255,8 @@ class _Outcomes:
         if rate is not None:
             times = uniform_sample_times(episode.grid, rate)
 
-        def look(frame: str) -> FrameObservationSchedule:
-            return FrameObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
+        def look(frame: str) -> PointObservationSchedule:
+            return PointObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
 
         # a point that the second arm holds is measured by that arm
         held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
@@ -268,7 +268,7 @@ class _Outcomes:
         views += [look(change.camera_frame) for change in changes if change.camera_frame]
         feels = [*sorted(held - before), *(change.arm_frame for change in changes if change.arm_frame)]
         felt = np.full((len(arm_times), 3), arm_std)
-        return views + [FrameObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
+        return views + [PointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
 
 
 def _relative_stds_and_gain(

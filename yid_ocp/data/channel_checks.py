@@ -17,7 +17,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.sensors import CHANNEL_KINDS, SensorOptions
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORDER, quantization_step
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, quantization_step
 
 _MAX_REPEATED_FRACTION = 0.1  # fraction of samples that may repeat the previous one
 _MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # change next to a rest over smallest and median change
@@ -98,14 +98,14 @@ def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
 
 def white_noise_std(t: Array, values: Array) -> float:
     """Robust standard deviation of a channel's white noise; zero if the clock `t` is uneven or it rests long."""
-    if len(t) < NOISE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
+    if len(t) < NOISE_ESTIMATE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
-    together = np.lib.stride_tricks.sliding_window_view(even, NOISE_DIFFERENCE_ORDER).all(axis=1)
+    together = np.lib.stride_tricks.sliding_window_view(even, NOISE_ESTIMATE_DIFFERENCE_ORDER).all(axis=1)
     if together.sum() < MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
-    size = math.sqrt(float(scipy.special.comb(2 * NOISE_DIFFERENCE_ORDER, NOISE_DIFFERENCE_ORDER)))
-    return float(1.4826 * np.median(np.abs(np.diff(values, NOISE_DIFFERENCE_ORDER)[together])) / size)
+    size = math.sqrt(float(scipy.special.comb(2 * NOISE_ESTIMATE_DIFFERENCE_ORDER, NOISE_ESTIMATE_DIFFERENCE_ORDER)))
+    return float(1.4826 * np.median(np.abs(np.diff(values, NOISE_ESTIMATE_DIFFERENCE_ORDER)[together])) / size)
 
 
 def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, channel: str) -> float:
@@ -262,7 +262,7 @@ def _measured_positions(recording: Recording, point: str) -> Array:
     raise DataError(f"point '{point}' is not recorded", where=f"recording '{recording.name}'", **said)
 
 
-Severity = Literal["warning", "not_trusted", "refused"]
+IssueSeverity = Literal["warning", "not_trusted", "refused"]
 
 MAX_REPORTED_LIMIT_VIOLATION_RATIO = 1e3
 """Largest value of `Issue.limit_violation_ratio`; larger ratios are clipped."""
@@ -303,7 +303,7 @@ class Issue:
     cause: str  # key of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # sentence on the cause, with numbers
     # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
-    weight: Severity
+    weight: IssueSeverity
     # observed value over the detection limit (inverse for a lower limit), 1 to `MAX_REPORTED_LIMIT_VIOLATION_RATIO`
     limit_violation_ratio: float
     advice: str  # recommended action

@@ -114,7 +114,7 @@ _MocapTable = tuple[PointGroup, str, tuple[str, ...]]
 """Points of a motion capture export in its own unit, this unit (mm, cm or m), and notes for the user."""
 
 
-def mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
+def select_mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
     """Choose a reader of a motion capture export by the table's first row. Returns None for other tables."""
     first = first_row[0].strip() if first_row else ""
     if first == "Format Version":

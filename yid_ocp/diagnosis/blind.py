@@ -46,7 +46,7 @@ BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
     "finer_chain": 0.06,
 }
 """Fraction of the cases in every category."""
-ALLOWED_ENSEMBLE_PURPOSES = ("report", "calibration")
+BLIND_ENSEMBLE_PURPOSES = ("report", "calibration")
 """Purposes of an ensemble; the same seed draws different cases for each."""
 _MIN_CASES_PER_EXPERIMENT = 3  # with fewer cases, an experiment is not worth its compilation
 
@@ -67,7 +67,7 @@ def plan_blind_cases(
     seed: int,
     weights: Mapping[str, float],
     chains: frozenset[str] = frozenset(),
-    purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0],
+    purpose: str = BLIND_ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
     """Plan `count` blind cases of several experiments, in an order drawn by the seed.
 
@@ -95,7 +95,7 @@ def plan_blind_cases(
         name = max(able or kept, key=lambda entry: kept[entry] * (i + 1) - given[entry])
         given[name] += 1
         cases.append((name, *(slot if able else ("single", _DETECTABLE_MULTIPLES[1]))))
-    order = np.random.default_rng([seed, ALLOWED_ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
+    order = np.random.default_rng([seed, BLIND_ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
     # every third clean case, so that each experiment has some
     brisk = {place for i, place in enumerate(p for p, (_, kind, _) in enumerate(cases) if kind == "null") if i % 3 == 1}
     return [PlannedBlindCase(number, *cases[int(place)], int(place) in brisk) for number, place in enumerate(order)]
@@ -111,7 +111,7 @@ def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
     return found
 
 
-MAX_CASE_DRAWS = 64
+MAX_DRAWS_PER_CASE = 64
 """Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""
 _STIFFNESS_SPREAD_FACTOR = 1.5  # factor by which true stiffnesses lie above or below the problem's start, at most
 _PRIOR_DEVIATIONS = (0.6, 1.0)  # deviation of a parameter with a prior from its initial value, in stds of the prior
@@ -194,7 +194,7 @@ class SyntheticMeasurementConditions:
     # friction that the engine simulates with sticking, together with injected friction; None: smooth forces
     ordinary_friction: Sequence[InjectedEffect] | None = None
     is_brisk: bool = False
-    purpose: str = ALLOWED_ENSEMBLE_PURPOSES[0]  # one of `ALLOWED_ENSEMBLE_PURPOSES`
+    purpose: str = BLIND_ENSEMBLE_PURPOSES[0]  # one of `BLIND_ENSEMBLE_PURPOSES`
 
 
 _Detectable = tuple[EffectBase, Mapping[str, float], Array]
@@ -243,7 +243,7 @@ class BlindCaseGenerator:
             raise ConfigError(what, where="diagnosis.candidates", allowed=", ".join(INJECTABLE_EFFECT_KINDS), hint=hint)
 
     def _rng(self, *path: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, ALLOWED_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
+        return np.random.default_rng([self.seed, BLIND_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
     def _draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
         """True values of free parameters, log-uniform or according to a prior, and of all ordinary friction."""
@@ -336,7 +336,7 @@ class BlindCaseGenerator:
         """Draw recordings and label of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
         name = f"case_{planned.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
-        for attempt in range(MAX_CASE_DRAWS):
+        for attempt in range(MAX_DRAWS_PER_CASE):
             rng = self._rng(1, planned.number, attempt)
             truth = self._draw_true_parameters(rng)
             injected, multiple = self._injected(planned, rng)
@@ -350,7 +350,7 @@ class BlindCaseGenerator:
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return BlindCase(name, tuple(estimate), held_out, left_out), label
-        what, allowed = f"none of {MAX_CASE_DRAWS} motions can be simulated", "a motion that MuJoCo can simulate"
+        what, allowed = f"none of {MAX_DRAWS_PER_CASE} motions can be simulated", "a motion that MuJoCo can simulate"
         where, hint = f"{name} of {planned.experiment}", "use another --seed: one seed always draws the same motions"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 

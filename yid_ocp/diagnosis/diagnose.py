@@ -55,9 +55,9 @@ from yid_ocp.errors import DataError, SolverError, failed_rollout_error
 from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
+    encoder_noise_residual_factor,
     residual_channels,
     residual_chi2_null_test,
-    residual_spread_from_encoder_noise,
     residuals_exceed_noise,
     whiten_with_extra_errors,
 )
@@ -545,7 +545,7 @@ def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits:
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
-    spread = residual_spread_from_encoder_noise(fit.problem, fit.problem.unknown_vector(fit.values))
+    spread = encoder_noise_residual_factor(fit.problem, fit.problem.unknown_vector(fit.values))
     residual = whiten_with_extra_errors(fit.evaluation.residual, spread)
     return _null_test(fit.problem, residual, len(fit.values), limits)
 
@@ -578,7 +578,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
         return np.concatenate(parts)
 
     spread = np.vstack(slopes) @ unknowns_covariance_factor(problem, fit.evaluation)[:shared]
-    if (by_path := residual_spread_from_encoder_noise(own, x, predicted)).size:
+    if (by_path := encoder_noise_residual_factor(own, x, predicted)).size:
         spread = np.hstack([spread, by_path])
     residual = whiten_with_extra_errors(np.concatenate(residuals), spread)
     return _null_test(own, residual, 0, limits)

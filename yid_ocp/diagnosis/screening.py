@@ -30,8 +30,8 @@ from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_
 from yid_ocp.inference.null_test import (
     ResidualChannel,
     chi2_p_value,
+    encoder_noise_residual_factor,
     residual_channels,
-    residual_spread_from_encoder_noise,
 )
 
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
@@ -117,7 +117,7 @@ def linearize_candidates(
         if k == 0:
             basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
             residual = data - basis @ (basis.T @ data)
-            scatter = residual_spread_from_encoder_noise(trial, trial.unknown_vector(values))[: len(data)]
+            scatter = encoder_noise_residual_factor(trial, trial.unknown_vector(values))[: len(data)]
         moved = jacobian[:, places]
         moved = moved - basis @ (basis.T @ moved)
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect in chosen])[:-1]

@@ -368,7 +368,7 @@ def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.S
     return force
 
 
-def change_joint_bodies(
+def system_with_changed_bodies(
     system: System, joints: Collection[str], change: Callable[[tuple[Inertia, ...]], Iterable[Inertia]]
 ) -> System:
     """Return the system with `change` applied to the rigid bodies of the named joints."""

@@ -54,7 +54,7 @@ class _ScaledBodies(EffectBase):
         raise NotImplementedError
 
     def apply_to_system(self, system: System) -> System:
-        return base.change_joint_bodies(
+        return base.system_with_changed_bodies(
             system, self._joints(system), lambda bodies: (b.scaled_by(self["scale"]) for b in bodies)
         )
 
@@ -91,7 +91,7 @@ class _LinkMass(_ScaledBodies):
         return (self.location,)
 
 
-def add_link_mass_parameters(system: System, name: str) -> System:
+def system_with_link_mass_factors(system: System, name: str) -> System:
     """The system with a factor `JOINT.name` on mass and inertia of every arm link, besides the effect `link_mass`."""
     tree, text = system.mechanism, "mass and inertia of the link on {} over those of the URDF"
     factors = {j: Parameter(f"{j}.{name}", 1.0, "1", 0.2, 3.0, text.format(j)) for j in _joints_with_mass(system)}
@@ -133,7 +133,7 @@ class _PointMass(EffectBase):
         frame = system.mechanism.frame(self.location)
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
         joint = system.mechanism.joints[frame.joint_index].name
-        return base.change_joint_bodies(system, [joint], lambda bodies: (*bodies, point))
+        return base.system_with_changed_bodies(system, [joint], lambda bodies: (*bodies, point))
 
 
 @EFFECTS.register("payload")
@@ -208,7 +208,7 @@ class Payload(EffectBase):
         # two bodies, one of 1 kg, to avoid a division by the mass
         one = Inertia(ca.SX(1), centre + first, ca.densify(tensor))
         other = Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3)))
-        return base.change_joint_bodies(system, [joint.name], lambda bodies: (*bodies, one, other))
+        return base.system_with_changed_bodies(system, [joint.name], lambda bodies: (*bodies, one, other))
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
@@ -344,7 +344,7 @@ class _GravityScale(EffectBase):
             return replace(body, gravity_fraction=nominal + self["fraction"])
 
         joints = base.object_joint_names(system)
-        return base.change_joint_bodies(system, joints, lambda bodies: map(scaled, bodies))
+        return base.system_with_changed_bodies(system, joints, lambda bodies: map(scaled, bodies))
 
 
 @EFFECTS.register("gravity_tilt")

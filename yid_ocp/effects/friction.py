@@ -55,7 +55,7 @@ class _JointFriction(EffectBase):
         )
 
 
-def set_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
+def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
     """The effect with another smoothing speed [rad/s] if it is a joint friction and a speed is given."""
     if speed is None or not isinstance(effect, _JointFriction):
         return effect

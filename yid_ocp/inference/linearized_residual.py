@@ -209,11 +209,11 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
         return math.inf
     if not len(x):
         return 0.0
-    step = solve_step_within_unknown_sizes(problem, x, evaluation.jacobian, evaluation.residual, 1e-14)
+    step = size_limited_damped_step(problem, x, evaluation.jacobian, evaluation.residual, 1e-14)
     return predicted_cost_reduction(evaluation.jacobian, evaluation.residual, step)
 
 
-def solve_step_within_unknown_sizes(
+def size_limited_damped_step(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
     """Solve for the damped least-squares step (nx,) in which an unknown moves by at most its value or typical size."""

@@ -144,7 +144,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
 
 
-def residual_spread_from_encoder_noise(
+def encoder_noise_residual_factor(
     problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
 ) -> Array:
     """Spread F (nr, K) of the points' residuals by the noise of encoders that move prescribed arms, a draw a column.

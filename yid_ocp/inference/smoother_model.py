@@ -31,8 +31,8 @@ from yid_ocp.inference.linearized_residual import (
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import (
+    dynamic_observable_state_mask,
     input_or_servo_torques_of_rollout,
-    moving_observable_state_mask,
     step_derivatives_along_rollout,
 )
 from yid_ocp.model.kinematics import forward_kinematics
@@ -350,7 +350,7 @@ def _recording(
     pushes = pushes[:, unknowns.forced]
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
     about = course.problem.step, course.nominal.theta, course.nominal.rollout
-    moving = np.flatnonzero(moving_observable_state_mask(*about, loads))
+    moving = np.flatnonzero(dynamic_observable_state_mask(*about, loads))
     slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course.nominal, with_neighbours=True)
     slopes = slopes.select_states(moving)
     beyond = len(slopes.by_state) - 2  # steps that samples at an interval's end depend on

@@ -45,7 +45,7 @@ from yid_ocp.inference.linearized_residual import (
     ResidualDerivativesAtNodes,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import moving_observable_state_mask, step_derivatives_along_rollout
+from yid_ocp.integrator.step import dynamic_observable_state_mask, step_derivatives_along_rollout
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -162,7 +162,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     ends = {"seen": slopes.visible_state_mask, "disturbed": np.any(np.abs(start) > _MIN_START_SLOPE, axis=1)}
-    live = moving_observable_state_mask(step, course.theta, course.rollout, **ends)
+    live = dynamic_observable_state_mask(step, course.theta, course.rollout, **ends)
     kept = np.flatnonzero(live)
     rows_of_node, slopes = slopes.residual_indices_by_first_node(count), slopes.select_states(kept)
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])

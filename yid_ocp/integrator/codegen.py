@@ -52,12 +52,12 @@ class StepFunctions:
         return self._function("linear")
 
     @property
-    def row_scale_and_time_step(self) -> ca.Function:
+    def row_scale_and_time_step_function(self) -> ca.Function:
         """Function that returns the scale of the momentum balance's rows and the clock-corrected time step [s]."""
         return self._function("scales")
 
     @property
-    def internal_residual_at_rest(self) -> ca.Function:
+    def internal_residual_at_rest_function(self) -> ca.Function:
         """Function of the internal equations at rest (both nodes equal) and their derivatives by (q, z, lam, u)."""
         return self._function("resting")
 

@@ -109,7 +109,7 @@ class EquilibriumSolver:
         step, system = self.step, self.step.system
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
         theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))
-        stiffness = measured_angle_holding_stiffness(system, torque is not None)
+        stiffness = measured_angle_hold_stiffness(system, torque is not None)
         nu, nz, m = step.sizes["nu"], step.sizes["nz"], step.sizes["m"]
         held = np.zeros(nu) if torque is None else float_array_with_checked_shape("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness, np.where(_is_motor_off(system, held), _HOLD_STIFFNESS, 0.0))
@@ -254,7 +254,7 @@ class EquilibriumSolver:
             part[:n] += of_p
         if nz:
             inner, at = slice(n, n + nz), (q, q, none, z, z, lam, u, theta, step.time_step)
-            residual, nonzeros = (np.array(x).ravel() for x in step.functions.internal_residual_at_rest(*at))
+            residual, nonzeros = (np.array(x).ravel() for x in step.functions.internal_residual_at_rest_function(*at))
             slopes = np.zeros((nz, n + nz + m + nu))
             slopes[nonzero_indices(step.functions.sparsity_patterns["resting"])] = nonzeros
             rows[0][inner], by_rows[inner], rows[2][inner] = residual, slopes[:, : n + nz + m], slopes[:, n + nz + m :]
@@ -323,7 +323,7 @@ def _is_motor_off(system: System, command: Array) -> BoolArray:
     return np.asarray(bool(system.servos) & (command >= MOTOR_OFF_COMMAND / 2))
 
 
-def measured_angle_holding_stiffness(system: System, known: bool) -> float:
+def measured_angle_hold_stiffness(system: System, known: bool) -> float:
     """Stiffness of springs at measured angles [N m/rad]. `known` states whether torques or servo commands are given."""
     if not known:
         return _HOLD_STIFFNESS

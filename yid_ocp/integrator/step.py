@@ -64,7 +64,7 @@ class Step(ReprMixin):
         """Time step corrected for the recording's clock [s]: h times `System.recorded_time_scale` at `theta`."""
         s = self.sizes
         none = [np.zeros(s[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
-        return float(self.functions.row_scale_and_time_step(*none, theta, self.time_step)[1])
+        return float(self.functions.row_scale_and_time_step_function(*none, theta, self.time_step)[1])
 
     @property
     def force_split(self) -> ForceSplit:
@@ -332,7 +332,7 @@ def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, t
     return np.array(ca.densify(rows)).T.reshape(np.shape(q))
 
 
-def moving_observable_state_mask(
+def dynamic_observable_state_mask(
     step: Step,
     theta: Array,
     rollout: Rollout,

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 from scipy.interpolate import BSpline
 
-from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
+from yid_ocp.analysis.experiment_design import ASSUMED_TORQUE_NOISE_STD
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, failed_rollout_error
@@ -205,7 +205,7 @@ class SplineMotionExperiment:
         sensors = dict(self._options().sensors)
         if joints.effort is not None:
             std = np.zeros(len(joints.names)) if joints.effort_std is None else np.asarray(joints.effort_std)
-            joints = replace(joints, effort_std=np.where(std > 0, std, DEFAULT_TORQUE_STD))
+            joints = replace(joints, effort_std=np.where(std > 0, std, ASSUMED_TORQUE_NOISE_STD))
         if self.configured_problem.system.driven:
             # `_blur` represents the error of the motion
             joints = replace(joints, position_std=None)

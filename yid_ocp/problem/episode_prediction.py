@@ -492,7 +492,7 @@ class _Trajectory:
     by_multipliers: Array | None
 
 
-def episode_with_observed_equilibrium_and_denoised_loads(
+def episode_at_equilibrium_with_denoised_gear_loads(
     predictor: EpisodePredictor, episode: Episode, theta: Array
 ) -> Episode:
     """Start an episode at the equilibrium near its first points, and remove effort noise from gear loads."""

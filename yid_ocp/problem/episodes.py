@@ -208,7 +208,7 @@ class Episode:
     @property
     def has_uncertain_sensor_biases(self) -> bool:
         """Whether a sensor or its clock has a constant error of unknown size, which is treated as noise."""
-        return any(samples.has_uncertain_errors for samples in self.measurements)
+        return any(samples.has_uncertain_biases_or_clock for samples in self.measurements)
 
     @property
     def name(self) -> str:

@@ -16,7 +16,7 @@ from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
-from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_observed_equilibrium_and_denoised_loads
+from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_at_equilibrium_with_denoised_gear_loads
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
@@ -111,7 +111,7 @@ class EstimationProblem(ReprMixin):
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
         ready, other = (
-            tuple(episode_with_observed_equilibrium_and_denoised_loads(self.predictor, e, theta) for e in group)
+            tuple(episode_at_equilibrium_with_denoised_gear_loads(self.predictor, e, theta) for e in group)
             for group in (fitted, others)
         )
         self._set(functions, options, tuple(free), theta, ready, other)

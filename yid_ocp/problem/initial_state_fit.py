@@ -15,7 +15,7 @@ from yid_ocp.integrator.statics import steady_effect_internal_coordinates
 from yid_ocp.integrator.step import Step, generalized_momentum_from_velocity
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.objects.cable import START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES, START_SPEED_PARAMETER_NAME
+from yid_ocp.model.objects.cable import INITIAL_ANGLE_AND_TORQUE_SUFFIXES, INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import Sensor, sensor_reading_function
@@ -98,7 +98,7 @@ class InitialStateFitter:
         self._presets = tuple(
             (index, spring.joint_name)
             for index, spring in zip(at, system.elastic_joints, strict=True)
-            if f"{spring.joint_name}.{START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES[0]}" in system.parameters
+            if f"{spring.joint_name}.{INITIAL_ANGLE_AND_TORQUE_SUFFIXES[0]}" in system.parameters
         )
         loads = [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
         self._load = ca.Function("load", e.arguments, loads)
@@ -167,8 +167,8 @@ class InitialStateFitter:
         momentum = generalized_momentum_from_velocity(step, q0, velocity, theta)
         state = np.concatenate([q0, momentum, steady_effect_internal_coordinates(step, q0, theta)])
         own = dict(zip(self.fitted_parameters, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
-        if START_SPEED_PARAMETER_NAME in system.parameters:
-            own[START_SPEED_PARAMETER_NAME] = _speed(frames[first], frames[then], (then - first) * step.time_step)
+        if INITIAL_RMS_SPEED_PARAMETER in system.parameters:
+            own[INITIAL_RMS_SPEED_PARAMETER] = _speed(frames[first], frames[then], (then - first) * step.time_step)
         return PrecomputedInitialState(state, own)
 
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
@@ -186,7 +186,7 @@ class InitialStateFitter:
         columns = np.array(ca.densify(pull))[:, at].T
         reaction = np.linalg.lstsq(weight[:, None] * columns, weight * (stiffness[at] * q[at] - free), rcond=None)[0]
         load = free + columns @ reaction
-        angle_suffix, load_suffix = START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES
+        angle_suffix, load_suffix = INITIAL_ANGLE_AND_TORQUE_SUFFIXES
         angles = {f"{joint}.{angle_suffix}": float(q[index]) for index, joint in self._presets}
         loads = zip(self._presets, load, strict=True)
         return angles | {f"{joint}.{load_suffix}": float(value) for (_, joint), value in loads}

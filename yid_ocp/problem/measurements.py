@@ -94,12 +94,12 @@ class SensorMeasurements:
     change_by_clock: Array | None = None  # change of the outputs by one std of the clock offset, (M, k)
 
     @property
-    def has_uncertain_errors(self) -> bool:
+    def has_uncertain_biases_or_clock(self) -> bool:
         """Whether outputs have constant errors of unknown size, or the clock has an offset of unknown size."""
         return bool(np.any(self.bias_std > 0)) or self.change_by_clock is not None
 
     @property
-    def output_changes_per_error_std(self) -> Array:
+    def output_changes_per_bias_and_clock_std(self) -> Array:
         """Change (M, k, m) of the outputs by one std of each constant error and of the clock offset."""
         own = self.bias_std * np.eye(len(self.bias_std))[self.bias_std > 0]
         constant = np.broadcast_to(own.T, (len(self.value), *own.T.shape))
@@ -297,7 +297,7 @@ def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasure
 
     Derivatives of the residual, prediction minus measurement, have the opposite sign.
     """
-    parts = [s.weight[:, :, None] * s.output_changes_per_error_std for s in samples]
+    parts = [s.weight[:, :, None] * s.output_changes_per_bias_and_clock_std for s in samples]
     count, before = sum(part.shape[2] for part in parts), 0
     found = np.zeros((sum(s.n_residuals for s in samples), count))
     rows = 0
@@ -320,7 +320,7 @@ def subtract_estimated_biases(
     left = _estimated_constant_errors(slopes, residual)
     made = []
     for s in samples:
-        directions = s.output_changes_per_error_std
+        directions = s.output_changes_per_bias_and_clock_std
         own, left = left[: directions.shape[2]], left[directions.shape[2] :]
         none = np.zeros_like(s.bias_std)
         made.append(replace(s, value=s.value - directions @ own, bias_std=none, change_by_clock=None))

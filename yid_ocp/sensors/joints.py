@@ -34,7 +34,7 @@ JOINT_POSITION_GROUP_NAME = "joints.position"
 _EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelSpecification("joints", "effort", "N m"))
 _POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelSpecification("joints", "position", "rad"))
 _MAX_STEPS_PER_GAP = 0.1  # median gap between a quantized channel's values, in smallest gaps and per value
-NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate noise: they remove motion slower than the sampling
+NOISE_ESTIMATE_DIFFERENCE_ORDER = 6  # of differences: they remove motion slower than the sampling
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ def joint_torque_bias_std(joints: RecordedJointGroup, names: Sequence[str], choi
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
     """Noise (k,) of channels (N, k) from high-order differences; any change as fast as the sampling counts as noise."""
-    order = NOISE_DIFFERENCE_ORDER
+    order = NOISE_ESTIMATE_DIFFERENCE_ORDER
     if len(values) <= order:
         what, allowed = f"{len(values)} samples are too few to estimate the noise of {group}", f"more than {order}"
         raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")

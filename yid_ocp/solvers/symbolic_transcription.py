@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.discrete import NlpStepConstraints, nlp_step_constraints
-from yid_ocp.integrator.statics import measured_angle_holding_stiffness
+from yid_ocp.integrator.statics import measured_angle_hold_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episode_prediction import sensor_not_predictable_at_nodes_error
 from yid_ocp.problem.episodes import Episode
@@ -397,7 +397,7 @@ class _Maker:
             statics = problem.model_functions.equilibrium_solver
             rest = statics.symbolic_equations
             sought, held = rest.inputs[0], rest.inputs[2]
-            stiffness = measured_angle_holding_stiffness(problem.system, bool(problem.system.driven))
+            stiffness = measured_angle_hold_stiffness(problem.system, bool(problem.system.driven))
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()

@@ -19,7 +19,7 @@ from yid_ocp.vision.point_cloud import SkeletonOptions as SkeletonOptions
 from yid_ocp.vision.surface_meshes import CameraTimingModel as CameraTimingModel
 from yid_ocp.vision.surface_meshes import DepthSensorModel as DepthSensorModel
 from yid_ocp.vision.surface_meshes import ExtraMesh as ExtraMesh
-from yid_ocp.vision.surface_meshes import ObservedScene as ObservedScene
+from yid_ocp.vision.surface_meshes import SceneModel as SceneModel
 from yid_ocp.vision.surface_meshes import VirtualCameraSetup as VirtualCameraSetup
 from yid_ocp.vision.surface_meshes import VirtualFramesWithTruth as VirtualFramesWithTruth
 from yid_ocp.vision.surface_meshes import render_virtual_frames as render_virtual_frames

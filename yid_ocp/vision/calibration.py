@@ -29,10 +29,10 @@ from yid_ocp.vision.camera_registration import (
     TRANSLATION_SLICE,
     ArmSurface,
     CalibrationFrame,
-    CameraState,
+    CalibrationState,
     RobustCostDerivatives,
     SurfaceVisibilityFractions,
-    initial_camera_states,
+    candidate_calibration_states,
     pooled_surface_visibility_fractions,
     robust_gradient_and_hessian,
 )
@@ -85,7 +85,7 @@ class _StampDelay(NamedTuple):
 
 
 def stamp_delay_beyond_clock_offset(
-    arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
+    arm: ArmSurface, state: CalibrationState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Estimate the delay [s] of a frame's time stamp beyond the common clock offset. None if the arm is not in view.
 
@@ -190,10 +190,10 @@ class CameraCalibrationOptions:
 class CameraCalibration:
     """Result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
 
-    camera_state: CameraState  # used pose, depth and clock
-    prior_state: CameraState
+    camera_state: CalibrationState  # used pose, depth and clock
+    prior_state: CalibrationState
     usual_square_distance: float | None  # misfit of single frames [m^2]; None if no clock was compared
-    # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero if nothing was estimated
+    # (10, 10), of `camera_state`, in the order of `CalibrationState.difference_from`; zero if nothing was estimated
     state_covariance: Array
     estimate_minus_used: Array  # (10,), estimate minus used state, if the pose is fixed
     arm_visibility: SurfaceVisibilityFractions | None  # visibility of the arm at the calibrated state
@@ -225,7 +225,7 @@ class CameraCalibration:
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
     """Make a calibration from the given pose and clock offset, without estimation. `reason` says why."""
     text = f"clock offset {1e3 * options.initial_offset:.0f} ms as given" + (f": {reason}" if reason else "")
-    state = CameraState(pose, clock_offset=options.initial_offset)
+    state = CalibrationState(pose, clock_offset=options.initial_offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
 
@@ -246,7 +246,7 @@ def calibrate_camera(
     does not match the clouds, or moves too little to determine the clock.
     """
     about = float(np.mean([g.stamp for g in frames])) if frames else 0.0
-    told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
+    told = CalibrationState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
     try:
         return _Calibrator(arm, told, rng, options, clock).run(frames)
     except _UntoldError as reason:
@@ -271,7 +271,7 @@ class _Calibrator:
     """Data of one call of `calibrate_camera`."""
 
     arm: ArmSurface
-    told: CameraState
+    told: CalibrationState
     rng: np.random.Generator
     options: CameraCalibrationOptions
     clock: CameraClockOptions
@@ -335,7 +335,7 @@ class _Calibrator:
         ]
         return CalibrationFrame(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
-    def _start(self, glimpses: Sequence[CalibrationFrame]) -> CameraState:
+    def _start(self, glimpses: Sequence[CalibrationFrame]) -> CalibrationState:
         """The state at which most of the arm's surface coincides with measured points."""
         few = []
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
@@ -343,7 +343,7 @@ class _Calibrator:
             few.append(
                 CalibrationFrame(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False))
             )
-        tried = initial_camera_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
+        tried = candidate_calibration_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
         best, most = tried[0], -1.0
@@ -358,23 +358,23 @@ class _Calibrator:
         return best
 
     def _rounds(
-        self, state: CameraState, frames: Sequence[CalibrationFrame], reach: float, along: bool, most: int, rounds: int
-    ) -> tuple[CameraState, RobustCostDerivatives, list[CalibrationFrame]]:
+        self, state: CalibrationState, frames: list[CalibrationFrame], reach: float, along: bool, cap: int, rounds: int
+    ) -> tuple[CalibrationState, RobustCostDerivatives, list[CalibrationFrame]]:
         """The state after some steps on a limited number of points per frame, its cost, and these points."""
         chosen = []
         for glimpse in frames:
             points = state.measured_to_world_points(glimpse.points)
             t = float(state.stamps_to_joint_clock(glimpse.stamp))
             near = np.flatnonzero(self.arm.near_moving_surface_off_grasps_mask(points, t, 1.5 * reach))
-            if len(near) > most:
-                near = self.rng.choice(near, most, replace=False)
+            if len(near) > cap:
+                near = self.rng.choice(near, cap, replace=False)
             if len(near) >= MIN_ARM_POINTS_PER_FRAME:
                 chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _MIN_FRAMES:
             hint = "check the specified pose and the unit of the clouds"
             raise _UntoldError("what the camera sees does not lie on it", hint)
 
-        def cost(state: CameraState) -> RobustCostDerivatives:
+        def cost(state: CalibrationState) -> RobustCostDerivatives:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
             return robust_gradient_and_hessian(rows, reach)
 
@@ -387,7 +387,7 @@ class _Calibrator:
                 break
         return state, cost(state), chosen
 
-    def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
+    def _message(self, state: CalibrationState, covariance: Array, stamp: float) -> str:
         stds = np.sqrt(np.diag(covariance))
         known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms (stamp minus joint time)"
         searched = self.clock.search_half_width > 0

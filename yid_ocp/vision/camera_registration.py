@@ -40,7 +40,7 @@ from yid_ocp.vision.surface_meshes import ArticulatedSurfaces
 
 ROTATION_SLICE, TRANSLATION_SLICE = slice(0, 3), slice(3, 6)
 DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = 6, 7, 8, 9
-"""Positions of the parts of a `CameraState` change in its vector."""
+"""Positions of the parts of a `CalibrationState` change in its vector."""
 CAMERA_STATE_SIZE, MIN_ARM_POINTS_PER_FRAME = 10, 40
 
 # through which the robot's visible surface is sampled
@@ -62,7 +62,7 @@ _MIN_CURVATURE_FRACTION = 0.2  # lower bound of the robust sum's curvature, rela
 
 
 @dataclass(frozen=True, eq=False)
-class CameraState:
+class CalibrationState:
     """Estimated camera state: pose, depth scale and offset, clock offset and drift."""
 
     pose: Array  # (4, 4), camera in the world, R and t
@@ -103,18 +103,18 @@ class CameraState:
         result[:, :, DEPTH_OFFSET_INDEX] = away / ahead[:, None]
         return result
 
-    def with_state_increment(self, change: Array) -> CameraState:
+    def with_state_increment(self, change: Array) -> CalibrationState:
         """Camera state after a change of rotation (world axes), translation, log depth scale, depth and clock."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
         scale, offset, clock, drift = map(float, change[DEPTH_SCALE_INDEX:])
         depth = self.depth_scale * math.exp(scale), self.depth_offset + offset
-        return CameraState(
+        return CalibrationState(
             pose, *depth, self.clock_offset + clock, self.clock_drift + drift, self.clock_reference_stamp
         )
 
-    def difference_from(self, other: CameraState) -> Array:
+    def difference_from(self, other: CalibrationState) -> Array:
         """Difference (10,) of this state from another one."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
@@ -159,7 +159,7 @@ class ArmSurface:
     def _part_poses_at_time(self, t: float) -> Array:
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
-    def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
+    def visible_surface_points(self, state: CalibrationState, stamp: float) -> tuple[Array, IntArray]:
         """World points on moving surfaces that an unobstructed camera sees, and the surface part of each point."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
@@ -201,7 +201,7 @@ class ArmSurface:
         return _SurfaceMatches(chosen, error[chosen], normal[chosen], rate, part[chosen], local)
 
     def linearized_surface_distances(
-        self, state: CameraState, frame: CalibrationFrame, reach: float, along: bool
+        self, state: CalibrationState, frame: CalibrationFrame, reach: float, along: bool
     ) -> _CalibrationEquations:
         """Distances of a frame's points from the arm's surface, linearised in the camera state."""
         points, t = state.measured_to_world_points(frame.points), float(state.stamps_to_joint_clock(frame.stamp))
@@ -284,9 +284,9 @@ def _at_least(least: Array, matrix: Array) -> Array:
     return np.asarray(back.T @ (np.maximum(values, 1.0)[:, None] * back))
 
 
-def initial_camera_states(
-    arm: ArmSurface, frames: Sequence[CalibrationFrame], specified: CameraState, search: float, count: int
-) -> list[CameraState]:
+def candidate_calibration_states(
+    arm: ArmSurface, frames: Sequence[CalibrationFrame], specified: CalibrationState, search: float, count: int
+) -> list[CalibrationState]:
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
     Returns at most `count` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets are within `search` [s]
@@ -299,7 +299,7 @@ def initial_camera_states(
     total = np.zeros((len(delays), len(cells)))
     for glimpse in frames:
         _add_costs(total, arm, specified, glimpse, delays, cells)
-    result: list[CameraState] = []
+    result: list[CalibrationState] = []
     for index in np.argsort(total, axis=None):
         delay, cell = np.unravel_index(index, total.shape)
         change = np.zeros(CAMERA_STATE_SIZE)
@@ -317,7 +317,7 @@ def initial_camera_states(
 
 
 def _add_costs(
-    total: Array, arm: ArmSurface, told: CameraState, glimpse: CalibrationFrame, delays: Array, cells: IntArray
+    total: Array, arm: ArmSurface, told: CalibrationState, glimpse: CalibrationFrame, delays: Array, cells: IntArray
 ) -> None:
     """Add the costs of the arm's points, `delays` [s] earlier and shifted by cells, to `total` (delays, cells)."""
     from scipy.ndimage import distance_transform_edt  # slow to import; only needed to search for the camera's pose
@@ -370,7 +370,7 @@ class SurfaceVisibilityFractions:
 
 
 def pooled_surface_visibility_fractions(
-    arm: ArmSurface, frames: Sequence[CalibrationFrame], state: CameraState, within: float
+    arm: ArmSurface, frames: Sequence[CalibrationFrame], state: CalibrationState, within: float
 ) -> SurfaceVisibilityFractions:
     """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)

@@ -69,7 +69,7 @@ class ExtraMesh:
 
 
 @dataclass(frozen=True)
-class ObservedScene:
+class SceneModel:
     """Robot and object in a camera's view."""
 
     system: System
@@ -537,7 +537,7 @@ class VirtualCameraSetup:
 
 
 def render_virtual_frames(
-    scene: ObservedScene, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
+    scene: SceneModel, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
 ) -> VirtualFramesWithTruth:
     """Render the frames that a virtual camera takes of a motion. A frame is rendered, reproducibly, on loading.
 

@@ -63,7 +63,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
         runs.append(load_config(None, arguments.overrides, EMBEDDED_CONFIG_FILE_NAME))
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
-    purpose = blind.ALLOWED_ENSEMBLE_PURPOSES[int(arguments.calibration)]
+    purpose = blind.BLIND_ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
     asked, part = (runs, out, arguments.cases, arguments.seed), _slice_numbers(arguments.slice)
     return run_command_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose, part))
@@ -85,7 +85,7 @@ def run_blind(
     seed: int = 1,
     progress: Progress = NULL_PROGRESS,
     workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
-    purpose: str = blind.ALLOWED_ENSEMBLE_PURPOSES[0],
+    purpose: str = blind.BLIND_ENSEMBLE_PURPOSES[0],
     part: tuple[int, int] = (1, 1),
 ) -> CommandOutcome[None]:
     """Run a blind validation of the diagnosis in several processes. Finished parts in the folder are reused.
@@ -125,7 +125,7 @@ def run_blind(
         log.warning("finished cases are in %s; the same command resumes with the others", proof.folder)
         raise
     flags = ["--cases", count, "--seed", seed]
-    flags += ["--calibration"] if purpose == blind.ALLOWED_ENSEMBLE_PURPOSES[1] else []
+    flags += ["--calibration"] if purpose == blind.BLIND_ENSEMBLE_PURPOSES[1] else []
     found = {
         **{key: commitment[key] for key in ("slice", "cases", "seed", "purpose", "configs")},
         "code": package_source_hash(),
@@ -297,7 +297,7 @@ def _diagnose_case_from_recordings_task(
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
     found["evidence"] = evidence
-    if experiment["purpose"] == blind.ALLOWED_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
+    if experiment["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
         wide = blind_scores.permissive_thresholds(run.diagnosis)
         try:
             anything = blind.diagnose_blind_case(ensemble, case, candidates, wide)
@@ -427,8 +427,8 @@ class _BlindExperiment:
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
         conditions = replace(self._recording_conditions(), has_camera=vision)
         posture = blind.first_recorded_driven_joint_positions(system, first[0])
-        for attempt in range(blind.MAX_CASE_DRAWS):
-            rng = np.random.default_rng([self.seed, blind.ALLOWED_ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
+        for attempt in range(blind.MAX_DRAWS_PER_CASE):
+            rng = np.random.default_rng([self.seed, blind.BLIND_ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:
                 made = blind.record_random_motion(system, system, posture, values, values, (), rng, conditions)
             except ModelError:
@@ -436,8 +436,9 @@ class _BlindExperiment:
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
         hint = "give the object more damping, or start the arms where it hangs in equilibrium"
-        what, allowed = f"none of {blind.MAX_CASE_DRAWS} motions can be simulated", "a motion that MuJoCo can simulate"
-        raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", allowed=allowed, hint=hint)
+        what = f"none of {blind.MAX_DRAWS_PER_CASE} motions can be simulated"
+        where, allowed = f"{self.config_file.name}, {varied.description}", "a motion that MuJoCo can simulate"
+        raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.BlindCaseGenerator]:
         return _ensemble(self, first, first.stat().st_mtime_ns)

@@ -107,7 +107,7 @@ def score_slices(
         "slices": [part["slice"] for part in parts],
         "date": local_time_text(),
     }
-    if first["purpose"] == blind.ALLOWED_ENSEMBLE_PURPOSES[1]:
+    if first["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1]:
         found = blind_scores.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}

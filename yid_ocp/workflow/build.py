@@ -17,8 +17,8 @@ from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.effects.bodies import add_link_mass_parameters
-from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, set_sign_smoothing_speed
+from yid_ocp.effects.bodies import system_with_link_mass_factors
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, effect_with_sign_smoothing_speed
 from yid_ocp.effects.law import make_torque_law, read_torque_law_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
@@ -186,13 +186,13 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
     """The system with uncertain link masses, the effects, and the parameter values of the settings."""
     if run.model.arms.relative_link_mass_std > 0:
-        system = add_link_mass_parameters(system, _LINK_MASS_PARAMETER)
+        system = system_with_link_mass_factors(system, _LINK_MASS_PARAMETER)
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
     for joint in friction_joint_names(run, system):
         assert run.model.friction is not None
         kinds, speed = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law], run.model.friction.sign_smoothing_speed
         made = [make_effect(kind, joint, system) for kind in kinds if f"{kind}@{joint}" not in named]
-        system = system.with_effects([set_sign_smoothing_speed(effect, speed) for effect in made])
+        system = system.with_effects([effect_with_sign_smoothing_speed(effect, speed) for effect in made])
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
             system = system.with_effects([_stated_effect(said, system)])

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_grasp_frame_distances
+from yid_ocp.analysis.discretisation import longest_accurate_time_step, smallest_possible_grasp_gaps
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
@@ -29,7 +29,7 @@ from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.options import DiscretisationName, DividedLinksModel
+from yid_ocp.problem.options import DividedLinksModel, RefinedDiscretisation
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
@@ -105,13 +105,13 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     )
 
 
-def _checked_discretisations(run: RunSettings) -> tuple[DiscretisationName, ...]:
+def _checked_discretisations(run: RunSettings) -> tuple[RefinedDiscretisation, ...]:
     """Discretisations that are checked after a solve: from the settings, by default those relevant to the object."""
     said, item = run.output.checked_discretisations, run.model.object
     if said is None:
         said = "both" if item is not None and item.default_link_refinement else "time_step"
-    choices: dict[str, tuple[DiscretisationName, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
-    return choices.get(said, ())
+    kinds: dict[str, tuple[RefinedDiscretisation, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
+    return kinds.get(said, ())
 
 
 def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel | None:
@@ -168,7 +168,7 @@ def build_problem(
     return problem
 
 
-def min_initial_grasp_frame_distances(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+def smallest_possible_initial_grasp_gaps(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
     """Smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
     system = problem.system
     if not system.grasps:
@@ -178,7 +178,7 @@ def min_initial_grasp_frame_distances(problem: EstimationProblem, episode: Episo
     theta = problem.theta.copy()
     for name, value in episode.known_parameters.items():
         theta[system.parameters.index(name)] = value
-    return min_grasp_frame_distances(system, posture, theta)
+    return smallest_possible_grasp_gaps(system, posture, theta)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
@@ -186,7 +186,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
         hint = f"first correct these issues: {'; '.join(f'{issue.location_text}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in min_initial_grasp_frame_distances(problem, episode).items():
+        for name, gap in smallest_possible_initial_grasp_gaps(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
                 where, allowed = run.setting_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
@@ -303,7 +303,7 @@ def _beside_the_model(
         if any(doubt.weight == "refused" for doubt in found):
             return found
         told = list(joint_checks.inverse_dynamics_effort_issues(arm, recording))
-        told += point_checks.robot_held_point_issues(arm, recording, _choice(run))
+        told += point_checks.forward_kinematics_issues(arm, recording, _choice(run))
         found += [doubt for doubt in told if not _is_modelled(system, doubt)]
     theta = system.parameters.vector()
     return found + list(point_checks.point_distance_issues(arm, system, theta, recording, _choice(run)))

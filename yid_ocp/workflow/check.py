@@ -25,7 +25,7 @@ from yid_ocp.report.animation import Animation, animation_of_trajectories, recor
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
-from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_initial_grasp_frame_distances
+from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, smallest_possible_initial_grasp_gaps
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_settings_command
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -140,7 +140,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
-    entry["grasp_gaps"] = min_initial_grasp_frame_distances(problem, episode)
+    entry["grasp_gaps"] = smallest_possible_initial_grasp_gaps(problem, episode)
     return entry
 
 

@@ -70,7 +70,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
 
 def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:
     mean, error = mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)
-    difference, paired = friction_ladder.error_difference_and_std_error(fit, best, kinds)
+    difference, paired = friction_ladder.prediction_error_difference_and_std_error(fit, best, kinds)
     return {
         "mean_error": mean,
         "standard_error": error,

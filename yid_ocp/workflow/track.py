@@ -40,7 +40,7 @@ from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-from yid_ocp.vision.surface_meshes import ObservedScene, VirtualFramesWithTruth
+from yid_ocp.vision.surface_meshes import SceneModel, VirtualFramesWithTruth
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
@@ -225,8 +225,8 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
     return recording, made
 
 
-def _camera_scene(run: RunSettings, system: System) -> ObservedScene:
-    return ObservedScene(system, run.model.robot, extra_meshes=run.model.extra_meshes)
+def _camera_scene(run: RunSettings, system: System) -> SceneModel:
+    return SceneModel(system, run.model.robot, extra_meshes=run.model.extra_meshes)
 
 
 def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames_path"]) -> FrameSequence:

@@ -18,7 +18,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import mean_sample_rate
-from yid_ocp.data.foreign_formats import column_meanings, mocap_table_reader
+from yid_ocp.data.foreign_formats import column_meanings, select_mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -105,7 +105,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
 
 def _mocap_table(path: Path) -> tuple[PointGroup, str, tuple[str, ...]] | None:
     delimiter = _delimiter(path)
-    read = mocap_table_reader(next(_rows(path, delimiter), (1, []))[1])
+    read = select_mocap_table_reader(next(_rows(path, delimiter), (1, []))[1])
     return None if read is None else read(_rows(path, delimiter), str(path))
 
 

@@ -44,13 +44,13 @@ from yid_ocp.model.system import Grasp, System, SystemBuildArguments, floating_j
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
-MEMORY_HALVING_SPEED_PARAMETER_NAME = "start.speed_scale"
+SHAPE_MEMORY_HALVING_SPEED_PARAMETER = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
 # Parameters of a joint whose rest angle follows from the start: its angle [rad] and torque [N m] there.
-START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES = ("start", "load")
+INITIAL_ANGLE_AND_TORQUE_SUFFIXES = ("start", "load")
 # Parameter set to the root mean square speed of the measured points at the start [m/s].
-START_SPEED_PARAMETER_NAME = "start.speed"
+INITIAL_RMS_SPEED_PARAMETER = "start.speed"
 
 
 @dataclass(frozen=True)
@@ -176,16 +176,16 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     text = "share of the start's shape in the rest shape"
     shares = {s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, text) for s in item.segment_layouts}
     text = "speed of the vertices at the recording's start"
-    speed = Parameter(START_SPEED_PARAMETER_NAME, 0.0, "m/s", 0.0, np.inf, text)
+    speed = Parameter(INITIAL_RMS_SPEED_PARAMETER, 0.0, "m/s", 0.0, np.inf, text)
     text = "start speed at which the memory counts half"
-    scale = Parameter(MEMORY_HALVING_SPEED_PARAMETER_NAME, 0.3, "m/s", 1e-3, np.inf, text)
+    scale = Parameter(SHAPE_MEMORY_HALVING_SPEED_PARAMETER, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
     told = (("rad", "angle at the recording's start"), ("N m", "torque borne at the recording's start"))
     for spring in item.elastic_joints:
         angle, load = (
             Parameter(f"{spring.joint_name}.{suffix}", 0.0, unit, description=text)
-            for suffix, (unit, text) in zip(START_ANGLE_AND_LOAD_PARAMETER_SUFFIXES, told, strict=True)
+            for suffix, (unit, text) in zip(INITIAL_ANGLE_AND_TORQUE_SUFFIXES, told, strict=True)
         )
         entries += [angle, load]
         shift = angle.symbol - load.symbol / (spring.stiffness + _MIN_STIFFNESS)
