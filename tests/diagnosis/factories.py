@@ -150,7 +150,7 @@ def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:
 
 def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=None) -> SelectedEffect:
     """An effect that was added; it is the first of its rivals."""
-    return SelectedEffect(of, fitted or fit([of]), part or closed(), (of, *rivals))
+    return SelectedEffect(of, fitted or fit([of]), part or closed(), (of, *rivals), (1.0,) + (0.0,) * len(rivals))
 
 
 def carried(name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> EffectAmplitudeTransferCheck:

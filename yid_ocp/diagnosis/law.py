@@ -147,7 +147,7 @@ def find_gap_law(
     best, *others = found
     runner_up = None
     if others:
-        rival, closed = others[0].law, held_out_gap_closure(before.held_out_loss, others[0].loss, search.thresholds)
+        rival, closed = others[0].law, held_out_gap_closure(before.held_out_loss, others[0].loss)
         runner_up = (rival.location, "+".join(rival.quantities), closed.fraction)
     # the model without the law may move far beyond the recorded range: new knots for the visited range
     if any(_is_much_narrower(best, quantity) for quantity in best.law.quantities):
@@ -155,7 +155,7 @@ def find_gap_law(
         again, better = _refitted_families(search, problem, last, [finer], events, best.law.quantities)
         if again is not None and better and better[0].loss.chi2_per_sample <= best.loss.chi2_per_sample:
             best = better[0]
-    closure = held_out_gap_closure(before.held_out_loss, best.loss, search.thresholds)
+    closure = held_out_gap_closure(before.held_out_loss, best.loss)
     least = _MIN_LEFTOVER_CLOSURE if last.effects else search.thresholds.min_gap_closed
     if not _closes(before.held_out_loss, best.loss, closure, least):
         return None

@@ -17,6 +17,7 @@ from yid_ocp.diagnosis.select import (
     UNDEFINED_GAP_CLOSURE,
     GapClosure,
     SelectedEffect,
+    leaves_noise,
     refit_selection_without_effect,
     select_effects,
 )
@@ -26,8 +27,8 @@ from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
 from yid_ocp.inference.smoother import GapLocation, main_gap_locations
 from yid_ocp.problem.options import ExcessResidualCriteria
 
-UnknownVerdictReason = Literal["", "none", "unsure", "little", "stand_in"]
-"""Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""
+UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
+"""Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
 
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
@@ -146,36 +147,21 @@ class Judgement:
         return 1.0 - (1.0 - limits.min_explained_fraction) ** self.assumption_count
 
 
-def _is_little_explained(said: Judgement, limits: Thresholds) -> bool:
-    """Whether effects explain too little of the fitted data; one effect may close enough held out instead."""
-    elsewhere = said.assumption_count == 1 and said.gap_closure.ci_low >= limits.min_explained_fraction
-    return said.explained_fraction < said.required_explained_fraction(limits) and not elsewhere
-
-
-_REASONS_FOR_UNKNOWN: Mapping[UnknownVerdictReason, Callable[[Judgement, Thresholds], bool]] = {
-    "none": lambda said, limits: not said.selected_effects,
-    "unsure": lambda said, limits: (
-        not (said.gap_closure.ci_low > limits.min_gap_closed or said.gap_closure.is_decisive)
-    ),
-    "little": _is_little_explained,
-    "stand_in": lambda said, limits: bool(said.failed_transfer_checks),
-}
-"""Rules that effects must pass, in order; the first failed rule is the reason why no effect is accepted."""
-
-
-def _with_verdict(said: Judgement, gap: bool, are_data_sufficient: bool, limits: Thresholds) -> Judgement:
-    """The judgement with the first applicable verdict."""
-    reasons: list[UnknownVerdictReason] = [name for name, fails in _REASONS_FOR_UNKNOWN.items() if fails(said, limits)]
-    reason = [*reasons, ""][0]
-    holds = {
-        "insufficient_data": not are_data_sufficient,
-        "no_gap": not gap,
-        "unknown": bool(reason),
-        "confusable": any(len(entry.equivalent_effects) > 1 for entry in said.selected_effects[:1]),
-        "effect": True,
-    }
-    verdict = next(name for name, is_so in holds.items() if is_so)
-    return replace(said, verdict=verdict, unknown_reason=reason if verdict == "unknown" else "")
+def _verdict_and_reason(
+    said: Judgement, has_gap: bool, are_data_sufficient: bool, limits: Thresholds
+) -> tuple[str, UnknownVerdictReason]:
+    """The verdict, and the first reason why no effect is accepted. See `required_explained_fraction`."""
+    if not are_data_sufficient:
+        return "insufficient_data", ""
+    if not said.selected_effects:
+        return ("unknown", "none") if has_gap else ("no_gap", "")
+    # one effect may instead close enough of other motions
+    held_out = said.gap_closure.ci_low if said.assumption_count == 1 else 0.0
+    if max(said.explained_fraction, held_out) < said.required_explained_fraction(limits):
+        return "unknown", "little"
+    if said.failed_transfer_checks:
+        return "unknown", "stand_in"
+    return "confusable" if len(said.selected_effects[0].equivalent_effects) > 1 else "effect", ""
 
 
 def judge(
@@ -205,18 +191,28 @@ def judge(
     total, explained = UNDEFINED_GAP_CLOSURE, 1.0
     if added:
         total = added[-1].cumulative_closure
-        explained = _explained_fraction(nominal, added[-1].refitted_model, located)
+        explained = _explained_fraction(nominal, added[-1].refitted_model, located, limits)
     finished("carry_over")
     said = Judgement("", "", fits, added, total, explained, carried)
     is_seen = any(entry.is_detectable for entry in evidence.screening.detectability)
-    return _with_verdict(said, has_gap or bool(added), enough and is_seen, limits)
+    verdict, reason = _verdict_and_reason(said, has_gap, enough and is_seen, limits)
+    return replace(said, verdict=verdict, unknown_reason=reason)
 
 
-def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, located: GapLocalization | None) -> float:
-    """Decrease of r'r by effects over that by the smoother, minus degrees of freedom; 1 with process noise."""
-    if located is None or nominal.has_process_noise or located.chi2_decrease <= 0:
-        return 1.0
-    return (2 * (nominal.cost - last.cost) - last.effect_parameter_count) / located.chi2_decrease
+def _explained_fraction(
+    nominal: RefitStatistics, last: RefitStatistics, located: GapLocalization | None, limits: Thresholds
+) -> float:
+    """Decrease of r'r by effects over that by the smoother, minus degrees of freedom.
+
+    With process noise, whose spectrum the smoother's forces share, the whole excess takes its place, if more than noise
+    is left. 1 if there is nothing to compare with.
+    """
+    if nominal.has_process_noise:
+        explainable = 0.0 if leaves_noise(last, limits) else 2 * nominal.cost - nominal.residual_count
+    else:
+        explainable = 0.0 if located is None else located.chi2_decrease
+    decrease = 2 * (nominal.cost - last.cost) - last.effect_parameter_count
+    return decrease / explainable if explainable > 0 else 1.0
 
 
 def _effects_with_transfer_checks(
