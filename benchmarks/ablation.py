@@ -23,7 +23,6 @@ NEUTRAL = {
     "min_channel_excess_chi2_per_dof": 0.0,
     "min_samples_per_unknown": 1e-9,
     "signature_overlap": 1.0,
-    "n_refit_lowest_p": 0,
     "n_refit_pairs": 0,
     "max_effects": 1,
     "min_z": 0.0,

@@ -225,8 +225,7 @@ def ranked(**decreases):
 
 def shortlisted(scores, table, places=(), **limits):
     screened = ScreeningResult((), tuple(scores), table, FEW)
-    limits = Thresholds(**{"n_refit_lowest_p": 0} | limits)
-    return [of.kind for (of,), _ in _refit_shortlist(screened, limits, places=places)]
+    return [of.kind for (of,), _ in _refit_shortlist(screened, Thresholds(**limits), places=places)]
 
 
 def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
@@ -245,16 +244,6 @@ def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
     assert shortlisted(scores, many, n_refit_per_round=2) == ["a", "b", "c", "d"], "as many more, and each once"
     [((of,), step), *_] = _refit_shortlist(ScreeningResult((), tuple(scores), many, FEW), LIMITS)
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
-
-
-def test_the_surest_are_refitted_wherever_they_stand():
-    scores = ranked(a=9.0, b=8.0, c=7.0, d=6.0)
-    scores[3] = score(scores[3].effect, p=1e-30, decrease=6.0, statistic=100.0)
-    scores[2] = score(scores[2].effect, p=1e-30, decrease=7.0, statistic=90.0)
-    table = alike([s.effect.label for s in scores], np.eye(4))
-    assert shortlisted(scores, table, n_refit_per_round=1, n_refit_lowest_p=1) == ["a", "d"]
-    assert shortlisted(scores, table, n_refit_per_round=1, n_refit_lowest_p=2) == ["a", "d", "c"]
-    assert shortlisted(scores, table, n_refit_per_round=4, n_refit_lowest_p=2) == ["a", "b", "c", "d"]
 
 
 def test_the_best_of_every_place_of_the_gap_is_refitted():
@@ -278,7 +267,9 @@ class Rounds:
         self.losses, self.refits, self.screens, self.heard = losses, [], [], Heard()
         usual = {"fails": (), "absent": (), "before": None, "pairs": (), "left": None, "cost": 1.0, "noisy": False}
         vars(self).update(usual | how)
-        self.scores = tuple(map(lambda of, p, best: score(of, p=p, decrease=best), EFFECTS, p_values, (19.0, 18.0, 17.0)))
+        self.scores = tuple(
+            map(lambda of, p, best: score(of, p=p, decrease=best), EFFECTS, p_values, (19.0, 18.0, 17.0))
+        )
         self.progress, self.skipped, self.is_late = self.heard, [], False
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
 

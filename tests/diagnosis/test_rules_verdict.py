@@ -33,7 +33,6 @@ from yid_ocp.diagnosis.verdict import (
     NominalModelGapEvidence,
     _check_effect_amplitude_transfer,
     _compare,
-    _effects_with_transfer_checks,
     _explained_fraction,
     _inflate_fit_stds_by_disagreement,
     _verdict_and_reason,
@@ -322,36 +321,10 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
     assert name == "spring@elbow on the held-out recordings"
 
 
-@cases("blocks, effects", {"in blocks": (True, [SPRING]), "no effect": (False, ()), "no fit": (False, [SPRING])})
-def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks, effects):
+@cases("blocks", {"in blocks": (True,), "no fit": (False,)})
+def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks):
     asked = []
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", lambda *_: asked.append(True))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
-    assert _check_effect_amplitude_transfer(search, fit(effects)) == ()
-    assert bool(asked) is (not blocks and bool(effects))
-
-
-@cases(
-    "place, kept, agrees",
-    {
-        "of one place, the last leaves": ("elbow", ["friction@elbow"], True),
-        "of two places, both stay": ("wrist", ["friction@elbow", "friction@wrist"], False),
-    },
-)
-def test_of_effects_that_share_a_torque_one_leaves_where_the_other_transfers_alone(monkeypatch, place, kept, agrees):
-    first, second = effect("friction@elbow"), effect("friction@wrist" if place == "wrist" else "spring@elbow")
-    pair = fit([first, second], values={f"{first.label}.a": 0.3, f"{second.label}.a": 0.5})
-    alone = fit([first], values={f"{first.label}.a": 0.8})
-
-    def refitted(problem, effects, start, store, name, limits):
-        if "held-out" not in name:
-            return alone
-        swapped = {f"{first.label}.a": 0.9, f"{second.label}.a": 0.0}
-        return fit(effects, values=swapped if len(effects) > 1 else {f"{first.label}.a": 0.79})
-
-    monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", refitted)
-    search = RefitContext(AllCandidatesProblem(Problem(), (first, second), False), Thresholds(), NULL_PROGRESS)
-    both = (added(first, fitted=alone), added(second, fitted=pair))
-    chosen, checks = _effects_with_transfer_checks(search, fit(), both)
-    assert [entry.effect.label for entry in chosen] == kept
-    assert all(entry.is_consistent for entry in checks) is agrees
+    assert _check_effect_amplitude_transfer(search, fit([SPRING])) == ()
+    assert bool(asked) is not blocks

@@ -15,7 +15,7 @@ import numpy as np
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics, refit_with_each_effect
 from yid_ocp.diagnosis.screening import ScreeningResult
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 
@@ -168,9 +168,7 @@ def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds
     return fit.p_values[effect.label] <= math.erfc(limits.min_z / math.sqrt(2.0))
 
 
-def _is_needed(
-    nominal: RefitStatistics, without: RefitStatistics, fit: RefitStatistics, limits: Thresholds
-) -> bool:
+def _is_needed(nominal: RefitStatistics, without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better.
 
     Effects beside others must close more of the whole gap than errors in the response to these can leave.
@@ -181,7 +179,9 @@ def _is_needed(
         odds = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
         is_clear = odds and gained >= limits.min_gap_closed * whole * bool(known)
     else:
-        least = max(_MIN_ADDED_GAP_FRACTION * whole * bool(known), limits.min_gap_closed * before.excess_chi2_per_sample)
+        least = max(
+            _MIN_ADDED_GAP_FRACTION * whole * bool(known), limits.min_gap_closed * before.excess_chi2_per_sample
+        )
         is_clear = gained > error and gained >= least
     return is_clear and all(_is_significant(effect, fit, limits) for effect in fit.effects if effect.label not in known)
 
@@ -193,14 +193,13 @@ _Start = tuple[tuple[EffectBase, ...], Mapping[str, float]]
 
 
 def _refit_shortlist(screened: ScreeningResult, limits: Thresholds, places: Sequence[str] = ()) -> list[_Start]:
-    """Candidates to refit, with initial values: the best and those confusable with them, the surest, one per place."""
+    """Candidates to refit, with initial values: the best, those confusable with them, one per place."""
     ranked = [score for score in screened.candidate_scores if score.p_value < limits.significance_level]
     best, most = ranked[: limits.n_refit_per_round], limits.signature_overlap
     names = {name for s in best for name in screened.confusability.confusable_with(s.effect.label, most)}
     alike = [s for s in ranked if s.effect.label in names and s not in best][: limits.n_refit_per_round]
-    surest = sorted(ranked, key=lambda s: (s.p_value, -s.lm_statistic))[: limits.n_refit_lowest_p]
     there = [s for place in places for s in [s for s in screened.candidate_scores if s.effect.location == place][:1]]
-    return [((s.effect,), s.predicted_values) for s in {s.effect.label: s for s in (*best, *alike, *surest, *there)}.values()]
+    return [((s.effect,), s.predicted_values) for s in {s.effect.label: s for s in (*best, *alike, *there)}.values()]
 
 
 @dataclass(frozen=True)
@@ -250,10 +249,14 @@ def select_effects(
             dearest_first = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
             fits = list({fit.effects[-1].label: fit for fit in dearest_first}.values())
         if len(base) == 1:
-            fits += refit_with_each_effect(search, (), _pairs_to_refit(search, alone, base[0]), nominal.values, "together")
+            fits += refit_with_each_effect(
+                search, (), _pairs_to_refit(search, alone, base[0]), nominal.values, "together"
+            )
         # an effect of implausible size would correct errors of earlier effects
         known = {effect.label for effect in base}
-        fits = [f for f in fits if not base or all(_is_plausible(e, f, limits) for e in f.effects if e.label not in known)]
+        fits = [
+            f for f in fits if not base or all(_is_plausible(e, f, limits) for e in f.effects if e.label not in known)
+        ]
         near = _near_best_models(nominal, fits, limits) if fits else []
         first = first or sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
         better = next((fit for fit, _ in near if _is_needed(nominal, current, fit, limits)), None)
@@ -282,7 +285,7 @@ def _is_futile(
     alone: ScreeningResult,
     screened: ScreeningResult,
 ) -> bool:
-    """Whether the linear models promise too little of another effect, or of any two where one closes hardly anything."""
+    """Whether the linear models promise too little of another effect, or of any two if one closes little."""
     limits, gap = search.thresholds, 2 * nominal.cost - nominal.residual_count
     promised = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=0.0)
     if leaves_noise(current, limits):
@@ -349,7 +352,8 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
     company = f"in the place of {label}"
     screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
-    tried = [pair for pair in _refit_shortlist(screened, limits) if pair[0][0].label != label]
+    best = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
+    tried = [pair for pair in best if pair[0][0].label != label]
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
     near = _near_best_models(nominal, [own, *(f for f in others if _is_plausible(f.effects[-1], f, limits))], limits)
@@ -373,16 +377,3 @@ def _with_closures(
         weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
         found.append(SelectedEffect(effect, fit or chosen.fit, closed, rivals, tuple(weights / weights.sum())))
     return tuple(found)
-
-
-def refit_selection_without_effect(
-    search: RefitContext, nominal: RefitStatistics, kept: Sequence[SelectedEffect], entry: SelectedEffect
-) -> tuple[SelectedEffect, ...]:
-    """Remove one of the selected effects and refit the others. Empty if the refit fails."""
-    full, rest = kept[-1].refitted_model, [other for other in kept if other is not entry]
-    name = f"{join_effect_labels(full.effects)} without {entry.effect.label}"
-    without = search.refit(tuple(other.effect for other in rest), full.values, name)
-    if without is None:
-        return ()
-    rivals = {other.effect.label: [(own, 0.0) for own in other.equivalent_effects] for other in rest}
-    return _with_closures(search, nominal, _Choice(without, rivals), ())

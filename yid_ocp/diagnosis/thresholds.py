@@ -46,7 +46,6 @@ class Thresholds(SmootherThresholds):
     ] = 2.576 + 1.282
     shape_parameter_grid_size: Annotated[int, Ge(1), OptionInfo("number of values tried per shape parameter")] = 4
     n_refit_per_round: Annotated[int, Ge(1), OptionInfo("number of candidates refitted per round")] = 6
-    n_refit_lowest_p: Annotated[int, Ge(0), OptionInfo("candidates with the smallest p-values, always refitted")] = 2
     n_refit_pairs: Annotated[int, Ge(0), OptionInfo("pairs of candidates refitted if one effect leaves a gap")] = 4
     signature_overlap: Annotated[
         float, Gt(0), Le(1), OptionInfo("fraction of a signature from which two candidates are confusable")

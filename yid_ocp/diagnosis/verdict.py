@@ -7,7 +7,7 @@ parameters on all recordings. The held-out recordings are therefore fitted too, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,7 +18,6 @@ from yid_ocp.diagnosis.select import (
     GapClosure,
     SelectedEffect,
     leaves_noise,
-    refit_selection_without_effect,
     select_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -187,11 +186,13 @@ def judge(
         places = [place.location for place in main_gap_locations(located.locations)]
         fits, added = select_effects(search, nominal, evidence.screening, places, evidence.has_left_baseline)
     finished("refits")
-    added, carried = _effects_with_transfer_checks(search, nominal, added)
+    carried: tuple[EffectAmplitudeTransferCheck, ...] = ()
     total, explained = UNDEFINED_GAP_CLOSURE, 1.0
     if added:
-        total = added[-1].cumulative_closure
-        explained = _explained_fraction(nominal, added[-1].refitted_model, located, limits)
+        last, total = added[-1].refitted_model, added[-1].cumulative_closure
+        explained = _explained_fraction(nominal, last, located, limits)
+        carried = _check_effect_amplitude_transfer(search, last)
+        added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
     finished("carry_over")
     said = Judgement("", "", fits, added, total, explained, carried)
     is_seen = any(entry.is_detectable for entry in evidence.screening.detectability)
@@ -215,31 +216,6 @@ def _explained_fraction(
     return decrease / explainable if explainable > 0 else 1.0
 
 
-def _effects_with_transfer_checks(
-    search: RefitContext, nominal: RefitStatistics, added: tuple[SelectedEffect, ...]
-) -> tuple[tuple[SelectedEffect, ...], tuple[EffectAmplitudeTransferCheck, ...]]:
-    """The selected effects, with standard deviations increased by disagreement, and their transfer checks.
-
-    Effects at one location divide a torque between them arbitrarily. If they do not transfer, one of them is removed,
-    the last one first, if the others transfer without it.
-    """
-    if not added:
-        return added, ()
-    checks = _check_effect_amplitude_transfer(search, added[-1].refitted_model)
-    places = [entry.effect.location for entry in added]
-    shared = [entry for entry in reversed(added) if places.count(entry.effect.location) > 1]
-    for entry in shared if any(not check.is_consistent for check in checks) else ():
-        fewer = refit_selection_without_effect(search, nominal, added, entry)
-        own = _check_effect_amplitude_transfer(search, fewer[-1].refitted_model) if fewer else ()
-        if own and all(check.is_consistent for check in own):
-            added, checks = fewer, own
-            break
-    if not checks:
-        return added, ()
-    last = _inflate_fit_stds_by_disagreement(added[-1].refitted_model, checks)
-    return (*added[:-1], replace(added[-1], refitted_model=last)), checks
-
-
 def _check_effect_amplitude_transfer(
     search: RefitContext, fit: RefitStatistics
 ) -> tuple[EffectAmplitudeTransferCheck, ...]:
@@ -247,7 +223,7 @@ def _check_effect_amplitude_transfer(
 
     Empty if one recording is split, or if the refit fails; neither is evidence against an effect.
     """
-    again = search.refit_on_held_out(fit) if fit.effects else None
+    again = search.refit_on_held_out(fit)
     if again is None:
         return ()
     return tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again, search.thresholds))
