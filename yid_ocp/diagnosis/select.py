@@ -174,16 +174,20 @@ def _is_needed(nominal: RefitStatistics, without: RefitStatistics, fit: RefitSta
     Effects beside others must close more of the whole gap than errors in the response to these can leave.
     """
     before, after, whole = without.held_out_loss, fit.held_out_loss, nominal.held_out_loss.excess_chi2_per_sample
-    (gained, error), known = held_out_improvement(before, after), {effect.label for effect in without.effects}
+    (gained, error), is_beside = held_out_improvement(before, after), bool(without.effects)
     if leaves_noise(without, limits):
-        odds = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
-        is_clear = odds and gained >= limits.min_gap_closed * whole * bool(known)
+        is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
+        least = limits.min_gap_closed * whole * is_beside
     else:
-        least = max(
-            _MIN_ADDED_GAP_FRACTION * whole * bool(known), limits.min_gap_closed * before.excess_chi2_per_sample
-        )
-        is_clear = gained > error and gained >= least
-    return is_clear and all(_is_significant(effect, fit, limits) for effect in fit.effects if effect.label not in known)
+        is_clear = gained > error
+        least = max(_MIN_ADDED_GAP_FRACTION * whole * is_beside, limits.min_gap_closed * before.excess_chi2_per_sample)
+    return is_clear and gained >= least and all(_is_significant(e, fit, limits) for e in _beside(without.effects, fit))
+
+
+def _beside(effects: Sequence[EffectBase], fit: RefitStatistics) -> list[EffectBase]:
+    """The effects of a fit that are not among some effects."""
+    known = {effect.label for effect in effects}
+    return [effect for effect in fit.effects if effect.label not in known]
 
 
 # -- several effects --------------------------------------------------------------------------------------------------
@@ -253,10 +257,7 @@ def select_effects(
                 search, (), _pairs_to_refit(search, alone, base[0]), nominal.values, "together"
             )
         # an effect of implausible size would correct errors of earlier effects
-        known = {effect.label for effect in base}
-        fits = [
-            f for f in fits if not base or all(_is_plausible(e, f, limits) for e in f.effects if e.label not in known)
-        ]
+        fits = [fit for fit in fits if not base or all(_is_plausible(e, fit, limits) for e in _beside(base, fit))]
         near = _near_best_models(nominal, fits, limits) if fits else []
         first = first or sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
         better = next((fit for fit, _ in near if _is_needed(nominal, current, fit, limits)), None)
