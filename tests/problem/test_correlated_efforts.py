@@ -267,3 +267,15 @@ def test_efforts_are_compared_where_they_were_measured(efforts_of, cutoff, time_
     if math.isinf(cutoff):
         for time, value in found[time_step].items():
             np.testing.assert_allclose(value, effort[round(time)], atol=1e-12)
+
+
+def test_friction_that_holds_a_held_out_arm_is_estimated_from_its_first_efforts(urdf_folder):
+    """Filtered efforts begin long after the recording does, and friction that holds acts from its start on."""
+    friction = {"tau_c": 0.5, "yield_angle": 0.005}
+    step = pendulum_step(urdf_folder, [("joint_presliding", "elbow", friction)], prescribed=JOINTS)
+    still = np.tile([0.3, 0.2], (301, 1))
+    problem = arm(step, still, needed(step, still) + np.array([0.0, 0.6 * friction["tau_c"]]))
+    held = problem.with_episodes(problem.episodes, problem.episodes)
+    [(episode, _, offset)] = held.held_out_prediction_inputs(problem.initial_unknowns)
+    assert episode.measurements[0].node[0] * 0.01 > 0.2
+    assert offset == pytest.approx([0.6], abs=0.01)

@@ -46,7 +46,7 @@ from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
 
 _HELD_OUT_START_WINDOW = 0.2
-"""Duration of the data from which a held-out recording's initial state is estimated [s]."""
+"""Duration of a sensor's first samples from which a held-out recording's initial state is estimated [s]."""
 _HELD_OUT_ITERATIONS = 3
 """Gauss-Newton iterations of this nearly linear estimate."""
 
@@ -468,7 +468,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
     if not len(offset):
         return offset
-    short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
+    short = _beginning(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
     limit = initial_internal_state_offset_bounds(predictor.system, predictor.unknowns.initial_state_names)
@@ -486,3 +486,13 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
         offset = offset - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]
         offset = np.clip(offset, -limit, limit)
     return offset
+
+
+def _beginning(episode: Episode, steps: int) -> Episode:
+    """The first `steps` steps of each sensor's measurements. Filtered ones need as many nodes after as before them."""
+    firsts = [int(samples.node.min(initial=episode.grid.steps)) for samples in episode.measurements]
+    short, made = truncate_episode(episode, max((2 * first + steps for first in firsts), default=steps)), []
+    for samples, first in zip(short.measurements, firsts, strict=True):
+        is_early = samples.node.reshape(len(samples.node), -1) <= first + steps
+        made.append(replace(samples, weight=np.where(is_early, samples.weight, 0.0)))
+    return replace(short, measurements=tuple(made))
