@@ -29,6 +29,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.effects import make_effect
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
@@ -46,13 +47,13 @@ def free_arm(source, **how) -> RecordedJointsModel:
     """Joints that hold nothing."""
     robot = read_urdf(source, **how)
     system = System.build(robot, prescribed=robot.joint_names)
-    return RecordedJointsModel.from_system(system, system.parameters.vector())
+    return RecordedJointsModel.from_system(system)
 
 
 @pytest.fixture(scope="module")
 def arms() -> dict[int, RecordedJointsModel]:
     systems = {count: baxter_foam_y_system(count) for count in (1, 2)}
-    return {n: RecordedJointsModel.from_system(system, system.parameters.vector()) for n, system in systems.items()}
+    return {n: RecordedJointsModel.from_system(system) for n, system in systems.items()}
 
 
 @pytest.fixture(scope="module")
@@ -229,6 +230,16 @@ def test_a_joint_of_which_nothing_is_asked_may_swing(drives, kind, least, expect
     assert np.sqrt(np.mean(needed**2)) == pytest.approx(least, rel=0.3)
     recording = swung(drives, lambda e: e * [0.0, 1.0], least / 2.4, length=6.0, effort_kind=kind)
     assert {doubt.cause for doubt in inverse_dynamics_effort_issues(drives, recording)} == expected
+
+
+def test_an_unknown_payload_is_no_wrong_gain(drives):
+    payload = make_effect("payload", "tip", drives.system)
+    system, names = drives.system.with_effects([payload]), payload.parameters.names
+    known = system.parameters.with_nominal_values({"payload@tip.mass": 1.2, "payload@tip.mz": -0.3})
+    run = swung(RecordedJointsModel.from_system(replace(system, parameters=known)))
+    for free, expected in (((), ["effort_gain"]), (names, [])):
+        found = inverse_dynamics_effort_issues(RecordedJointsModel.from_system(system, free), run)
+        assert [doubt.cause for doubt in found] == expected
 
 
 def test_motion_of_another_robot_or_with_a_counterbalance(arms, runs):

@@ -36,6 +36,8 @@ _SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither
 _MOTION_BANDWIDTH_HZ = 5.0  # bandwidth of an arm's motion; faster components are removed [Hz]
 _MAX_MOTION_SAMPLES = 300  # approximate number of samples used of a motion
 _VISCOUS_FRICTION_FRACTION = 0.04  # usual viscous friction beside a joint's largest effort [per rad/s]
+_LOAD_EFFECT_PREFIXES = ("payload@", "point_mass@")
+_LOAD_RANGE_FRACTION = 0.1  # typical size of an unknown load parameter, of the range between its bounds
 _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
 
 
@@ -47,14 +49,15 @@ class RecordedJointsModel:
     """
 
     system: System
-    theta: Array
     joint_names: tuple[str, ...]
+    unknown_load_parameters: tuple[str, ...]  # free parameters of payloads and point masses
 
     @staticmethod
-    def from_system(system: System, theta: Array) -> RecordedJointsModel | None:
+    def from_system(system: System, free: Sequence[str] = ()) -> RecordedJointsModel | None:
         """Return the model of a system's driven and prescribed joints, or None without such joints."""
         names = (*system.driven, *system.prescribed)
-        return RecordedJointsModel(system, theta, names) if names else None
+        unknown = tuple(name for name in free if name.startswith(_LOAD_EFFECT_PREFIXES))
+        return RecordedJointsModel(system, names, unknown) if names else None
 
     def has_all_angles_recorded(self, recording: Recording) -> bool:
         """Whether a recording has all joint angles. Clamps that follow measured points have no recorded angles."""
@@ -96,6 +99,11 @@ class RecordedJointsModel:
         """Joint efforts (N, k) [N m] by rigid-body inverse dynamics, without dampers, springs and grasps."""
         return np.array(self._effort.map(len(q)).call([q.T, v.T, a.T])[0]).T
 
+    def _effort_change_by_loads(self, motion: _SmoothedMotion) -> Array:
+        """Derivatives (nl, N, k) of the efforts of a motion by the unknown load parameters."""
+        slope = self._effort.map(len(motion.q)).call([motion.q.T, motion.v.T, motion.a.T])[1]
+        return np.array(slope).reshape(len(self.joint_names), len(motion.q), len(self.unknown_load_parameters)).T
+
     @cached_property
     def _places(self) -> CasadiLockedCache[tuple[str, ...], ca.Function]:
         return CasadiLockedCache(self._place_function)
@@ -118,7 +126,9 @@ class RecordedJointsModel:
         effort = ca.jtimes(by_v, full[0], full[1]) + ca.jtimes(by_v, full[1], full[2]) - rigid.lagrangian_by_q
         placed = ca.vertcat(*(self._placed(x) for x in known))
         effort = ca.substitute(effort[list(self.joint_configuration_indices)], ca.vertcat(*full), placed)
-        return ca.Function("effort", known, [ca.densify(self._numbers(effort))])
+        by = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self.unknown_load_parameters))
+        parts = effort, ca.jacobian(effort, by)
+        return ca.Function("effort", known, [ca.densify(self._numbers(part)) for part in parts])
 
     def _placed(self, known: ca.SX) -> ca.SX:
         full = ca.SX.zeros(self.system.n_coordinates)
@@ -129,7 +139,8 @@ class RecordedJointsModel:
     def _numbers(self, expression: ca.SX) -> ca.SX:
         internal = self.system.effect_internal_coordinate_symbols.values()
         symbols = ca.vertcat(self.system.parameters.symbols, *internal)
-        return ca.substitute(expression, symbols, ca.SX(ca.DM([*self.theta, *([0.0] * len(internal))])))
+        values = [*self.system.parameters.vector(), *([0.0] * len(internal))]
+        return ca.substitute(expression, symbols, ca.SX(ca.DM(values)))
 
 
 @dataclass(frozen=True)
@@ -287,9 +298,9 @@ def joint_excitation_issues(
 #     e_j / g_j = w_j + c_j + d_j v_j + s_j sign(v_j) + k_j q_j + (J' f)_j,
 #
 # linear in 1/g_j, offset, friction, springs and the load f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x) of each
-# grasp on the arm, whatever it holds. All have priors of typical size for robots, so that a joint without information
-# keeps g = 1. A joint whose effort is not explained has no issue: a counterbalance missing in the URDF is not a wrong
-# sign.
+# grasp on the arm, whatever it holds, and in the unknown parameters of payloads. All have priors of typical size for
+# robots, so that a joint without information keeps g = 1. A joint whose effort is not explained has no issue: a
+# counterbalance missing in the URDF is not a wrong sign.
 
 # Error of a robot's model: fraction of the joint's largest effort, fraction of the spread of the required effort.
 _EFFORT_LIMIT_ERROR_FRACTION, _EFFORT_SPREAD_ERROR_FRACTION = 0.02, 0.1
@@ -536,18 +547,20 @@ def _loaded(data: _Data) -> BoolArray:
 
 
 def _loads(data: _Data) -> tuple[Array, Array]:
-    """Columns (N, k, 33 per grasp) of the force at every grasp, and their typical sizes."""
-    if not data.holders:
-        return np.zeros((*data.needed.shape, 0)), np.zeros(0)
-    place, by_angle = data.arm.frame_positions_and_jacobians(data.holders, data.motion.q)
-    columns = []
+    """Columns (N, k, c) of what the arm holds, and their typical sizes: unknown load parameters, 33 per grasp."""
+    motion, arm = data.motion, data.arm
+    unknown = [arm.system.parameters[name] for name in arm.unknown_load_parameters]
+    columns = [*arm._effort_change_by_loads(motion)] if unknown else []
+    sizes = [_LOAD_RANGE_FRACTION * (entry.upper - entry.lower) for entry in unknown]
+    if data.holders:
+        place, by_angle = arm.frame_positions_and_jacobians(data.holders, motion.q)
     for g in range(len(data.holders)):
         moved = place[:, g] - place[:, g].mean(axis=0)
-        speed = np.einsum("nik,nk->ni", by_angle[:, g], data.motion.v)
+        speed = np.einsum("nik,nk->ni", by_angle[:, g], motion.v)
         for axis in range(3):
             lever = by_angle[:, g, axis, :]
             squares = [lever * (moved[:, [b]] * moved[:, [c]]) for b in range(3) for c in range(b, 3)]
             columns += [lever, *(lever * moved[:, [b]] for b in range(3)), *squares, lever * speed[:, [axis]]]
     stiffness = [_GRASP_STIFFNESS_STD] * 3 + [_GRASP_QUADRATIC_STIFFNESS_STD] * 6
-    sizes = [_GRASP_FORCE_STD, *stiffness, _GRASP_DAMPING_STD] * 3 * len(data.holders)
-    return np.stack(columns, axis=2), np.array(sizes)
+    sizes += [_GRASP_FORCE_STD, *stiffness, _GRASP_DAMPING_STD] * 3 * len(data.holders)
+    return np.stack([np.zeros_like(data.needed), *columns], axis=2)[:, :, 1:], np.array(sizes)

@@ -224,7 +224,7 @@ def _check_recordings(
     doubts: list[Issue] = []
     cable = cable_topology_between_clamps(run)
     kept: tuple[list[Recording], list[Recording]] = [], []
-    arm = None if cable is not None else RecordedJointsModel.from_system(system, system.parameters.vector())
+    arm = None if cable is not None else RecordedJointsModel.from_system(system, free)
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices
     clamped = () if cable is None else cable.clamped_vertex_names
     for role, recordings in zip(kept, _once(run, estimate, held_out, doubts), strict=True):
@@ -252,7 +252,7 @@ def recording_quality_issues_with_model(run: RunSettings, system: System, record
     """Find all data quality issues of one uncut recording. Errors are as in `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
-    arm = RecordedJointsModel.from_system(system, system.parameters.vector())
+    arm = RecordedJointsModel.from_system(system, free_parameter_names(run, system.parameters))
     found += _beside_the_model(run, system, arm, None, recording)
     _raise_for_issues(run, found)
     return found
