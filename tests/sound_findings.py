@@ -27,7 +27,8 @@ def assert_sound(finding: DiagnosisResult) -> None:
     assert_nothing_impossible_is_said(finding, finding.summary)
     result = finding.to_dict()
     json.dumps(result, allow_nan=False)
-    closures = [result["gap"]["closure"], *(entry["closure"] for entry in (*result["which"], *result["steps"]))]
+    rejected = result["rejected_candidates"]
+    closures = [result["gap"]["closure"], *(entry["closure"] for entry in (*result["which"], *rejected))]
     if finding.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
         assert closures == [None] * len(closures)
     if finding.verdict in ("no_gap", "insufficient_data"):

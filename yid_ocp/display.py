@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import html
 import logging
+import re
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+_MAX_NAMES_IN_LINE = 12  # names in a line; tables list all
 _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows are only counted
 
 
@@ -48,6 +50,36 @@ def _row(cells: Sequence[str], kind: str) -> str:
 def count_with_noun(number: int, noun: str) -> str:
     """Format a number with its noun, such as `1 joint` and `2 joints`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def abbreviated_names_text(names: Sequence[str]) -> str:
+    """Join names in one line. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
+
+    A long line is cut, with the number of omitted names.
+    """
+    parts = [re.split(r"(\d+)", name) for name in names]
+    taken: set[int] = set()
+    said, left = list[str](), 0
+    for i, own in enumerate(parts):
+        if i in taken:
+            continue
+        longest, text = [i], names[i]
+        for at in range(1, len(own), 2):
+            run = [i]
+            for number in range(int(own[at]) + 1, int(own[at]) + len(names)):
+                following = [*own[:at], str(number), *own[at + 1 :]]
+                if following not in parts:
+                    break
+                run.append(parts.index(following))
+            if len(run) > max(2, len(longest)) and not taken.intersection(run):
+                end = parts[run[-1]][at]
+                longest, text = run, "".join([*own[: at + 1], "..", end, *own[at + 1 :]])
+        taken.update(longest)
+        if len(said) < _MAX_NAMES_IN_LINE:
+            said.append(text)
+        else:
+            left += len(longest)
+    return ", ".join(said) + (f" and {left} more" if left else "")
 
 
 class Progress:

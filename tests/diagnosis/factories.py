@@ -15,7 +15,7 @@ import pytest
 import scipy
 from made_series import seeing
 
-from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
     AllCandidatesLinearization,
@@ -129,6 +129,12 @@ def costing(cost: float, rows: int) -> Evaluation:
     return replace(evaluation(np.zeros(rows)), cost=cost)
 
 
+def problem_of(*names: str) -> SimpleNamespace:
+    """What is asked of a problem whose free parameters [N m/rad] have these names."""
+    system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad") for name in names})
+    return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system)
+
+
 def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:
     """A refitted model; values are neutral unless given. `held`: std of amplitudes with shapes held, if others."""
     neutral = {name: value for entry in effects for name, value in entry.neutral_values.items()}
@@ -139,6 +145,7 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
         e.label: [(values[n] - neutral[n]) / (held[n] or 1e-9) for n in e.amplitude_parameter_names] for e in effects
     }
     p_values = {label: float(scipy.special.chdtrc(len(z), np.square(z).sum())) for label, z in sizes.items()}
+    problem = problem_of() if problem is None else problem
     noisy = getattr(problem, "has_process_noise", False)
     rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, noisy, problem, evaluation([1.0]))
     return RefittedModel(values, std, p_values, "made up", *rest)
@@ -196,8 +203,13 @@ def place(location="T1", share=1.0, observable=True, windows=()) -> GapLocation:
     return GapLocation(location, share, observable, tuple(windows))
 
 
-def absorbed(name, before, after, std=0.1, unit="N m/rad") -> NominalParameterChange:
-    return NominalParameterChange(name, unit, before, after, std)
+def absorbing(of: EffectBase, std=0.1, **moved: tuple[float, float]) -> dict:
+    """What a finding has if parameters [N m/rad], with values before and after, absorb an effect."""
+    first = {name: own[0] for name, own in moved.items()}
+    last = {name: own[1] for name, own in moved.items()} | {f"{of.label}.a": 0.5}
+    fitted = fit([of], loss(1.0, 1.1), values=last, std=dict.fromkeys(moved, std))
+    nominal = fit(lost=loss(2.0, 2.2), values=first, problem=problem_of(*moved))
+    return {"nominal_model": nominal, "selected_effects": (added(of, fitted=fitted),)}
 
 
 def finding(verdict="effect", **changed) -> DiagnosisResult:
@@ -213,19 +225,17 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "are_offsets_stated": False,
         "explained_fraction": 1.0,
         "transfer_checks": (),
-        "smoother_result": None,
+        "smoother_result": smoothed({FORCE: 9.0, BIAS: 9.0}, evidence={"plant": 9.0, "sensor": 9.0, "both": 20.0}),
         "gap_locations": (place(),),
-        "nominal_model": fit(lost=loss(2.0, 2.2), problem=SimpleNamespace(has_process_noise=False)),
+        "nominal_model": fit(lost=loss(2.0, 2.2)),
         "single_effect_models": (alone,),
         "selected_effects": (added(of, fitted=alone),),
         "gap_closure": closed(),
-        "remaining_test": outcome(p=0.4, chi2=1.02),
+        "remaining_test": outcome(p=1e-8, chi2=2.1) if verdict == "unknown" else outcome(p=0.4, chi2=1.02),
         "remaining_gap_locations": (),
-        "nominal_changes": (),
         "next_experiment": "Repeat.",
         "held_out_names": ("other",),
         "is_split_in_blocks": False,
-        "message": "",
         "thresholds": Thresholds(),
         "stage_seconds": {"nominal_model": 1.0},
         "unknown_reason": "none" if verdict == "unknown" else "",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from factories import (
     BIAS,
     FORCE,
     READ_FORCE,
-    absorbed,
+    absorbing,
     added,
     amplitude,
     carried,
@@ -36,15 +37,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sound_findings import assert_nothing_impossible_is_said
 
-from yid_ocp.diagnosis.baseline import EarlierRunsComparison
-from yid_ocp.diagnosis.diagnosis_messages import (
-    _event_sentences,
-    _separating_experiment,
-    _since,
-    diagnosis_summary_text,
-    insufficient_data_message,
-    recommended_experiment_text,
+from yid_ocp.diagnosis.baseline import (
+    EarlierRunsComparison,
+    ErrorsWithEffectsRemovedAndAdded,
+    _ParameterShift,
+    _PredictionErrors,
 )
+from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -52,7 +51,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 SPEED, ACCELERATION, GRAVITY = "how fast it moves", "how hard it accelerates", "its orientation to gravity"
-REASONS = ("unsure", "little", "stand_in")
+REASONS = ("little", "stand_in")
 NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 
 
@@ -71,8 +70,10 @@ def gaps():
     ]:  # fmt: skip
         tests = {"nominal_test": outcome(p[0], chi2=1.123), "nominal_held_out_test": outcome(p[1], chi2=2.345)}
         yield f"{verdict}, p = {p[0]:g} and {p[1]:g}", finding(verdict, **tests, **NO_EFFECT)
-    short = {"message": "4 samples.", "next_experiment": "Longer."}
-    yield "insufficient data", finding("insufficient_data", **short, **NO_EFFECT)
+    few = {"nominal_test": outcome(degrees=11.6), "nominal_model": fit(values=dict.fromkeys("abcde", 1.0))}
+    for seen in ((), (True,), (True, False)):
+        hidden = {"screening": screening(seen=[visible(FRICTION, own) for own in seen])}
+        yield f"insufficient data, {seen}", finding("insufficient_data", **few, **hidden, **NO_EFFECT)
     quiet = {"nominal_test": outcome(0.2, chi2=1.02), "nominal_held_out_test": outcome(0.6, chi2=0.989)}
     yield "along a candidate alone", finding(**quiet)
     yield "no gap", finding("no_gap", next_experiment="None is needed.", **NO_EFFECT)
@@ -102,7 +103,7 @@ def effects():
     for unit, std in [("N m", 0.0234), ("1", 0.0234), ("N m", math.inf), ("N m", math.nan)]:
         yield f"a = 0.457, std {std} {unit}", with_effect(effect("friction@elbow", amplitude(unit=unit)), 0.4567, std)
     yield "closure", with_effect(FRICTION, 0.5, gap_closure=closed(0.9123, 0.8012, 0.9534))
-    yield "no sure closure", with_effect(FRICTION, 0.5, gap_closure=closed(0.9, 0.01, 0.95))
+    yield "no sure closure", with_effect(FRICTION, 0.5, gap_closure=closed(0.9, -0.01, 0.95))
     both = fit([FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25})
     yield "two effects", finding(selected_effects=(added(FRICTION), added(OFFSET, fitted=both)))
     rivals = (added(FRICTION, [OFFSET, effect("third@x")]),)
@@ -111,40 +112,42 @@ def effects():
     for value in (2.5, 2.51, -0.5, -0.51, 9.0):
         yield f"range 0 to 2, value {value}", with_effect(odd, value)
     for chi2, p, where in [
-        (1.23, 0.002, (place("T2"),)), (1.23, 0.002, ()), (1.23, 0.02, ()), (1.23, 0.01, ()), (0.9, 0.002, ()),
-        (1.0, 0.002, ()),
+        (1.23, 0.002, (place("T2"),)), (1.23, 0.002, ()), (1.23, 0.02, ()), (1.23, 0.01, ()),
     ]:  # fmt: skip
         rest = {"remaining_test": outcome(p=p, chi2=chi2), "remaining_gap_locations": where}
         yield f"remains chi2 {chi2}, p = {p}, {len(where)} places", with_effect(FRICTION, 0.5, **rest)
     for before, after in [(10.0, 11.1), (10.0, 8.9), (10.0, 11.0), (-10.0, -8.9), (0.0, 1e-9), (0.0, 1e-11)]:
-        moved = (absorbed("T1.bend", before, after),)
-        yield f"moves from {before} to {after}", with_effect(FRICTION, 0.5, nominal_changes=moved)
-    many = tuple(absorbed(f"p{i}", 1.0, 2.0) for i in range(8))
-    yield "eight parameters move", with_effect(FRICTION, 0.5, nominal_changes=many)
+        moved = absorbing(FRICTION, **{"T1.bend": (before, after)})
+        yield f"moves from {before} to {after}", finding(**moved)
+    yield "eight parameters move", finding(**absorbing(FRICTION, **{f"p{i}": (1.0, 2.0) for i in range(8)}))
     yield "in blocks", with_effect(FRICTION, 0.5, is_split_in_blocks=True)
 
 
 def unknown():
     """Why a gap has no name, with the numbers that decide it."""
     for name, reason, changed in [
-        ("not sure", "unsure", {"gap_closure": closed(0.4, 0.01, 0.7)}),
         ("little explained", "little", {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}),
         ("imitates", "stand_in", {"gap_closure": closed(0.91), "transfer_checks": (carried(),)}),
         ("imitates by one of two", "stand_in", {
             "transfer_checks": (carried(agrees=True, name="b", values=(3.0, 3.1)), carried(stds=(0.01, 0.02)))}),
         *((f"two effects, {reason}", reason, {
-            "selected_effects": (added(FRICTION), added(OFFSET)), "explained_fraction": 0.31,
-            "transfer_checks": (carried(),)}) for reason in ("unsure", "little", "stand_in")),
+            "selected_effects": (added(FRICTION), added(OFFSET, fitted=fit([FRICTION, OFFSET]))),
+            "explained_fraction": 0.31, "gap_closure": closed(0.4, 0.01, 0.7), "transfer_checks": (carried(),),
+        }) for reason in REASONS),
     ]:  # fmt: skip
         limits = Thresholds(min_explained_fraction=0.5)
         yield name, finding("unknown", unknown_reason=reason, thresholds=limits, **changed)
     for reason in REASONS:
         none = {"gap_closure": closed(math.nan, math.nan, math.nan), "transfer_checks": (carried(),)}
+        none |= {"nominal_held_out_test": outcome(), "remaining_test": outcome(), "explained_fraction": 0.31}
         yield f"no held-out gap, {reason}", finding("unknown", unknown_reason=reason, **none)
     joints = [effect(f"friction@{name}") for name in ("elbow", "wrist", "waist")]
     for of, p_values in (("two joints", (1e-9, 3e-5, 4e-5)), ("one joint", (1e-9, 4e-5, 4e-5))):
         seen = screening([score(own, p=p) for own, p in zip(joints, p_values, strict=True)])
-        yield f"significant at {of}", finding("unknown", unknown_reason="little", screening=seen)
+        yield (
+            f"significant at {of}",
+            finding("unknown", unknown_reason="little", explained_fraction=0.31, screening=seen),
+        )
     hurried = {"search_seconds": 12.54, "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
     yield (
@@ -160,6 +163,28 @@ def unknown():
     yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True)
 
 
+def compared():
+    """What changed since a baseline, and what the effects predict elsewhere."""
+    for name, (moved, shared, is_explained) in {
+        "nothing changed": (False, 0.5, True), "one changed": (True, 0.5, True), "runs differ": (True, 1e-3, False),
+    }.items():  # fmt: skip
+        shift = _ParameterShift("T1.bend", "N m/rad", 10.0, 0.1, 12.0, 0.2, 9.0, 1e-9, moved)
+        earlier = EarlierRunsComparison(("a", "b"), is_explained, (), 9.0, shared, (shift,))
+        yield name, finding("no_gap", baseline_comparison=earlier, **NO_EFFECT)
+    errors = [{"points.tip": (error, "m")} for error in (0.02, 0.01)]
+    better = _PredictionErrors(("bare (without)",), *errors)
+    for name, other in {"worse": _PredictionErrors(("a", "b", "c"), *reversed(errors)),
+                        "failed": _PredictionErrors(("a",), {}, {}, "it diverges")}.items():  # fmt: skip
+        yield f"{name} with effects", finding(counterfactual=ErrorsWithEffectsRemovedAndAdded(better, other))
+
+
+def separating(rivals: Mapping[str, str]) -> str:
+    """The experiment that separates effects, given by label with what they depend on."""
+    alike = [SimpleNamespace(location=k.partition("@")[2], required_excitation=v) for k, v in rivals.items()]
+    chosen = (SimpleNamespace(equivalent_effects=alike),)
+    return recommended_experiment_text(SimpleNamespace(accepted_selections=chosen))
+
+
 def said() -> dict[str, str]:
     """Every text by its case."""
     found = {
@@ -173,25 +198,21 @@ def said() -> dict[str, str]:
         ("no_gap", (), ("a@b",)), ("no_gap", (), tuple(f"{kind}@x" for kind in "abcde")), ("effect", (), ()),
     ]:  # fmt: skip
         case = f"next experiment: {verdict} {[p.location for p in where]} {len(unseen)} unseen"
-        hidden = [visible(effect(label), seen=False) for label in unseen]
-        found[case] = recommended_experiment_text(finding(verdict, selected_effects=()), where, hidden)
+        hidden = screening(seen=[visible(effect(label), seen=False) for label in unseen])
+        made = finding(verdict, selected_effects=(), gap_locations=where, screening=hidden)
+        found[case] = recommended_experiment_text(made)
     for rivals in [
         {"joint_viscous@elbow": SPEED, "joint_coulomb@elbow": SPEED}, {"a@elbow": SPEED, "b@shoulder": SPEED},
-        {"tilt@world": GRAVITY, "mass@elbow": ACCELERATION, "a@elbow": SPEED}, {"odd@T1": ""},
+        {"tilt@world": GRAVITY, "mass@elbow": ACCELERATION, "a@elbow": SPEED},
         {"melting@T1": "how hot it is", "density@T1": ACCELERATION},
     ]:  # fmt: skip
-        alike = [SimpleNamespace(location=k.partition("@")[2], required_excitation=v) for k, v in rivals.items()]
-        found[f"next experiment: rivals {list(rivals)}"] = _separating_experiment(alike)
-    few, limits = {"nominal_test": outcome(degrees=11.6)}, Thresholds(min_samples_per_unknown=4.0)
-    few["nominal_model"] = fit(values=dict.fromkeys("abcde", 1.0))
-    for seen in (True, False):
-        known = finding(screening=screening(seen=[visible(FRICTION, seen)]), **few)
-        text = insufficient_data_message("insufficient_data", known, limits)
-        found[f"insufficient data: detectable {seen}"] = text
+        found[f"next experiment: rivals {list(rivals)}"] = separating(rivals)
     force = ForceOrFaultEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
     odd = ForceOrFaultEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
-    for events in ((force,), (force, odd), (force,) * 10):
-        found[f"events: {len(events)}"] = _event_sentences(EventSet(events, (_Overspeed("run_0", "elbow", 3.0),)))
+    for events in ((force,), (force, odd), (force,) * 14):
+        seen = EventSet(events, (_Overspeed("run_0", "elbow", 3.0),))
+        found[f"events: {len(events)}"] = diagnosis_summary_text(finding("no_gap", events=seen, **NO_EFFECT))
+    found |= {f"baseline: {name}": diagnosis_summary_text(made) for name, made in compared()}
     return found
 
 
@@ -208,8 +229,7 @@ def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
     if lost.excess_chi2_per_sample <= 0:
         closure = closed(math.nan, math.nan, math.nan)
     tests = {"nominal_test": outcome(p, chi2=fitted), "nominal_held_out_test": outcome(p, chi2=held_out)}
-    nominal = fit(lost=lost, problem=SimpleNamespace(has_process_noise=False))
-    known = {**tests, "gap_closure": closure, "nominal_model": nominal}
+    known = {**tests, "gap_closure": closure, "nominal_model": fit(lost=lost)}
     verdict = how if how in ("effect", "no_gap") else "unknown"
     none = NO_EFFECT if verdict == "no_gap" else {"transfer_checks": (carried(),)}
     made = finding(verdict, **known, **none, **({} if verdict == how else {"unknown_reason": how}))
@@ -222,20 +242,11 @@ def test_a_diagnosis_says_what_is_written_down():
 
 def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_suffice():
     alike = finding("effect", selected_effects=(added(FRICTION, rivals=[OFFSET]),))
-    assert recommended_experiment_text(alike, (), ()) == _separating_experiment([FRICTION, OFFSET])
-    sole = recommended_experiment_text(finding("effect", selected_effects=(added(FRICTION),)), (), ())
+    assert recommended_experiment_text(alike).startswith("Move so that elbow and wrist work one at a time")
+    sole = recommended_experiment_text(finding("effect", selected_effects=(added(FRICTION),)))
     assert sole.startswith("Repeat with other motions")
-    few = recommended_experiment_text(replace(alike, verdict="insufficient_data"), (), ())
+    few = recommended_experiment_text(replace(alike, verdict="insufficient_data"))
     assert few.startswith("Record longer and larger motions")
-
-
-def test_runs_of_a_baseline_differ_where_there_are_several_and_chance_does_not_explain_it():
-    def differ(runs, p_value):
-        found = _since(EarlierRunsComparison(runs, True, (), 9.0, p_value, ()), False)
-        return any("differ among themselves" in text for text in found)
-
-    said = [differ(runs, p) for runs, p in ((("a", "b"), 1e-3), (("a", "b"), 0.5), (("a",), 1e-3))]
-    assert said == [True, False, False]
 
 
 if __name__ == "__main__":

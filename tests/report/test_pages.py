@@ -211,15 +211,17 @@ def test_every_verdict_has_its_chapters(found, verdict, left_out, tmp_path):
 
 
 def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
-    [first, *others] = found["effect"].nominal_changes
-    moved = replace(first, value_after=2 * first.value_before)
-    text = text_of(page_of(replace(found["effect"], nominal_changes=(moved, *others)), tmp_path))
+    finding = found["effect"]
+    (name, values) = next(iter(finding.nominal_changes.items()))
+    before = finding.nominal_model.values | {name: values["after"] / 2}
+    moved = replace(finding, nominal_model=replace(finding.nominal_model, values=before))
+    text = text_of(page_of(moved, tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
     assert "would have been detected" in text
     assert "By evidence the gap lies in the mechanics or what the effort sensors read" in text
     assert "Closed by joint_coulomb@elbow" in text
     assert "The most significant value is that of elbow" in text
-    assert f"{moved.name} goes from" in text
+    assert f"{name} goes from" in text
 
 
 def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tmp_path):

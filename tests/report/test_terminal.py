@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.data import JointGroup, Recording
+from yid_ocp.display import abbreviated_names_text
 from yid_ocp.inference.uncertainty import VERDICT_SENTENCE_TEXTS, VERDICT_TABLE_TEXTS, parameter_verdict
 from yid_ocp.report import diagnosis_summaries, summaries, terminal  # noqa: F401, they register
-from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable, abbreviated_names_text
+from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
 BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True, "worse_than_guess": []}

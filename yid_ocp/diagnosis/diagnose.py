@@ -18,13 +18,12 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
-from yid_ocp.diagnosis.diagnosis_messages import (
+from yid_ocp.diagnosis.diagnosis_result import (
+    DiagnosisResult,
     diagnosis_summary_text,
     held_out_truncation_message,
-    insufficient_data_message,
     recommended_experiment_text,
 )
-from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
     SIMULATED_DURATION_FRACTIONS_TO_KEEP,
@@ -208,7 +207,7 @@ def _diagnosed(
     problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, float]
 ) -> DiagnosisResult:
     search, nominal, evidence = seen.search, seen.nominal, seen.evidence
-    limits, held, screened = search.thresholds, evidence.nominal_held_out_test, evidence.screening
+    limits, held = search.thresholds, evidence.nominal_held_out_test
     evidence = replace(evidence, has_left_baseline=earlier.fit_parameters_differ_significantly(nominal, limits))
     smoothed: SmoothedUnknownsResult | None = None
 
@@ -251,9 +250,6 @@ def _diagnosed(
         gap_locations=where,
         remaining_test=remaining,
         remaining_gap_locations=rest,
-        nominal_changes=_changes(nominal, final),
-        next_experiment=recommended_experiment_text(judged, where, screened.detectability),
-        message=insufficient_data_message(judged.verdict, evidence, limits),
         held_out_names=tuple(episode.name for episode in nominal.problem.held_out),
         is_split_in_blocks=search.problem.is_split_in_blocks,
         thresholds=limits,
@@ -267,6 +263,7 @@ def _diagnosed(
         search_seconds=clock["refits"] - clock[""],
         law=law,
     )
+    finding = replace(finding, next_experiment=recommended_experiment_text(finding))
     return replace(finding, summary=diagnosis_summary_text(finding))
 
 
@@ -487,13 +484,6 @@ def _after(
     rest = gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.location_z) if left else ()
     windows = merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
     return remaining, gap_locations_from_effect_closures(where, judged.closure_by_location, rest, windows), rest
-
-
-def _changes(before: RefittedModel, after: RefittedModel) -> tuple[NominalParameterChange, ...]:
-    """Change of each nominal parameter from one model to another."""
-    names, parameters = before.problem.shared_parameters, before.problem.system.parameters
-    pairs = ((name, (before.values[name], after.values[name], after.std[name])) for name in names)
-    return tuple(NominalParameterChange(name, parameters[name].unit, *values) for name, values in pairs)
 
 
 def fit_nominal_model(

@@ -1,9 +1,9 @@
-"""The result of a diagnosis as a dataclass and in the format `yid-diagnosis/2`."""
+"""The result of a diagnosis: as a dataclass, in the format `yid-diagnosis/2`, and in sentences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,105 +12,72 @@ from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import (
-    GapClosure,
-    bic_difference,
-    held_out_gap_closure,
-)
+from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, bic_difference, held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import (
-    GapLocalization,
-    Judgement,
-    NominalModelGapEvidence,
-)
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin
+from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence
+from yid_ocp.display import ReprLineAndTableRows, ReprMixin, abbreviated_names_text
 from yid_ocp.effects import EffectBase
-from yid_ocp.files import object_attributes_to_json_dict, to_json_types
-from yid_ocp.inference.null_test import (
-    AssumedChannelNoiseLevel,
-    NullTestResult,
-    bonferroni_corrected_min_test_p_value,
-)
-from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
+from yid_ocp.files import attributes_by_name, to_json_types
+from yid_ocp.inference import null_test
+from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult, main_gap_locations
 
-_FORMAT = "yid-diagnosis/2"
-
-
-@dataclass(frozen=True)
-class NominalParameterChange:
-    """Value of one nominal parameter in the nominal model and in the model with the accepted effects."""
-
-    name: str
-    unit: str
-    value_before: float
-    value_after: float
-    std_after: float
+_EFFECT = "kind location"
+_PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
+_SHIFT = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
+_MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
+_PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range without a message
+_RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
+_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that cannot be moved by themselves
+_GAP_ORIGIN_PHRASES = {
+    "plant": ", in the mechanics rather than in what sensors read",
+    "sensor": ", in what sensors read",
+    "either": ", in the mechanics or in what the effort sensor reads (efforts alone cannot distinguish them)",
+}
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class DiagnosisResult(NominalModelGapEvidence, Judgement, ReprMixin):
     """Result of a diagnosis: verdict, gap, locations, effects and the statistics behind them.
 
-    `to_dict` returns it in the format of result.json, with a unit for every value.
-
-    Attributes
-    ----------
-    verdict : str
-        `effect`, `confusable`, `no_gap`, `unknown` or `insufficient_data`.
-    gap_closure : GapClosure
-        Fraction of the held-out gap that the accepted effects close [1], with its 95 % interval.
-    explained_fraction : float
-        Decrease of the sum of squared whitened residuals by the effects over its decrease by unknown forces [1].
-    noise_floor : tuple of AssumedChannelNoiseLevel
-        Root mean square error expected from noise alone, in the channel's unit (m, rad or N m).
-    smoother_result : SmoothedUnknownsResult or None
-        Means and standard deviations (J, nd) per recording of nd unknown forces [N m or N], offsets and biases [m] in J
-        time intervals, in units of `reference_std` (nd,). None if there is no gap to locate.
-    nominal_model, final_model : RefittedModel
-        `values` and `std` by parameter, each in its own unit (`problem.system.parameters[name].unit`).
-    nominal_changes : tuple of NominalParameterChange
-        Nominal parameters without and with the accepted effects, in `unit`.
-    stage_seconds, search_seconds : mapping of str to float, float
-        Durations [s].
+    Values have the units of their parameters. `smoother_result` has means and standard deviations (J, nd) per recording
+    of nd unknown forces [N m or N], offsets and biases [m] in J time intervals.
     """
 
-    noise_floor: tuple[AssumedChannelNoiseLevel, ...]
-    smoother_result: SmoothedUnknownsResult | None  # about the nominal model; None if there is no gap to locate
+    noise_floor: tuple[null_test.AssumedChannelNoiseLevel, ...]  # error from noise alone, in the channel's unit
+    smoother_result: SmoothedUnknownsResult | None  # None if there is no gap to locate
     gap_locations: tuple[GapLocation, ...]
     nominal_model: RefittedModel
-    remaining_test: NullTestResult  # held-out, with the effects added
+    remaining_test: null_test.NullTestResult  # held-out, with the effects added
     remaining_gap_locations: tuple[GapLocation, ...]
-    nominal_changes: tuple[NominalParameterChange, ...]  # when the accepted effects are added
-    next_experiment: str
     held_out_names: tuple[str, ...]
     is_split_in_blocks: bool
-    message: str  # why the data are insufficient; empty if they suffice
     thresholds: Thresholds
-    stage_seconds: Mapping[str, float]
+    stage_seconds: Mapping[str, float]  # duration of each stage [s]
     baseline_comparison: EarlierRunsComparison | None = None
     counterfactual: ErrorsWithEffectsRemovedAndAdded | None = None
+    next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     located_gap: GapLocalization | None = None
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
-    untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first; empty if all were done
-    search_seconds: float = 0.0  # duration until the end of the search for effects
-    # stated time step, and the step used if the error of the stated one was part of the gap [s]
-    stated_and_finer_time_step: tuple[float, float] | None = None
+    untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first
+    search_seconds: float = 0.0  # from the start to the end of the search for effects
+    stated_and_finer_time_step: tuple[float, float] | None = None  # [s], if the stated step's error was part of the gap
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprLineAndTableRows:
-        effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction
-        said = f"{100 * closed:.3g} % of the held-out gap closed" if effects and math.isfinite(closed) else ""
+        said, closed = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects)], self.gap_closure
+        if self.accepted_effects and math.isfinite(closed.fraction):
+            said.append(f"{100 * closed.fraction:.3g} % of the held-out gap closed")
         rows = [("candidate", "parameters", "closure alone", "p")]
         for entry in _ranked_candidates(self, self)[:8]:
-            values = {name: own for name, own in entry["parameters"].items() if own["value"] is not None}
-            known = ", ".join(f"{name} = {own['value']:.3g} {own['unit']}" for name, own in values.items())
+            values = ((name, own["value"], own["unit"]) for name, own in entry["parameters"].items())
+            known = ", ".join(f"{name} = {value:.3g} {unit}" for name, value, unit in values if value is not None)
             alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
             rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
-        return ReprLineAndTableRows(", ".join(filter(None, (self.verdict.replace("_", " "), effects, said))), rows)
+        return ReprLineAndTableRows(", ".join(said), rows)
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
@@ -120,205 +87,306 @@ class DiagnosisResult(NominalModelGapEvidence, Judgement, ReprMixin):
     @property
     def final_model(self) -> RefittedModel:
         """The model with all accepted effects, or the nominal model if there are none."""
-        last = self.accepted_selections[-1].refitted_model if self.accepted_selections else self.nominal_model
+        last = [self.nominal_model, *(entry.refitted_model for entry in self.accepted_selections)][-1]
         assert isinstance(last, RefittedModel)
         return last
 
     @property
-    def worst_held_out_channel_by_unit(self) -> dict[str, tuple[str, float]]:
-        """By unit, the channel with the largest held-out error beyond noise in the final model, and that RMS."""
-        noise = {own.channel: own.noise_rmse for own in self.noise_floor}
-        found: dict[str, tuple[str, float]] = {}
-        for channel, (error, unit) in self.final_model.held_out_loss.channel_rmse.items():
-            size = math.sqrt(max(error**2 - noise.get(channel, 0.0) ** 2, 0.0))
-            found[unit] = max(found.get(unit, ("", 0.0)), (channel, size), key=lambda own: own[1])
-        return {unit: own for unit, own in found.items() if own[1] > 0}
+    def nominal_changes(self) -> dict[str, dict[str, Any]]:
+        """By parameter of the nominal model: value before and after effects are added, standard deviation and unit."""
+        first, last, known = self.nominal_model, self.final_model, self.nominal_model.problem.system.parameters
+        names, keys = first.problem.shared_parameters, ("before", "after", "std", "unit")
+        values = ((first.values[name], last.values[name], last.std[name], known[name].unit) for name in names)
+        return {name: dict(zip(keys, own, strict=True)) for name, own in zip(names, values, strict=True)}
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the result to a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
-        smoothed, since, finer = self.smoother_result, self.baseline_comparison, self.stated_and_finer_time_step
-        cuts = "recording kept=kept_duration whole=full_duration"
-        carried = "effect=effect_label parameter value=estimation_value std=estimation_std again=held_out_value"
-        carried += " again_std=held_out_std unit agrees=is_consistent"
-        changes = "before=value_before after=value_after std=std_after unit"
-        judged = judgement_to_dict(self, self, self.gap_locations)
-        return {
-            "format": _FORMAT,
+        judged, since, baseline = judgement_to_dict(self, self, self.gap_locations), self.baseline_comparison, None
+        after = _errors(self.final_model) | attributes_by_name(self.remaining_test, "chi2_per_dof p_value")
+        left = [attributes_by_name(place, _PLACE) for place in self.remaining_gap_locations]
+        reason = "; ".join(check.both_estimates_text for check in self.failed_transfer_checks)
+        rejected = self.selected_effects if self.unknown_reason == "stand_in" else ()
+        if since is not None:
+            shifts = {e.name: attributes_by_name(e, f"{_SHIFT} changed=has_changed") for e in since.parameter_shifts}
+            baseline = {"parameters": shifts}
+        found = {
+            "format": "yid-diagnosis/2",
             **judged,
-            "gap": {
-                **judged["gap"],
-                "after": _state(self.final_model, self.remaining_test),
-                "held_out": list(self.held_out_names),
-                "finer_time_step": None if finer is None else finer[1],
-                "cut": [object_attributes_to_json_dict(c, cuts) for c in self.truncated_recordings],
-            },
-            "remaining": {
-                "p_value": self.remaining_test.p_value,
-                "model_error": {
-                    channel: {"rms": size, "unit": unit}
-                    for unit, (channel, size) in self.worst_held_out_channel_by_unit.items()
-                },
-                "where": [object_attributes_to_json_dict(p, _PLACE) for p in self.remaining_gap_locations],
-            },
+            "gap": {**judged["gap"], "after": after, "held_out": self.held_out_names},
+            "remaining": {"p_value": after["p_value"], "where": left},
             "reason": self.unknown_reason,
             "law": None if self.law is None else self.law.to_dict(),
-            "rejected_candidates": _rejected_candidates(self),
-            "carried_over": [object_attributes_to_json_dict(c, carried) for c in self.transfer_checks],
-            "events": [event.to_dict() for event in self.events.disturbances],
-            "not_judged": [
-                object_attributes_to_json_dict(f, "recording joint from=start_time") for f in self.events.overspeeds
+            "rejected_candidates": [
+                {**attributes_by_name(e.effect, _EFFECT), **_closure(e.cumulative_closure), "reason": reason}
+                for e in rejected
             ],
+            "events": [event.to_dict() for event in self.events.disturbances],
             "next_experiment": self.next_experiment,
-            "side": None if smoothed is None else smoothed.plant_or_sensor_origin,
-            "evidence": {} if smoothed is None else dict(smoothed.log_evidence),
-            "explainable": None if smoothed is None else smoothed.explainable_gap_fraction,
             "statistics": diagnosis_decision_statistics(self),
             "summary": self.summary,
-            "message": self.message,
-            "held_out_in_blocks": self.is_split_in_blocks,
-            "absorption": {a.name: object_attributes_to_json_dict(a, changes) for a in self.nominal_changes},
-            "steps": [
-                {
-                    "added": entry.effect.label,
-                    **_closure(entry.cumulative_closure),
-                    "chi2_per_dof": entry.refitted_model.held_out_loss.chi2_per_sample,
-                    "rmse": {n: e for n, (e, _) in entry.refitted_model.held_out_loss.channel_rmse.items()},
-                }
-                for entry in self.selected_effects
-            ],
+            "absorption": self.nominal_changes,
+            "steps": [{"added": e.effect.label, **_errors(e.refitted_model)} for e in self.selected_effects],
             "unseen": [v.effect.label for v in self.screening.detectability if not v.is_detectable],
-            "noise": {
-                f.channel: object_attributes_to_json_dict(f, "std=noise_std unit samples=n_samples")
-                for f in self.noise_floor
-            },
-            "stopped": {"after": self.search_seconds, "next": list(self.untried)} if self.untried else None,
-            "baseline": None if since is None else _baseline_to_json(since),
+            "untried": self.untried,
+            "baseline": baseline,
             "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
-            "seconds": dict(self.stage_seconds),
+            "seconds": self.stage_seconds,
         }
+        return dict(to_json_types(found))
 
 
 def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
     """Convert the rule-based, scored part of a diagnosis to a JSON-compatible dictionary."""
-    closed = judged.gap_closure if judged.accepted_selections else None
-    rivals = [entry.equivalent_effects for entry in judged.accepted_selections if len(entry.equivalent_effects) > 1]
-    return {
+    added = judged.accepted_selections
+    before = _errors(seen.nominal_model) | attributes_by_name(seen.nominal_held_out_test, "chi2_per_dof p_value")
+    rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
+    found = {
         "verdict": judged.verdict,
-        "gap": {"before": _state(seen.nominal_model, seen.nominal_held_out_test), **_closure(closed)},
-        "where": [object_attributes_to_json_dict(place, _PLACE) for place in where],
+        "gap": {"before": before, **_closure(judged.gap_closure if added else UNDEFINED_GAP_CLOSURE)},
+        "where": [attributes_by_name(place, _PLACE) for place in where],
         "which": _ranked_candidates(judged, seen),
-        "effects": [object_attributes_to_json_dict(entry.effect, _EFFECT) for entry in judged.accepted_selections],
-        "confusable": [[object_attributes_to_json_dict(e, _EFFECT) for e in own] for own in rivals],
+        "effects": [attributes_by_name(entry.effect, _EFFECT) for entry in added],
+        "confusable": [[attributes_by_name(effect, _EFFECT) for effect in own] for own in rivals],
     }
+    return dict(to_json_types(found))
 
 
 def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
-    """Statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. Steps not reached are None.
-
-    - `p_value`, `chi2_per_dof`: null test of the estimation and held-out residuals together
-    - `largest_channel`: chi2/n of the channel with the largest chi2/n
-    - `candidate`: Bonferroni-corrected p-value of the best candidate
-    - `evidence`: rise of the log evidence by unknown forces, offsets and biases (None with process noise)
-    - `closure`, `closure_low`: held-out gap closure of all selected effects, accepted or not, and its lower bound
-    - `explained`: fraction of the smoother's decrease of r'r that the effects explain
-    - `assumptions`: number of assumptions
-    - `carried`: largest difference between estimation and held-out estimates [standard deviations]
-    - `behind`: per single-effect refit, held-out chi2/n (`left`) and BIC difference to the first (`squares`)
-    """
-    tests = (result.nominal_test, result.nominal_held_out_test)
-    added, seen, before = result.selected_effects, result.smoother_result, result.nominal_model
+    """Statistics that are compared with `Thresholds`, as a JSON-compatible dictionary; None if they are not known."""
+    tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
     differences = (entry.estimate_difference_and_std for entry in result.transfer_checks)
-    apart, alone = [distance / std for distance, std in differences if std > 0], result.single_effect_models
-    of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "explained"))
-    if added:
-        own = (result.gap_closure.fraction, result.gap_closure.ci_low, result.explained_fraction)
-        of_effects = dict(zip(of_effects, own, strict=True))
+    smoothed = None if result.nominal_model.has_process_noise else result.smoother_result
     found = {
-        "p_value": bonferroni_corrected_min_test_p_value(tests),
+        "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
         "candidate": min(1.0, bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores)),
-        "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
-        **of_effects,
-        "assumptions": result.assumption_count,
-        "carried": max(apart, default=None),
+        "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
+        "closure_low": result.gap_closure.ci_low,
+        "explained": result.explained_fraction,
+        # largest difference between estimation and held-out estimates [standard deviations]
+        "carried": max((apart / std for apart, std in differences if std > 0), default=None),
         "behind": {
-            fit.effects[-1].label: {
-                "left": fit.held_out_loss.chi2_per_sample,
-                "squares": bic_difference(fit, alone[0]),
-            }
+            fit.effects[-1].label: {"left": fit.held_out_loss.chi2_per_sample, "squares": bic_difference(fit, alone[0])}
             for fit in alone
         },
     }
-    return {name: to_json_types(value) for name, value in found.items()}
+    return dict(to_json_types(found))
 
 
-_EFFECT = "kind location"
-_PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
+def _closure(closed: GapClosure) -> dict[str, Any]:
+    return {"closure": closed.fraction, "closure_ci": [closed.ci_low, closed.ci_high]}
 
 
-def _baseline_to_json(found: EarlierRunsComparison) -> dict[str, Any]:
-    runs = "runs=baseline_runs explains=is_baseline_explained effects=baseline_effects chi2=between_runs_chi2"
-    shift = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
-    parameters = {
-        e.name: object_attributes_to_json_dict(e, f"{shift} p_value changed=has_changed")
-        for e in found.parameter_shifts
-    }
-    changed = [entry.name for entry in found.changed_parameters]
-    known = object_attributes_to_json_dict(found, f"{runs} p_value=between_runs_p_value")
-    return {**known, "parameters": parameters, "changed": changed}
-
-
-def _state(fit: RefitStatistics, test: NullTestResult) -> dict[str, Any]:
-    channels = fit.held_out_loss.channel_rmse
-    return {
-        "rmse": {name: value for name, (value, _) in channels.items()},
-        "unit": {name: unit for name, (_, unit) in channels.items()},
-        "chi2_per_dof": test.chi2_per_dof,
-        "p_value": test.p_value,
-    }
-
-
-def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
-    """Effects that imitate the gap but were rejected, each with its closure and the reason."""
-    failed, listed = finding.failed_transfer_checks, []
-    for entry in finding.selected_effects if finding.unknown_reason == "stand_in" else ():
-        own = [check for check in failed if check.effect_label == entry.effect.label] or failed
-        reason = "; ".join(check.both_estimates_text for check in own)
-        closed = to_json_types(entry.cumulative_closure.fraction)
-        listed.append({**object_attributes_to_json_dict(entry.effect, _EFFECT), "closure": closed, "reason": reason})
-    return listed
-
-
-def _closure(closed: GapClosure | None) -> dict[str, Any]:
-    if closed is None:
-        return {"closure": None, "closure_ci": None}
-    return to_json_types({"closure": closed.fraction, "closure_ci": [closed.ci_low, closed.ci_high]})
+def _errors(fit: RefitStatistics) -> dict[str, Any]:
+    channels = fit.held_out_loss.channel_rmse.items()
+    return {"rmse": {name: rmse for name, (rmse, _) in channels}, "unit": {name: unit for name, (_, unit) in channels}}
 
 
 def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list[dict[str, Any]]:
-    """All candidates: selected effects, then other refits by held-out loss, then the rest by score."""
-    ranked, first = seen.screening.candidate_scores, judged.single_effect_models
-    scores = {score.effect.label: score for score in ranked}
-    alone = {fit.effects[0].label: fit for fit in first}
-    entries: list[tuple[EffectBase, RefitStatistics | None]] = [
-        *((entry.effect, judged.accepted_selections[-1].refitted_model) for entry in judged.accepted_selections),
-        *((fit.effects[0], fit) for fit in first),
-        *((score.effect, None) for score in ranked),
+    """All candidates: accepted effects, then other refits by held-out loss, then the rest by score."""
+    added, alone, before = judged.accepted_selections, judged.single_effect_models, seen.nominal_model.held_out_loss
+    closures = {fit.effects[0].label: held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
+    scores = {score.effect.label: score for score in seen.screening.candidate_scores}
+    found = [
+        *((e.effect, added[-1].refitted_model.effect_parameters_as_reported(e.effect)) for e in added),
+        *((fit.effects[0], fit.effect_parameters_as_reported(fit.effects[0])) for fit in alone),
+        *((s.effect, s.effect.parameters_as_reported(s.predicted_values)) for s in scores.values()),
     ]
     listed: dict[str, dict[str, Any]] = {}
-    for effect, fit in entries:
-        if effect.label in listed:
-            continue
-        score, own = scores.get(effect.label), alone.get(effect.label)
-        step = {} if score is None else score.predicted_values
-        reported = effect.parameters_as_reported(step) if fit is None else fit.effect_parameters_as_reported(effect)
-        before = seen.nominal_model.held_out_loss
-        listed[effect.label] = {
-            **object_attributes_to_json_dict(effect, _EFFECT),
-            "parameters": {name: object_attributes_to_json_dict(r, "value std unit") for name, r in reported.items()},
-            "score": 0.0 if score is None else score.lm_statistic,
-            "p_value": 1.0 if score is None else score.p_value,
-            **_closure(None if own is None else held_out_gap_closure(before, own.held_out_loss)),
+    for effect, reported in found:
+        score = scores.get(effect.label, CandidateScore(effect, {}, 0.0, 0.0, 1.0))
+        entry = {
+            **attributes_by_name(effect, _EFFECT),
+            "parameters": {name: attributes_by_name(own, "value std unit") for name, own in reported.items()},
+            **attributes_by_name(score, "score=lm_statistic p_value"),
+            **_closure(closures.get(effect.label, UNDEFINED_GAP_CLOSURE)),
         }
+        listed.setdefault(effect.label, to_json_types(entry))
     return list(listed.values())
+
+
+def recommended_experiment_text(result: DiagnosisResult) -> str:
+    """Recommend the next recording in a sentence, from verdict, gap location and confusable effects."""
+    for rivals in (entry.equivalent_effects for entry in result.accepted_selections):
+        aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
+        places = list(dict.fromkeys(effect.location for effect in rivals))
+        if len(aspects) > 1:
+            return f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording."
+        if len(places) > 1:
+            return f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."
+        if len(rivals) > 1:
+            return f"Vary {aspects[0]} over a wider range."
+    place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
+    alone = _listed("Move ", place, " alone, slowly and fast, and hold it still in several configurations.")
+    unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
+    texts = {
+        "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
+        "unknown": alone or "Record other motions, faster and larger.",
+        "no_gap": f"None needed: no relevant gap was found.{_listed(' These motions cannot reveal ', unseen)}",
+        "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
+    }
+    return texts[result.verdict]
+
+
+def diagnosis_summary_text(result: DiagnosisResult) -> str:
+    """Summarise a diagnosis in a text on gap, locations, effects, events and the next experiment."""
+    text = [_gap(result)]
+    if result.stated_and_finer_time_step is not None:
+        stated, used = (f"{step:.4g}" for step in result.stated_and_finer_time_step)
+        used = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
+        text.append(f"The discretisation error of {stated} s steps looks like a gap, {used}.")
+    if result.verdict not in ("insufficient_data", "no_gap"):
+        text += [_places(result), *_causes(result), *_remains(result)]
+    if result.law is not None:
+        text.append(result.law.sentence)
+    stopped = f"The search stopped after {result.search_seconds:.3g} s; it would go on with "
+    text += [_listed(stopped, result.untried), *map(held_out_truncation_message, result.truncated_recordings)]
+    text += _earlier_runs(result)
+    if result.is_split_in_blocks:
+        text.append("No other recording could be held out, so alternate blocks of the recordings were.")
+    events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
+    text += [_listed("Excluded as brief disturbances: ", events), *ignored_after_overspeed_messages(result.events)]
+    return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
+
+
+def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
+    """Sentence on how far the nominal model follows a truncated held-out recording."""
+    used, whole = cut.kept_duration, cut.full_duration
+    return f"The nominal model follows {cut.recording} for {used:.3g} of {whole:.3g} s only; the rest is ignored."
+
+
+def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
+    """One sentence per recording whose end is ignored because a joint exceeds `max_joint_speed`."""
+    said, why = "s are ignored in", "moves too fast for the model."
+    return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
+
+
+def _listed(beginning: str, names: Iterable[str], end: str = ".") -> str:
+    """Sentence on names, similar ones merged. Empty if there are none."""
+    text = abbreviated_names_text([*names])
+    return f"{beginning}{text}{end}" if text else ""
+
+
+def _p_value_relation(p_value: float) -> str:
+    return f"= {p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
+
+
+def _gap(result: DiagnosisResult) -> str:
+    """Sentence on whether there is a gap."""
+    tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
+    fitted, other = (f"{t.chi2_per_dof:.3g}" if math.isfinite(t.chi2_per_dof) else "not known" for t in tests)
+    sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
+    if result.verdict == "insufficient_data":
+        unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
+        samples, needed = tests[0].degrees_of_freedom, result.thresholds.min_samples_per_unknown * unknowns
+        said = f"{samples:.0f} effective samples for {unknowns} unknowns (at least {needed:.0f} are needed)"
+        return f"The data are insufficient: {said}; {sum(seen)} of {len(seen)} candidates are detectable."
+    if result.verdict == "no_gap":
+        return f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)})."
+    if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_limits):
+        return f"The gap is real ({sizes}; p {_p_value_relation(p_value)})."
+    best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
+    small = f"not along what {best.effect.label} would do (p {_p_value_relation(min(p_value, 1.0))})"
+    return f"As a whole the recordings are explained to within their noise ({sizes}), but {small}."
+
+
+def _places(result: DiagnosisResult) -> str:
+    """Sentence on the gap's locations, with inseparable locations together."""
+    where = [place for place in main_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
+    named = [f"{' or '.join([p.location, *p.indistinguishable_from])} ({100 * p.gap_share:.0f} %)" for p in where]
+    if not named:
+        return "These data cannot locate it."
+    assert result.smoother_result is not None  # it found the locations
+    side = _GAP_ORIGIN_PHRASES.get(result.smoother_result.plant_or_sensor_origin, "")
+    return f"It lies in {' and '.join(named)}{side}."
+
+
+def _causes(result: DiagnosisResult) -> list[str]:
+    """Sentences on the selected effects, and on why the verdict is unknown."""
+    added, total, limits, text = result.selected_effects, result.gap_closure, result.thresholds, list[str]()
+    if added:
+        names = " and ".join(_named(entry.effect, added[-1].refitted_model) for entry in added)
+        verb, part = "closes" if len(added) == 1 else "together close", "no measurable part of it on held-out motions"
+        if math.isfinite(total.ci_low):
+            interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
+            part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
+        text.append(f"{names} {verb} {part}.")
+    for own, *others in (entry.equivalent_effects for entry in result.accepted_selections):
+        text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
+    if result.verdict == "unknown":
+        explained, enough = 100 * result.explained_fraction, 100 * result.required_explained_fraction(limits)
+        apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
+        reasons = {
+            "none": "No effect tried is significant and closes enough of it.",
+            "little": f"This explains {explained:.3g} % of what unknown forces explain; {enough:.3g} % is required.",
+            "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
+        }
+        text.append(reasons[result.unknown_reason])
+        scores = result.screening.candidate_scores
+        best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
+        alike = [s for s in scores if s.effect.kind in best and not s.effect.is_local]
+        places = [s.effect.location for s in alike if s.p_value * len(scores) < limits.gap_significance_level]
+        if len(places) > 1:
+            advice = "add it to the model at all of them (`model.effects`, or `yid-ocp friction` for friction)"
+            text.append(f"{best[0]} is significant at {abbreviated_names_text(places)}: {advice}.")
+    return text
+
+
+def _named(effect: EffectBase, fit: RefitStatistics) -> str:
+    """An effect with its estimates, and a warning if an amplitude is far outside its expected range."""
+    values, odd = [], ""
+    for name, r in fit.effect_parameters_as_reported(effect).items():
+        known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".removesuffix(" 1")
+        values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
+    for name in effect.amplitude_parameter_names:
+        (low, high), value = effect.prior_ranges[name], fit.values[name]
+        if abs(value - 0.5 * (low + high)) > (0.5 + _PRIOR_RANGE_TOLERANCE) * (high - low):
+            odd = f" (outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
+    return f"{effect.label} with {', '.join(values)}{odd}"
+
+
+def _remains(result: DiagnosisResult) -> list[str]:
+    """Sentences on the error that remains on held-out motions, and on what the effects change in the model."""
+    noise = {own.channel: own.noise_rmse for own in result.noise_floor}
+    errors = result.final_model.held_out_loss.channel_rmse.items()
+    beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
+    worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
+    mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
+    said = "What remains on held-out motions is noise."
+    if result.remaining_test.p_value < result.thresholds.significance_level:
+        said = f"What remains on held-out motions is model error: {', '.join([*worst.values(), *mostly])}."
+    moved = [
+        f"{name} goes from {own['before']:.3g} to {own['after']:.3g}"
+        for name, own in result.nominal_changes.items()
+        if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
+    ]
+    return [said, _listed("With it ", moved)]
+
+
+def _earlier_runs(result: DiagnosisResult) -> list[str]:
+    """Sentences on changes since the baseline, and on recordings made without the effects, and with them."""
+    since, swapped, text = result.baseline_comparison, result.counterfactual, list[str]()
+    if since is not None:
+        moved = []
+        for own in since.changed_parameters:
+            before = f"{own.baseline_value:.3g} ± {own.baseline_std:.2g}"
+            moved.append(f"{own.name} goes from {before} to {own.current_value:.3g} ± {own.current_std:.2g} {own.unit}")
+        text.append(_listed("Against the baseline, ", moved or ["no parameter has changed detectably"]))
+        if since.between_runs_p_value < _RUNS_DIFFER_LEVEL:
+            differ = f"differ among themselves (p = {since.between_runs_p_value:.2g})"
+            text.append(f"The runs of the baseline {differ}; their ± includes this.")
+        if not since.is_baseline_explained:
+            text.append("The model did not explain the baseline's recordings, so its ± may be too small.")
+    parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
+    for how, part in parts.items():
+        made = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
+        made = f"Recordings made {how} the effects ({made})"
+        plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
+        if part.failure_message:
+            text.append(f"{made} could not be predicted ({part.failure_message}).")
+            continue
+        text.append(f"{made} are predicted to {errors} (rms) {how} them, and to {plain} without a diagnosis.")
+        if not part.is_improved_by_counterfactual:
+            text.append("That is no better, so the effect may be a substitute for another cause.")
+    return text

@@ -19,12 +19,6 @@ from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, System
 from yid_ocp.registry import Registry
 
-REQUIRED_EXCITATION_PHRASES = (
-    *("how fast it moves", "how long it is held", "how hard it accelerates", "how far it bends"),
-    *("its orientation to gravity", "how hard it pulls at its ends", "when it is read", "the camera's pose"),
-    "how long it is",
-)
-"""What a motion must vary to excite an effect of the library, in the order in which messages list it."""
 _BAXTER_EFFORT_LIMIT = 50.0  # reference of the ranges of arm effects, which scale with the limit [N m]
 _SAME_POINT_DISTANCE = 1e-6  # points of arms nearer than this in all configurations count as one [m]
 _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -85,9 +79,8 @@ class EffectBase(Effect):
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
     equation: ClassVar[str] = ""  # equation that the kind adds, as text
-    # what a motion must vary to distinguish the kind from others: one of `REQUIRED_EXCITATION_PHRASES`, or text
-    # that continues "vary ..."
-    required_excitation: ClassVar[str] = ""
+    # what a motion must vary to distinguish the kind from others; the text continues "vary ..."
+    required_excitation: ClassVar[str] = "how it moves"
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
     # whether the effect at one location implies nothing about other locations, as for a mass (unlike friction)
     is_local: ClassVar[bool] = False

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
+from yid_ocp.display import abbreviated_names_text
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
@@ -18,7 +19,6 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
-    abbreviated_names_text,
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
+from yid_ocp.display import abbreviated_names_text
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
@@ -22,7 +23,6 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
-    abbreviated_names_text,
     discretisation_shift_sentences,
     format_error_value_and_unit,
     issue_summary_blocks,

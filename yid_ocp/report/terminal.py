@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +26,6 @@ _StatementKind = Literal["note", "verdict", "conclusion"]
 _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings side by side
 _MAX_NUMBERS_BEYOND_MODEL = 6  # numbers that a sentence lists; the table has all
-_MAX_NAMES_IN_LINE = 12  # parameters in a line; tables list all
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
@@ -254,33 +252,3 @@ def aligned_table_lines(rows: TableRows) -> list[str]:
     widths = [max(map(len, column)) for column in columns]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]
     return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
-
-
-def abbreviated_names_text(names: Sequence[str]) -> str:
-    """Join names in one line. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
-
-    A long line is cut, with the number of omitted names.
-    """
-    parts = [re.split(r"(\d+)", name) for name in names]
-    taken: set[int] = set()
-    said, left = list[str](), 0
-    for i, own in enumerate(parts):
-        if i in taken:
-            continue
-        longest, text = [i], names[i]
-        for at in range(1, len(own), 2):
-            run = [i]
-            for number in range(int(own[at]) + 1, int(own[at]) + len(names)):
-                following = [*own[:at], str(number), *own[at + 1 :]]
-                if following not in parts:
-                    break
-                run.append(parts.index(following))
-            if len(run) > max(2, len(longest)) and not taken.intersection(run):
-                end = parts[run[-1]][at]
-                longest, text = run, "".join([*own[: at + 1], "..", end, *own[at + 1 :]])
-        taken.update(longest)
-        if len(said) < _MAX_NAMES_IN_LINE:
-            said.append(text)
-        else:
-            left += len(longest)
-    return ", ".join(said) + (f" and {left} more" if left else "")

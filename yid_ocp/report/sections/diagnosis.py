@@ -187,7 +187,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
 
 def _events(finding: DiagnosisResult) -> _Chapter | None:
-    from yid_ocp.diagnosis.diagnosis_messages import ignored_after_overspeed_messages  # other commands need none of it
+    from yid_ocp.diagnosis.diagnosis_result import ignored_after_overspeed_messages  # other commands need none of it
 
     events = finding.events
     if not events:
@@ -369,12 +369,12 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     if not finding.accepted_effects or not finding.nominal_changes:
         return None
     rows, moved = [], []
-    for entry in finding.nominal_changes:
-        std, before, after = finding.nominal_model.std.get(entry.name, 0.0), entry.value_before, entry.value_after
-        values = {"fitted without the effects": (before, std), _EXTENDED_LABEL: (after, entry.std_after)}
-        rows.append((entry.name, entry.unit, values))
+    for name, entry in finding.nominal_changes.items():
+        std, before, after = finding.nominal_model.std.get(name, 0.0), entry["before"], entry["after"]
+        values = {"fitted without the effects": (before, std), _EXTENDED_LABEL: (after, entry["std"])}
+        rows.append((name, entry["unit"], values))
         if abs(after - before) > 0.1 * max(abs(before), 1e-9):
-            text = f"{entry.name} goes from {before:.3g} to {after:.3g} {entry.unit}"
+            text = f"{name} goes from {before:.3g} to {after:.3g} {entry['unit']}"
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
     shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
