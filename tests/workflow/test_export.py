@@ -12,6 +12,7 @@ import pytest
 
 from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import config_yaml_with_defaults
+from yid_ocp.virtual.mujoco_simulation import replay_mismatch_by_channel
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
@@ -208,7 +209,7 @@ def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
 
 
 def test_a_format_that_cannot_hold_all_is_refused_before_anything_is_replayed(cli, found, tmp_path) -> None:
-    done = cli("export", found, "--format", "urdf", "--out", tmp_path / "y.urdf")
+    done = cli("export", found, "--out", tmp_path / "y.urdf")  # the ending chooses the format
     assert done.code == 2
     assert "URDF cannot hold T1.bend, T1.twist, T2.bend" in done.err
     assert "grasp left" in done.err
@@ -217,9 +218,19 @@ def test_a_format_that_cannot_hold_all_is_refused_before_anything_is_replayed(cl
 
 
 def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path, exported) -> None:
-    assert cli("solve", pendulum, "--out", "run", "--set", "output.write_report=false").code == 0
+    said = ("--set", "output.write_report=false", "--set", "sensors.joints.effort.std=0.02")
+    assert cli("solve", pendulum, "--out", "run", *said).code == 0
     manifest = exported("run", tmp_path / "pendulum.xml")
     [(name, entry)] = manifest["gate"]["channels"].items()
     assert (name, entry["unit"]) == ("joints.effort", "N m")
     assert entry["after"] < 0.3 * entry["before"]
+    assert entry["noise"] == pytest.approx(0.02)  # as the settings state
+    assert manifest["parameters"]["shoulder.stiffness"]["estimated"]
     assert manifest["parameters"]["shoulder.stiffness"]["how"] == "stiffness of joints"
+    run = load_config(tmp_path / "run" / "config.yaml")
+    [recording] = read_recordings_of_role(run, "held_out")
+    rough = recording.joints.position + 1e-3 * np.random.default_rng(0).standard_normal(recording.joints.position.shape)
+    noisy = replace(recording, joints=replace(recording.joints, position=rough, position_std=None))
+    text = (tmp_path / "pendulum.xml").read_text(encoding="utf-8")
+    # noise that the recording does not state is smoothed: differentiated twice, it would be many times the torques
+    assert replay_mismatch_by_channel(text, build_system(run), noisy)["joints.effort"].rmse < 0.6

@@ -514,15 +514,15 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-export/1")
 def export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise an export: what the format cannot express, and the errors of the replay in MuJoCo."""
+    """Summarise an export: how the format expresses effects and estimates, and the errors of the replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
-    changed = {
+    listed = {
         name: entry
         for name, entry in manifest["parameters"].items()
-        if entry["status"] != "native" and name.rpartition(".")[0] not in effects
+        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
     }
     grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
-    entries = (manifest["effects"] | grasps | changed).items()
+    entries = (manifest["effects"] | grasps | listed).items()
     rows: TableRows = [("of the model", "in the file", "how, or why not")]
     yield SummaryTable([*rows, *((name, entry["status"], entry["how"]) for name, entry in entries)])
     gate = manifest["gate"]

@@ -450,7 +450,7 @@ def replay_mismatch_by_channel(
         commanded = _commanded(scene, system, t, joints.position_command[:, columns])
         return _errors(system, recording, joints, columns, commanded)
     balance = settle_to_equilibrium(scene, np.array(model.dof_damping))
-    noisy = joints.position_std is not None and bool(np.any(np.asarray(joints.position_std) > 0))
+    noisy = joints.position_std is None or bool(np.any(np.asarray(joints.position_std) > 0))
     path = _Path(moved, t, position, _SMOOTHING_SAMPLES if noisy else 0.0)
     if system.driven:
         return _errors(system, recording, joints, columns, _driven(scene, path, t, effort))

@@ -149,7 +149,7 @@ def propose_config_choices(
     known = [name for name in whole.joint_names if name in recorded.names]
     if not known:
         what = f"none of the recorded joints is in the URDF: {', '.join(recorded.names)}"
-        hint = f"rename them: --joints {recorded.names[0]}={whole.joint_names[0]},..."
+        hint = f"rename them at the import: --joints {recorded.names[0]}={whole.joint_names[0]},..."
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     tree = read_urdf(robot, joints=known)
     arms = tuple(sorted(_arms(tree), key=lambda arm: -_travel(first, arm.joints)))

@@ -31,6 +31,7 @@ from yid_ocp.files import attributes_by_name, file_sha256, to_json_types, write_
 from yid_ocp.model.system import System
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
+from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
     REPLAY_FEEDBACK_BANDWIDTH,
@@ -46,6 +47,7 @@ from yid_ocp.workflow.run_folder import software_and_plugin_versions
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
+_FORMAT_BY_ENDING = {"": "mjcf", "xml": "mjcf", "yml": "yaml", "world": "sdf"}  # of other endings, the ending itself
 _MCAP = "mcap"
 _PREDICTION_TOPICS: Mapping[str, Mapping[str, str]] = {
     SOLVE_TRAJECTORIES_FORMAT: {"predicted": "predicted"},
@@ -60,8 +62,10 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `export` and return its exit code."""
     source, form, out = Path(arguments.source), arguments.format, arguments.out
     if source.is_dir() and form not in ("csv", _MCAP):
+        ending = Path(out).suffix[1:].lower()
+        form = form or _FORMAT_BY_ENDING.get(ending, ending)
         with stderr_progress_display(arguments) as progress:
-            manifest = _export_model(source, Path(out), form or "mjcf", arguments.lossy, progress)
+            manifest = _export_model(source, Path(out), form, arguments.lossy, progress)
         print_result(arguments, manifest, lambda: summary_terminal_lines(export_summary(manifest)), out, out)
         return EXIT_DONE
     if source.is_dir() and form == "csv":
@@ -148,7 +152,8 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     if form not in _MODEL_FORMATS:
         why = "mjcf: UsdPhysics has no schema for cables yet, nor springs on joints that turn about three axes"
         hint, allowed = why if form == "usd" else "", ", ".join(_MODEL_FORMATS)
-        raise ConfigError(f"there is no format '{form}'", where="--format", allowed=allowed, hint=hint)
+        where = "--format, or the ending of --out"
+        raise ConfigError(f"there is no format '{form}'", where=where, allowed=allowed, hint=hint)
     calibrated = _read_calibrated_model(folder)
     progress.begin_stage("building the model")
     full = calibrated.system()
@@ -251,6 +256,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         if not recordings:
             return {"status": "not done", "reason": "the run has no recordings"}
         nominal = calibrated.system([f"{e.kind}@{e.location}" for e in system.effects], nominal=True)
+        recordings = [_with_configured_noise(own, nominal, calibrated.settings.sensors) for own in recordings]
         before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
         after = _replayed(text, system, recordings, progress, 1)
     except (DataError, ModelError) as error:
@@ -267,6 +273,28 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         "channels": channels,
         "fall": _fall([(before[name], error) for name, error in after.items()]),
     }
+
+
+def _with_configured_noise(recording: Recording, system: System, sensors: Mapping[str, SensorOptions]) -> Recording:
+    """The recording with the noise that settings state, and without the sensors that they leave out."""
+    angle, effort = (sensors.get(f"joints.{name}", SensorOptions()) for name in ("position", "effort"))
+    joints, points = recording.joints, []
+    if joints is not None:
+        joints = replace(joints, position_std=_stated_std(angle, joints.names, joints.position_std))
+        if effort.use is False and not system.driven:
+            joints = replace(joints, effort=None, effort_std=None, effort_bias_std=None)
+        elif joints.effort is not None:
+            joints = replace(joints, effort_std=_stated_std(effort, joints.names, joints.effort_std))
+    for group in recording.points:
+        choice = sensors.get(group.name, SensorOptions())
+        own = group if choice.std is None else replace(group, std=np.full(group.position.shape, choice.std))
+        points += [own] if choice.use is not False else []
+    return replace(recording, joints=joints, points=tuple(points))
+
+
+def _stated_std(choice: SensorOptions, names: Sequence[str], recorded: float | Array | None) -> float | Array | None:
+    std = choice.std
+    return np.array([std.get(name, 0.0) for name in names]) if isinstance(std, Mapping) else std or recorded
 
 
 def _replayed(
