@@ -318,6 +318,11 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
+    small = {"T1.bend": replace(found["T1.bend"], value=2.2e-5, std=5e-7)}
+    told_small = prediction_outputs.copyable_estimate_texts(
+        problem, SimpleNamespace(x=None, parameters=small), "runs/a"
+    )
+    assert told_small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & N m/rad \\"]
     assert told["export"] == "yid-ocp export runs/a --out model.xml"
     lost = {"T1.twist": found["T1.twist"]}
     assert prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=lost), "runs/a") == {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,18 +91,18 @@ def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, fold
             low, high, links = float(stiffness.min()), float(stiffness.max()), len(layout.link_joints)
             known = {"segment": layout.name, "deformation": deformation, "links": links}
             joints.append(known | {"lowest": low, "highest": high})
-            same = f'stiffness="{low:.4g}"' if high - low < 1e-9 * high else f'stiffness="{low:.4g}" to "{high:.4g}"'
-            lines.append(
-                f"<joint {same}/> <!-- {layout.name} {deformation}, {links} links; n links: times n/{links} -->"
-            )
+            note = f"{layout.name} {deformation}, {links} links; n links: times n/{links}"
+            note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
+            lines.append(f'<joint stiffness="{np.median(stiffness):.4g}"/> <!-- {note} -->')
     return {
         "values": [f"{n} = {e.value:.4g} ± {e.std:.2g} {e.unit}" for n, e in found.items()],
         "joints": joints,
         "yaml": ["parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
         "mjcf": lines,
         "latex": [
-            f"{n.replace('_', chr(92) + '_')} & ${e.value:.4g} \\pm {e.std:.2g}$ & {e.unit} \\\\"
+            re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row)
             for n, e in found.items()
+            for row in [f"{n.replace('_', chr(92) + '_')} & ${e.value:.4g} \\pm {e.std:.2g}$ & {e.unit} \\\\"]
         ],
         "export": f"yid-ocp export {folder} --out model.xml",
         "cite": "CITATION.cff of yid_ocp, and Caldwell, Coleman and Correll (ISER 2014) for the problem",
