@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PAGE = REPOSITORY / "docs" / "explain" / "comparison.md"
+PAGE = REPOSITORY / "docs" / "reference" / "comparison_results.md"
 CHART = REPOSITORY / "docs" / "pictures" / "peers.png"
 BEGIN, END = "<!-- peers: begin -->", "<!-- peers: end -->"
 HELD_OUT = {"springs": (1e3, "mm"), "servo": (1.0, "rad")}  # scale and unit; torques elsewhere

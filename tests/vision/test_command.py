@@ -179,8 +179,8 @@ def test_the_settings_exist(repository):
     known = {field.name for field in dataclasses.fields(options)}
     for part in ("filters", "skeleton", "shape_fit", "clock", "calibration"):
         known |= {field.name for field in dataclasses.fields(getattr(options, part))}
-    _, _, table = text.partition("| stage |")
-    rows = [line for line in table.splitlines()[1:] if line.startswith("| ") and line.count("|") == 4]
-    named = [name for row in rows for name in re.findall(r"`([\w.]+)`", row.split("|")[3])]
+    _, _, table = text.partition("| stage | settings")
+    rows = [line for line in table.partition("\n\n")[0].splitlines()[2:] if line.startswith("| ")]
+    named = [name for row in rows for name in re.findall(r"`([\w.]+)`", row.split("|")[2])]
     assert len(named) > 20
     assert {name.rpartition(".")[2] for name in named} <= known
