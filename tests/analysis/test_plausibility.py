@@ -441,7 +441,7 @@ def test_what_is_a_little_off_or_at_rest_is_no_wrong_clock(arms, runs):
 )
 def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
     recording = with_points(runs[1], "points_camera", lambda p: factor * p)
-    found = point_distance_issues(arms[1], arms[1].system, arms[1].theta, recording, usual)
+    found = point_distance_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert doubt.limit_violation_ratio == pytest.approx(ratio, rel=1e-3)
