@@ -37,6 +37,7 @@ from yid_ocp.inference.uncertainty import (
     needs_no_profile_likelihood,
     parameter_estimates,
     parameter_verdict,
+    priors_that_determine_unknown,
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
 )
@@ -560,3 +561,20 @@ def test_the_noise_floor_is_the_median_of_each_channel():
     assert set(found) == {"points.a", "points.b"}
     assert (found["points.a"].noise_std, found["points.a"].n_samples) == (3.0, 5)
     assert (found["points.b"].noise_std, found["points.b"].n_samples, found["points.b"].unit) == (9.0, 1, "m")
+
+
+@pytest.mark.parametrize(("own_part", "named"), [(0.0, [1, 2]), (1.0, [])])
+def test_a_mass_that_scales_with_a_motor_is_known_by_the_motors_priors(own_part, named):
+    """Unknowns: mass, gain, back-EMF, zero angle, viscous friction, which takes the place of the back-EMF."""
+    gain, speed, zero, own = 50 * np.random.default_rng(0).standard_normal((4, 200))
+    data = np.stack([-(gain + speed) + own_part * own, gain, speed, zero, speed], axis=1)
+    priors = np.zeros((3, 5))
+    priors[[0, 1, 2], [1, 2, 3]] = 4.0, 4.0, 1.0
+
+    def determined_by(count, column, known=priors):
+        mask = priors_that_determine_unknown(data[:, :count], known[:, :count], column)
+        return np.flatnonzero(mask).tolist()
+
+    assert determined_by(4, 0) == named
+    assert determined_by(5, 0) == named[:1]
+    assert determined_by(4, 3) == determined_by(4, 0, priors[:0]) == []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from yid_ocp.arrays import Array, IntArray
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import (
     DEFAULT_EXCESS_RESIDUAL_CRITERIA,
@@ -41,6 +41,8 @@ _MIN_CLUSTER_RECORDINGS, _MIN_CLUSTER_CHANNELS = 4, 8
 _MIN_COST_RISE_RATIO = 0.5
 # With more parameters, two rollouts per parameter take longer than the search itself.
 _MAX_CHECKED_PARAMETERS = 12
+_PRIOR_STD_RATIO = 3.0  # factor on a standard deviation without priors, from which on priors determine an unknown
+_MIN_PRIOR_SHARE = 0.5  # of the largest deviation from a prior [stds], from which on another prior is named, too
 
 
 @dataclass(frozen=True)
@@ -473,3 +475,26 @@ def interval_text(lower: float | None, upper: float | None) -> str:
     if lower is None:
         return f"below {upper:.4g}"
     return f"above {lower:.4g}" if upper is None else f"{lower:.4g} to {upper:.4g}"
+
+
+def priors_that_determine_unknown(data: Array, priors: Array, column: int) -> BoolArray:
+    """Mask (nx,) of the unknowns whose priors determine the unknown `column`; all False if the data determine it.
+
+    `data` (n, nx) and `priors` (k, nx) are Jacobians of whitened residuals. An unknown is determined by priors if its
+    standard deviation without them is more than `_PRIOR_STD_RATIO` times as large. The others can then change with
+    it and leave the predictions as they are. The mask has those that this moves away from their priors most.
+    """
+    others = np.arange(data.shape[1]) != column
+    found, whole = np.zeros(len(others), bool), np.vstack([data, priors])
+    size = np.linalg.norm(whole[:, others], axis=0)
+    scale = np.where(size > 0, 1 / np.maximum(size, 1e-300), 0.0)
+
+    def left(rows: Array) -> tuple[Array, float]:
+        moved = np.linalg.lstsq(rows[:, others] * scale, rows[:, column], rcond=1e-9)[0] * scale
+        return np.asarray(moved), float(np.sum((rows[:, column] - rows[:, others] @ moved) ** 2))
+
+    (_, by_data), (moved, by_all) = left(data), left(whole)
+    away = np.abs(moved) * np.linalg.norm(priors[:, others], axis=0)
+    if _PRIOR_STD_RATIO**2 * by_data < by_all and away.any():
+        found[others] = away >= _MIN_PRIOR_SHARE * away.max()
+    return found
