@@ -35,6 +35,7 @@ from yid_ocp.diagnosis.verdict import (
     _compare,
     _explained_fraction,
     _inflate_fit_stds_by_disagreement,
+    _probability,
     _verdict_and_reason,
 )
 from yid_ocp.display import NULL_PROGRESS
@@ -167,6 +168,26 @@ def judged(changed):
 )
 def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
     assert judged(changed)[1] == reason
+
+
+def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_more():
+    def sure(explained, effects=(added(ONE),), checks=()):
+        return _probability(Judgement("", "", (), effects, CERTAIN, explained, checks), LIMITS)
+
+    assert sure(1.0, ()) == 0.0
+    assert 0.9 < sure(1.0) < 1.0
+    assert sure(1.0) > sure(0.9) > sure(0.6) > sure(0.5) > sure(0.4) >= sure(-3.0) > 0.0
+    assert sure(1.0) > sure(1.0, TWO) > sure(1.0, THREE)
+    assert sure(1.0, TWO) > sure(0.9, TWO)
+    assert sure(1.0, ONE_LAW) == sure(1.0)
+    assert sure(1.0, checks=(carried(),)) == sure(0.0)
+
+
+def test_equivalent_effects_share_the_probability_of_their_set():
+    entry = replace(added(ONE, [OTHER]), shares=(0.7, 0.3))
+    said = Judgement("confusable", "", (), (entry, added(THIRD)), CERTAIN, 1.0, (), probability=0.9)
+    expected = {ONE.label: 0.63, OTHER.label: 0.27, THIRD.label: 0.9}
+    assert said.candidate_probabilities == pytest.approx(expected)
 
 
 @cases(

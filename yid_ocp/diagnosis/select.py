@@ -146,7 +146,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     fewer = (other.effect_parameter_count - fit.effect_parameter_count) * (best.chi2_per_sample > _MODEL_ERROR_CHI2)
     if lost <= math.expm1(fewer * math.log(count) / count) * best.chi2_per_sample:
         return 0.0
-    ratios = np.log(np.maximum(loss.block_chi2, 1.0) / np.maximum(best.block_chi2, 1.0))
+    ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
     spread = float(np.std(ratios, ddof=1)) / math.sqrt(count)
     least = _LOSS_RTOL * best.chi2_per_sample
     return max(lost / max(error, least), float(ratios.mean()) / max(spread, _LOSS_RTOL))

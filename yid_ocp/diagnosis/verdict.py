@@ -29,6 +29,8 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
 
+_LOGISTIC_OFFSET, _LOGISTIC_SLOPE = 0.3, 1.3  # of the probability of effects over the logarithm of what is unexplained
+_MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
 
@@ -109,6 +111,7 @@ class Judgement:
     gap_closure: GapClosure
     explained_fraction: float  # decrease of r'r by the effects over that by the smoother
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
+    probability: float = 0.0  # that the selected effects, or effects that are equivalent to them, are the cause
 
     @property
     def accepted_selections(self) -> tuple[SelectedEffect, ...]:
@@ -137,6 +140,21 @@ class Judgement:
             most = max(part, most)
         return closed
 
+    @property
+    def candidate_probabilities(self) -> dict[str, float]:
+        """By label, the probability that a candidate is a cause; without the candidates that others exclude."""
+        return {
+            effect.label: self.probability * share
+            for entry in self.selected_effects
+            for effect, share in zip(entry.equivalent_effects, entry.shares, strict=True)
+        }
+
+    @property
+    def best_explained_fraction(self) -> float:
+        """Fraction of the gap that effects explain, fitted or, if there is one assumption, surely held out."""
+        held_out = self.gap_closure.ci_low if self.assumption_count == 1 else 0.0
+        return max(self.explained_fraction, held_out)
+
     def required_explained_fraction(self, limits: Thresholds) -> float:
         """Fraction of the smoother's explanation that the effects are required to explain.
 
@@ -154,9 +172,7 @@ def _verdict_and_reason(
         return "insufficient_data", ""
     if not said.selected_effects:
         return ("unknown", "none") if has_gap else ("no_gap", "")
-    # one effect may instead close enough of other motions
-    held_out = said.gap_closure.ci_low if said.assumption_count == 1 else 0.0
-    if max(said.explained_fraction, held_out) < said.required_explained_fraction(limits):
+    if said.best_explained_fraction < said.required_explained_fraction(limits):
         return "unknown", "little"
     if said.failed_transfer_checks:
         return "unknown", "stand_in"
@@ -197,7 +213,20 @@ def judge(
     said = Judgement("", "", fits, added, total, explained, carried)
     is_seen = any(entry.is_detectable for entry in evidence.screening.detectability)
     verdict, reason = _verdict_and_reason(said, has_gap, enough and is_seen, limits)
-    return replace(said, verdict=verdict, unknown_reason=reason)
+    return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
+
+
+def _probability(said: Judgement, limits: Thresholds) -> float:
+    """Probability that the selected effects are the cause, from how much they explain of what is required.
+
+    A logistic curve fitted to simulated recordings of known cause; see `docs/design/verdicts.md`.
+    """
+    if not said.selected_effects:
+        return 0.0
+    explained = 0.0 if said.failed_transfer_checks else said.best_explained_fraction
+    unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
+    margin = math.log((1.0 - said.required_explained_fraction(limits)) / unexplained)
+    return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
 
 
 def _explained_fraction(
