@@ -224,6 +224,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "screening": screening([score(of, p=1e-9, decrease=100.0, statistic=40.0)]),
         "are_offsets_stated": False,
         "explained_fraction": 1.0,
+        "probability": 0.9,
         "transfer_checks": (),
         "smoother_result": smoothed({FORCE: 9.0, BIAS: 9.0}, evidence={"plant": 9.0, "sensor": 9.0, "both": 20.0}),
         "gap_locations": (place(),),

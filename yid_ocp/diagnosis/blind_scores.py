@@ -547,7 +547,7 @@ def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> 
             case.locate,
         )
     except UnrecordedRefitError:
-        judged = Judgement(_NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, ())
+        judged = Judgement(_NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, (), 0.0)
     where = () if case.located_gap is None else case.located_gap.locations
     if judged.accepted_selections:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])

@@ -111,7 +111,7 @@ class Judgement:
     gap_closure: GapClosure
     explained_fraction: float  # decrease of r'r by the effects over that by the smoother
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
-    probability: float = 0.0  # that the selected effects, or effects that are equivalent to them, are the cause
+    probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
 
     @property
     def accepted_selections(self) -> tuple[SelectedEffect, ...]:
@@ -210,7 +210,7 @@ def judge(
         carried = _check_effect_amplitude_transfer(search, last)
         added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
     finished("carry_over")
-    said = Judgement("", "", fits, added, total, explained, carried)
+    said = Judgement("", "", fits, added, total, explained, carried, 0.0)
     is_seen = any(entry.is_detectable for entry in evidence.screening.detectability)
     verdict, reason = _verdict_and_reason(said, has_gap, enough and is_seen, limits)
     return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
