@@ -57,6 +57,7 @@ def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float 
     named = [{"kind": effect.kind, "location": effect.location} for effect in effects] if verdict == "effect" else []
     result = {
         "verdict": verdict,
+        "probability": 0.9,
         "effects": named,
         "which": [{**entry, "parameters": {}} for entry in named],
         "where": [],

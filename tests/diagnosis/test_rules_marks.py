@@ -43,6 +43,7 @@ def said(verdict="effect", effects=(), which=None, where=(), confusable=(), clos
     listed = effects if which is None else which
     return {
         "verdict": verdict,
+        "probability": 0.9 if effects else 0.0,
         "effects": [pair(t) for t in effects],
         "which": [pair(t) | {"parameters": (values or {}).get(t, {})} for t in listed],
         "where": [{"location": p} for p in where],
@@ -192,6 +193,20 @@ def test_rates_are_over_the_cases_that_they_speak_of():
     assert (none["cases"], {none[name] for name in rates}) == (0, {None})
     assert all(entry["rate"] is None for entry in none["intervals"].values())
     assert none["confusion"]["counts"] == []
+
+
+def test_probabilities_are_compared_with_how_often_sets_hold_the_cause():
+    marks = [marked("single", probability=p, is_cause_in_sets=p > 0.5) for p in (0.1, 0.2, 0.9, 0.7, 0.8)]
+    found = blind_scores._calibration_rates([*marks, marked("single", answer="-", probability=0.0)])
+    assert [own["level"] for own in found["probabilities"]] == pytest.approx([0.1, 0.2, 0.7, 0.8, 0.9])
+    assert [own["rate"] for own in found["probabilities"]] == [0.0, 0.0, 1.0, 1.0, 1.0]
+    assert found["expected_calibration_error"] == pytest.approx((0.1 + 0.2 + 0.3 + 0.2 + 0.1) / 5)
+    assert blind_scores._calibration_rates([])["expected_calibration_error"] is None
+    # large sets and sets of each cause of a pair count, which are not right answers
+    wide = score_blind_case(SINGLE, alike([WRONG], [WRONG, "a@b", "c@d", RIGHT]))
+    assert (wide.right, wide.is_cause_in_sets, wide.probability) == (False, True, 0.9)
+    assert not score_blind_case(PAIR, said("effect", [RIGHT])).is_cause_in_sets
+    assert not score_blind_case(OUTSIDE, said("effect", [RIGHT])).is_cause_in_sets
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,8 @@ class BlindCaseScore:
     experiment: str = ""
     z: Mapping[str, float] = field(default_factory=dict)  # (estimate - truth)/std of the same parameters
     p_value: float = math.nan  # p-value of the null test on the held-out recordings
+    probability: float = 0.0  # that the named sets hold the cause
+    is_cause_in_sets: bool = False  # whether they do, with one set for each true effect
 
     @property
     def _named_effect_labels(self) -> tuple[str, ...]:
@@ -142,6 +144,8 @@ def score_blind_case(
         experiment=label.experiment,
         z=z,
         p_value=_or_nan(before.get("p_value")),
+        probability=float(result["probability"]),
+        is_cause_in_sets=bool(true) and _found(true, named, groups, math.inf),
     )
 
 
@@ -149,13 +153,17 @@ def _or_nan(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]]) -> bool:
-    """Whether each true effect has its own named effect: itself, or one in a small confusable set with it."""
+def _found(
+    true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]], most: float = _MAX_CONFUSABLE_SET
+) -> bool:
+    """Whether each true effect has its own named effect: itself, or one in a set of at most `most` with it."""
     if not true:
         return True
-    small = [group for group in groups if len(group) <= _MAX_CONFUSABLE_SET]
+    small = [group for group in groups if len(group) <= most]
     sets = [{name, *(label for group in small if name in group for label in group)} for name in named]
-    return any(true[0] in own and _found(true[1:], [*named[:i], *named[i + 1 :]], groups) for i, own in enumerate(sets))
+    return any(
+        true[0] in own and _found(true[1:], [*named[:i], *named[i + 1 :]], groups, most) for i, own in enumerate(sets)
+    )
 
 
 def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
@@ -249,11 +257,19 @@ def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 
 def _calibration_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """The empirical coverage of parameter intervals and of p-values of clean recordings."""
+    """The empirical coverage of intervals and of p-values of clean recordings, and of the probabilities of named sets.
+
+    Probabilities are compared in five bins of equal counts with how often the sets hold the cause.
+    """
     z = [abs(value) for m in marks if m.category == "single" for value in m.z.values()]
     p = [m.p_value for m in marks if m.category == "null" and math.isfinite(m.p_value)]
     quantiles = {a: float(scipy.stats.norm.ppf(0.5 * (1 + a))) for a in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)}
+    named = sorted((m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-")
+    bins = [own for own in np.array_split(np.array(named, float).reshape(-1, 2), 5) if len(own)]
+    errors = [abs(float(np.sum(own[:, 0] - own[:, 1]))) for own in bins]
     return {
+        "probabilities": [{"level": float(own[:, 0].mean()), **_binomial_proportion([*own[:, 1]])} for own in bins],
+        "expected_calibration_error": sum(errors) / len(named) if named else None,
         "intervals": [{"level": a, **_binomial_proportion([x <= q for x in z])} for a, q in quantiles.items()],
         "p_values": [{"level": a, **_binomial_proportion([x < a for x in p])} for a in (0.01, 0.05, 0.1, 0.2, 0.5)],
     }

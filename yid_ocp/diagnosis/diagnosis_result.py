@@ -142,6 +142,7 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
     rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
     found = {
         "verdict": judged.verdict,
+        "probability": judged.probability,
         "gap": {"before": before, **_closure(judged.gap_closure if added else UNDEFINED_GAP_CLOSURE)},
         "where": [attributes_by_name(place, _PLACE) for place in where],
         "which": _ranked_candidates(judged, seen),
@@ -200,6 +201,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
             **attributes_by_name(effect, _EFFECT),
             "parameters": {name: attributes_by_name(own, "value std unit") for name, own in reported.items()},
             **attributes_by_name(score, "score=lm_statistic p_value"),
+            "probability": judged.candidate_probabilities.get(effect.label, 0.0),
             **_closure(closures.get(effect.label, UNDEFINED_GAP_CLOSURE)),
         }
         listed.setdefault(effect.label, to_json_types(entry))

@@ -156,6 +156,7 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         ("closure over that of the true effect refitted", _share(result["closure_of_best"])),
         ("median error of the effects' parameters", _share(result["parameter_error"], 1)),
         ("their 95 % intervals that contain the true value", sure["interval_coverage"]),
+        ("expected calibration error", _number(result["calibration"]["expected_calibration_error"], ".3f")),
         ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
     ]
     sizes: TableRows = [
@@ -168,6 +169,8 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     for name, own in result["experiments"].items():
         counts = (str(own["cases"]), str(own.get("not_judged", 0)))
         experiments.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
+    sure_of: TableRows = [("probability of the named sets, by fifths of the cases", "sets that hold the cause")]
+    sure_of += [(f"{own['level']:.2f}", _rate(own)) for own in result["calibration"]["probabilities"]]
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
     cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
     for entry in result["marks"]:
@@ -177,7 +180,8 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         place = (", ".join(entry["confusable"]) or "-", "right" if entry["location_first"] else "-")
         shares = (_share(entry["closure"]), _share(entry["best"]))
         cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
-    tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
+    tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Probabilities": sure_of}
+    tables["Cases"] = cases
     if (rescored := result.get("rescored")) is not None:
         head = ("case", "truth", "then", "now")
         differ: TableRows = [head, *(tuple(own[key] for key in head) for own in rescored["changed"])]

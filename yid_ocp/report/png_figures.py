@@ -62,6 +62,7 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> list[Path]:
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="grey", linewidth=1)
     labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
+    labels["probabilities"] = "probabilities of named sets"
     levels = {label: [own for own in result["calibration"][key] if own["of"]] for key, label in labels.items()}
     _draw_rates(axes, {label: {own["level"]: own for own in known} for label, known in levels.items()}, "upper left")
     axes.set(xlabel="promised", ylabel="kept")
