@@ -316,6 +316,8 @@ def _causes(result: DiagnosisResult) -> list[str]:
         text.append(f"{names} {verb} {part}.")
     for own, *others in (entry.equivalent_effects for entry in result.accepted_selections):
         text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
+    if result.accepted_effects:
+        text.append(f"The probability that this names the cause is {100 * result.probability:.0f} %.")
     if result.verdict == "unknown":
         explained, enough = 100 * result.explained_fraction, 100 * result.required_explained_fraction(limits)
         apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
