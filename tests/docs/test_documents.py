@@ -28,6 +28,7 @@ from yid_ocp.files import file_sha256
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram
 from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.init import _object_from_arguments
 
 
 @pytest.fixture
@@ -86,7 +87,9 @@ def test_every_command_that_is_printed_is_understood(repository):
     for file in [repository / "README.md", *repository.glob("docs/**/*.md")]:
         for _, *arguments in printed_commands(file.read_text(encoding="utf-8")):
             try:
-                parser.parse_args(arguments)
+                parsed = parser.parse_args(arguments)
+                if arguments[0] == "init":
+                    _object_from_arguments(parsed)  # has all the numbers that it needs
             except (SystemExit, ConfigError) as error:
                 pytest.fail(f"{file.name}: {' '.join(arguments)}: {error}")
             named = [word for word in arguments if re.fullmatch(r"configs/\w+\.yaml", word)]

@@ -118,6 +118,27 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     assert len(bare) <= 6, bare  # what has no comment is said by the line above it
 
 
+def test_the_first_lines_of_the_readme_run_as_printed(bench: Path, repository: Path) -> None:
+    recording = moved(np.arange(0, 2, 1 / RATE))
+    (bench / "my_robot.urdf").write_text(URDF)
+    joints, [points] = recording.joints, recording.points
+    assert joints is not None
+    table = np.column_stack([joints.t, joints.position])
+    np.savetxt("joints.csv", table, header="time,q_roll,q_pitch", comments="", delimiter=",")
+    table = np.column_stack([points.t, points.position.reshape(len(points.t), -1)])
+    header = "time," + ",".join(f"{name}_{axis}" for name in points.names for axis in "xyz")
+    np.savetxt("mocap.csv", table, header=header, comments="", delimiter=",")
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    commands = re.search(r"```text\n(yid-ocp import .*?)```", text, re.S)
+    assert commands is not None
+    lines = [line.split()[1:] for line in commands[1].splitlines()]
+    assert [words[0] for words in lines] == ["import", "init", "check", "solve", "diagnose"]
+    for words in lines[:2]:  # the others run a configuration
+        assert main(words) == 0
+    assert {words[1] for words in lines[2:]} == {"run.yaml"}
+    build_system(load_config("run.yaml"))
+
+
 def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
