@@ -213,11 +213,6 @@ def attributes_by_name(value: Any, names: str) -> dict[str, Any]:
     return {key: getattr(value, name or key) for key, _, name in pairs}
 
 
-def object_attributes_to_json_dict(value: Any, names: str) -> dict[str, Any]:
-    """Return an object's attributes as JSON data, by name. `names` is as in `attributes_by_name`."""
-    return dict(to_json_types(attributes_by_name(value, names)))
-
-
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
     """Restore a dataclass instance from data of `to_lossless_plain_data`."""
     return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})

@@ -218,7 +218,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
     alone = fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})
     usual = {
         "verdict": verdict,
-        "noise_floor": (AssumedChannelNoiseLevel("points.tip", "m", 0.001, 100),),
+        "noise_floor": (AssumedChannelNoiseLevel("points.tip", "m", 0.001),),
         "nominal_test": outcome(p=1e-9, chi2=2.0),
         "nominal_held_out_test": outcome(p=1e-8, chi2=2.1),
         "screening": screening([score(of, p=1e-9, decrease=100.0, statistic=40.0)]),

@@ -60,7 +60,7 @@ def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
     made = finding(
         "unknown",
         nominal_model=fit(lost=loss(2.0, channels=errors)),
-        noise_floor=tuple(AssumedChannelNoiseLevel(*own[:3], 100, own[3]) for own in levels),
+        noise_floor=tuple(AssumedChannelNoiseLevel(*own) for own in levels),
     )
     size = math.sqrt(0.02**2 - 3 * 0.001**2)
     said = f"model error: 0 N m (rms) at joints.effort.elbow, {size:.2g} m (rms) at points.end."

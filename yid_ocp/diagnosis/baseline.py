@@ -60,11 +60,8 @@ class _ParameterShift:
 class EarlierRunsComparison:
     """Comparison of a fit with baseline runs: their agreement, and the shift of every parameter."""
 
-    baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
-    is_baseline_explained: bool  # whether the model explained their recordings
-    baseline_effects: tuple[str, ...]  # labels of the runs' effects that the model keeps
-    between_runs_chi2: float  # chi2 of the differences between earlier runs; zero, with p-value one, for one run
-    between_runs_p_value: float
+    is_baseline_explained: bool  # whether the model explained the earlier runs' recordings
+    between_runs_p_value: float  # of the differences between earlier runs; one for one run
     parameter_shifts: tuple[_ParameterShift, ...]
 
     @property
@@ -108,8 +105,6 @@ class EarlierRunsBaseline:
     """Combined estimates of earlier runs, and reference recordings made without the sought effect."""
 
     combined_estimates: RunEstimates | None  # all earlier runs together
-    baseline_runs: tuple[str, ...]
-    between_runs_chi2: float  # chi2 of the differences between the runs
     between_runs_p_value: float
     reference_recordings: tuple[Recording, ...]
 
@@ -117,11 +112,9 @@ class EarlierRunsBaseline:
     def from_runs(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> EarlierRunsBaseline:
         """Make a baseline from the estimates of several runs and from reference recordings `without` the effect."""
         if not runs:
-            return EarlierRunsBaseline(None, (), 0.0, 1.0, without)
+            return EarlierRunsBaseline(None, 1.0, without)
         known, chi2, degrees = pool_estimates_and_chi2(runs)
-        return EarlierRunsBaseline(
-            known, tuple(run.run_name for run in runs), chi2, chi2_p_value(chi2, degrees), without
-        )
+        return EarlierRunsBaseline(known, chi2_p_value(chi2, degrees), without)
 
     def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> EarlierRunsComparison | None:
         """Compute the shifts of a fit's parameters from its baseline prior. None if there are no runs."""
@@ -145,9 +138,7 @@ class EarlierRunsBaseline:
                 p = float(2 * scipy.special.ndtr(-abs(score)))
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, fit.std[name])
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
-        between = (self.between_runs_chi2, self.between_runs_p_value)
-        labels = tuple(baseline.effects)
-        return EarlierRunsComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
+        return EarlierRunsComparison(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
     def fit_parameters_differ_significantly(self, fit: RefittedModel, limits: Thresholds) -> bool:
         """Whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""

@@ -50,7 +50,6 @@ class AssumedChannelNoiseLevel:
     channel: str
     unit: str
     noise_std: float
-    n_samples: int
     outputs_per_channel: int = 1  # coordinates of a point
 
     @property
@@ -92,9 +91,7 @@ def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedCha
                 told[channel] = samples.sensor.unit, samples.sensor.outputs_per_channel
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
     return tuple(
-        AssumedChannelNoiseLevel(c, told[c][0], float(np.median(v)), len(v), told[c][1])
-        for c, v in joined.items()
-        if len(v)
+        AssumedChannelNoiseLevel(c, told[c][0], float(np.median(v)), told[c][1]) for c, v in joined.items() if len(v)
     )
 
 
