@@ -60,7 +60,7 @@ CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.ya
 SOUGHT = "T3.bend"
 OPTIONS = PlanOptions(
     goal="information",
-    identify=(SOUGHT,),
+    parameters_to_identify=(SOUGHT,),
     duration=3.5,
     hold_duration=0.5,
     n_spline_coefficients=28,
@@ -138,7 +138,9 @@ def pair(name: str, starts: int, share: float) -> None:
     values, sizes = _parameter_and_effect_values(before.to_dict())
     planned = []
     for seed in (0, 100):
-        options = replace(OPTIONS, identify=None, discriminate=labels, n_random_starts=starts, seed=seed)
+        options = replace(
+            OPTIONS, parameters_to_identify=None, effects_to_discriminate=labels, n_random_starts=starts, seed=seed
+        )
         plan = plan_informative_motion(problem, options, values, sizes, StderrLogLinesProgress())
         for (first, second), (then, now) in plan.effect_distances.items():
             print(f"seed {seed}: {first} beside {second}: {then:.3g} std in the recording, {now:.3g} in the plan")

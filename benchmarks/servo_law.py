@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from yid_ocp.analysis import friction_ladder as ladder
+from yid_ocp.analysis import friction_law_comparison as ladder
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import FrictionLawSettings

@@ -97,7 +97,7 @@ def _speed(config: Path, folder: Path) -> tuple[str, ...]:
         _camera_scene(run, build_system(run)), recording, read_frame_folder(folder), run.track.options
     )
     begun = time.process_time()
-    common = tracker.estimate_sequence_calibration()
+    common = tracker.estimate_shared_values()
     shared, begun = time.process_time() - begun, time.process_time()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
     each = (time.process_time() - begun) / len(frames)

@@ -85,7 +85,7 @@ virtual_arm: {friction_law: load, max_relative_link_mass_error: 0.03, encoder_co
     **{section: text for kind in OBJECT_KINDS for section, text in OBJECT_KINDS[kind].settings_examples.items()},
     "The file": """\
 description: A cable of 1 m, swung by a UR5
-model: {robot: package:ur5, object: {kind: segments, segments: {cable: {length: 1.0, mass: 0.1, radius: 0.005}}}}
+model: {robot: package:ur5, object: {kind: segments, named_segments: {cable: {length: 1.0, mass: 0.1, radius: 0.005}}}}
 recordings: {estimate: [swing.h5], held_out: [other_swing.h5]}
 parameters: {cable.bend: {free: true, initial: 0.05}, cable.damping: {free: true}}
 """,
@@ -217,7 +217,7 @@ track:
 """,
     "track.options": """\
 track:
-  options: {max_point_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
+  options: {max_mean_surface_distance_in_radii: 0.7, tracked_points: [w_T1, w_T3]}
 """,
     "track.options.filters": """\
 track:
@@ -242,7 +242,7 @@ track:
     "track.options.clock": """\
 track:
   options:
-    clock: {initial_offset: 0.08, search_half_width: 0.05}      # [s]
+    clock: {initial_stamp_minus_joint_time: 0.08, search_half_width: 0.05}      # [s]
 """,
     "plan": """\
 plan:

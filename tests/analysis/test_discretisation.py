@@ -363,8 +363,8 @@ def test_what_is_said(decades, stable):
     said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
     assert said.keeps_errors_below_resolution is stable
     told = "grows by 29 % in a step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
-    assert said.description.startswith(f"run: the step of 0.005 s is {'' if stable else 'not '}stable")
-    assert said.description.endswith("along the motion" if stable else told)
+    assert said.stability_message.startswith(f"run: the step of 0.005 s is {'' if stable else 'not '}stable")
+    assert said.stability_message.endswith("along the motion" if stable else told)
 
 
 def test_a_recording_is_judged_by_its_name(pendulum):

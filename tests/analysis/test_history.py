@@ -17,7 +17,7 @@ from yid_ocp.analysis.estimate_history import (
     nearby_positive_definite_covariance,
     pool_estimates_and_chi2,
 )
-from yid_ocp.analysis.friction_ladder import (
+from yid_ocp.analysis.friction_law_comparison import (
     FrictionLawFit,
     cross_validate_friction_law,
     mean_and_std_error_over_motion_kinds,

@@ -91,7 +91,10 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("model:\n  object: {links: 4}\n", ["line 2: model.object"]),
         ("model:\n  object: {kind: cube}\n", ["there is no kind 'cube'"]),
         ("model:\n  object: 3\n", ["model.object = 3 is not a section"]),
-        ("model:\n  object:\n    kind: segments\n    segments: {a: {length: 1, radius: 0.1}}\n", ["'mass' is missing"]),
+        (
+            "model:\n  object:\n    kind: segments\n    named_segments: {a: {length: 1, radius: 0.1}}\n",
+            ["'mass' is missing"],
+        ),
         ("model:\n  grasp: {left: {holder_frame: x}}\n", ["'held_frame' is missing"]),
         ("model:\n  grasp: [left]\n", ["model.grasp"]),
         ("model:\n  gravity: [0, 0]\n", ["a list of 3"]),
@@ -171,7 +174,7 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
     file = written(SET)
     other = load_config(file, ["solver={name: single_shooting}"]).solver
     assert (other.name, other.max_iterations) == ("single_shooting", type(other)().max_iterations)
-    assert load_config(file, ["model.object={kind: segments, segments: {}}"]).model.object.kind == "segments"
+    assert load_config(file, ["model.object={kind: segments, named_segments: {}}"]).model.object.kind == "segments"
     assert load_config(file, ["model.object={kind: foam_y}"]).model.object.links == 3
     assert load_config(file, ["sensors={}"]).sensors == {}
     assert list(load_config(file, ["sensors=null", "sensors={camera: {use: false}}"]).sensors) == ["camera"]
@@ -218,7 +221,7 @@ ANY_NUMBER = {
     "track.options.filters.floor_height",
     "track.options.filters.floor_margin_above_object_foot",
     "track.options.filters.max_depth_behind_robot_base",
-    "track.options.clock.initial_offset",
+    "track.options.clock.initial_stamp_minus_joint_time",
 }
 
 

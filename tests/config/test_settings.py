@@ -38,7 +38,7 @@ def test_the_page_in_the_docs_is_current(repository, maker):
     for line in (
         f"| `time_step` | {STEP_WORDS} | a number above 0 up to 0.1 or auto [s] | `0.01` |",
         "## solver, name: multiple_shooting",
-        "## model.object.segments.NAME",
+        "## model.object.named_segments.NAME",
         "| `mass` | mass of the whole segment | a number above 0 [kg] | needed |",
     ):
         assert f"\n{line}\n" in page

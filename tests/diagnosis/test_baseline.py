@@ -26,7 +26,7 @@ model:
   object:
     kind: segments
     mount: {rpy: [0.0, 1.5707963267948966, 0.0]}
-    segments:
+    named_segments:
       beam: {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_given_as_rigidity: true,
              clamped_at_base: true, joint_axes: y}
 recordings: {estimate: [bare.h5]}
@@ -36,7 +36,7 @@ parameters:
 problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, initial_configuration_prior_std: 0.2,
           initial_velocity_prior_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
-output: {write_report: false, checked_discretisations: none}
+output: {write_report: false, discretisation_check: none}
 """
 NOISE, LOAD = 1e-4, 0.05
 TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}
@@ -71,7 +71,7 @@ def beam(tmp_path_factory):
 
 
 def diagnosed(beam, recording, out):
-    said = (f"recordings.estimate=[{recording}.h5]", "diagnosis.baseline=[old]")
+    said = (f"recordings.estimate=[{recording}.h5]", "diagnosis.baseline_run_folders=[old]")
     return run_diagnose(load_config(beam / "beam.yaml", said), out)
 
 

@@ -184,13 +184,13 @@ def test_a_law_has_a_place_and_a_quantity_there(system):
 def test_a_configuration_has_a_law_by_its_table(tmp_path):
     file = tmp_path / "law.csv"
     file.write_text(torque_law_tables_csv(tables()))
-    said = f"model.effects=[{{kind: law, location: T1, depends_on: angle, table: {file}}}]"
+    said = f"model.effects=[{{kind: law, location: T1, depends_on: angle, law_csv: {file}}}]"
     made = build_system(load_config(None, [said]))
     assert [effect.label for effect in made.effects] == ["law@T1"]
     assert made.parameters["law@T1.angle3"].value == pytest.approx(tables()[0].torque[3])
     for wrong, text in (
-        ("{kind: law, location: T1}", "lacks `table` or `depends_on`"),
-        (f"{{kind: kelvin_voigt, location: T1, table: {file}}}", "kelvin_voigt has `table` or `depends_on`"),
+        ("{kind: law, location: T1}", "lacks `law_csv` or `depends_on`"),
+        (f"{{kind: kelvin_voigt, location: T1, law_csv: {file}}}", "kelvin_voigt has `law_csv` or `depends_on`"),
     ):
         with pytest.raises(ConfigError, match=text):
             build_system(load_config(None, [f"model.effects=[{wrong}]"]))

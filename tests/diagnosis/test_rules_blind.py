@@ -136,7 +136,7 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
 
 
 def of_category(ensemble, category, multiple=None):
-    return ensemble.draw_planned_case(PlannedBlindCase(7, "one", category, multiple))
+    return ensemble.draw_recordings_and_ground_truth(PlannedBlindCase(7, "one", category, multiple))
 
 
 @pytest.mark.parametrize("category", ["null", "finer_chain"])
@@ -186,9 +186,9 @@ def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn):
 def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     ensemble = drawn()
     wanted = [PlannedBlindCase(i, "one", "single", 3.0) for i in range(4)]
-    first = [ensemble.draw_planned_case(entry)[1] for entry in wanted]
+    first = [ensemble.draw_recordings_and_ground_truth(entry)[1] for entry in wanted]
     made = list(drawn.made)
-    assert drawn().draw_planned_case(wanted[3])[1] == first[3]
+    assert drawn().draw_recordings_and_ground_truth(wanted[3])[1] == first[3]
     assert CaseGroundTruth.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
     assert first[3].experiment == "one"
     assert len({json.dumps(entry.truth) for entry in first}) == 4
@@ -196,10 +196,10 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     seeds = [seed for own in made for seed in (own["motion"]["seed"], own["seed"])]
     assert len(set(seeds)) == len(seeds) == 16
     assert max(seeds) > 2**24
-    assert drawn(seed=9).draw_planned_case(wanted[3])[1].truth != first[3].truth
+    assert drawn(seed=9).draw_recordings_and_ground_truth(wanted[3])[1].truth != first[3].truth
     # an ensemble to calibrate by shares no case with the one that is reported
     calibrating = drawn(conditions=SyntheticMeasurementConditions(purpose="calibration"))
-    assert calibrating.draw_planned_case(wanted[3])[1].truth != first[3].truth
+    assert calibrating.draw_recordings_and_ground_truth(wanted[3])[1].truth != first[3].truth
 
 
 def test_what_is_detectable_survives_as_plain_data(drawn):
@@ -250,7 +250,7 @@ def test_one_clean_case_in_three_is_brisk():
 def test_a_brisk_motion_has_three_times_the_acceleration(drawn):
     ensemble, ratios, arm = drawn(), [], baxter_foam_y_system(1)
     for brisk in (False, True):
-        ensemble.draw_planned_case(PlannedBlindCase(7, "one", "null", None, brisk))
+        ensemble.draw_recordings_and_ground_truth(PlannedBlindCase(7, "one", "null", None, brisk))
     start = grasping_joint_angles(arm)
     for seed in range(2):
         sizes = []
@@ -272,7 +272,7 @@ def test_truth_has_ordinary_friction_and_parameters_as_uncertain_as_their_priors
     known.options.prior_stds = {"T2.bend": 0.05}
     for number in range(8):
         case = PlannedBlindCase(number, "one", "null", None)
-        truth = ensemble.draw_planned_case(case)[1].truth
+        truth = ensemble.draw_recordings_and_ground_truth(case)[1].truth
         assert 0.03 <= abs(truth["T2.bend"] - 5.0) <= 0.05
         [held] = drawn.made[-1]["friction"]
         assert held == InjectedEffect("joint_coulomb", "elbow", {"tau_c": truth["joint_coulomb@elbow.tau_c"]})

@@ -45,7 +45,7 @@ def test_the_bare_run_gives_the_modulus_that_others_found(bare):
 
 def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, folder, bare, tmp_path):
     for i, (recording, mass) in enumerate(loads(folder)):
-        said = (f"recordings.estimate=[{recording}]", f"diagnosis.baseline=[{bare.folder}]")
+        said = (f"recordings.estimate=[{recording}]", f"diagnosis.baseline_run_folders=[{bare.folder}]")
         run = load_config(repository / "configs" / "soft_beam.yaml", (*QUIET, *said))
         finding = run_diagnose(run, tmp_path / f"load{i}").output
         assert finding.accepted_effects[0].label == "point_mass@w_beam"

@@ -183,7 +183,7 @@ def test_a_fit_is_judged_in_units_of_noise_by_the_limits_of_a_diagnosis():
     found = problem.evaluate([1.0])
     assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(significance_level=1e-6)).explains
     assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(min_excess_chi2_per_dof=0.5)).explains
-    half = assess_goodness_of_fit(problem, found, ExcessResidualCriteria(noise_fraction_of_std=0.5))
+    half = assess_goodness_of_fit(problem, found, ExcessResidualCriteria(noise_fraction_of_stated_std=0.5))
     assert half.chi2_per_dof == pytest.approx(4 * assess_goodness_of_fit(problem, found).chi2_per_dof)
 
 

@@ -100,7 +100,7 @@ def test_driven_arms_tell_about_what_the_innovations_say(driven_experiment):
     for seed in range(2):
         w = some_motion(driven_experiment, seed, 0.3)
         searched = driven_experiment.search_problem_sensitivities(w)
-        judged = driven_experiment.configured_problem_sensitivities(w)
+        judged = driven_experiment.planned_recording_sensitivities(w)
         for criterion in (DOptimalityCriterion((i,), (0, 1)) for i in (0, 1)):  # logarithms of standard deviations
             told, true = (criterion.value_and_gradient_by_sensitivities(rows, False)[0] for rows in (searched, judged))
             assert told == pytest.approx(true, abs=0.5)
@@ -231,7 +231,7 @@ def test_the_same_seed_gives_the_same_motion(moved_problem):
 
 
 def test_two_effects_are_moved_apart(driven_problem):
-    options = replace(OPTIONS, discriminate=PAIR, n_random_starts=1, max_iterations=4)
+    options = replace(OPTIONS, effects_to_discriminate=PAIR, n_random_starts=1, max_iterations=4)
     found = plan_informative_motion(driven_problem, options)
     assert set(found.effect_distances) == {PAIR, PAIR[::-1]}
     for before, after in found.effect_distances.values():
@@ -239,7 +239,7 @@ def test_two_effects_are_moved_apart(driven_problem):
 
 
 def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
-    quick, told = replace(QUICK, discriminate=PAIR), []
+    quick, told = replace(QUICK, effects_to_discriminate=PAIR), []
     for factor in (1.0, 2.0):
         sizes = {PAIR[0]: {"tau_c": 0.2 * factor}, PAIR[1]: {"b": 0.05 * factor}}
         told.append(plan_informative_motion(driven_problem, quick, None, sizes).effect_distances)
@@ -257,7 +257,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
     assert damping.std_planned == damping.std_combined == np.inf
     assert found.parameter_precisions["elbow.stiffness"].std_planned < 1.0
     with pytest.raises(ConfigError) as caught:
-        plan_informative_motion(blind, replace(OPTIONS, identify=("shoulder.damping",)))
+        plan_informative_motion(blind, replace(OPTIONS, parameters_to_identify=("shoulder.damping",)))
     for word in ("information about shoulder.damping", "a parameter that changes readings", "standard deviations"):
         assert word in str(caught.value)
 
@@ -265,13 +265,19 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"identify": ("elbow.stifness",)}, ("no parameter 'elbow.stifness'", "did you mean 'elbow.stiffness'?")),
-        ({"identify": ()}, ("plan.identify is empty", "elbow.stiffness")),
-        ({"identify": FREE, "discriminate": ("joint_viscous@elbow",)}, ("one of the two",)),
-        ({"discriminate": ("joint_viscous@elbow",)}, ("plan.discriminate has 1 effects", "two effects or more")),
-        ({"discriminate": ("joint_viscous", "joint_coulomb@elbow")}, ("has no location", "KIND@LOCATION")),
-        ({"discriminate": ("joint_viscus@elbow", PAIR[0])}, ("no effect 'joint_viscus'", "joint_viscous")),
-        ({"discriminate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
+        (
+            {"parameters_to_identify": ("elbow.stifness",)},
+            ("no parameter 'elbow.stifness'", "did you mean 'elbow.stiffness'?"),
+        ),
+        ({"parameters_to_identify": ()}, ("plan.parameters_to_identify is empty", "elbow.stiffness")),
+        ({"parameters_to_identify": FREE, "effects_to_discriminate": ("joint_viscous@elbow",)}, ("one of the two",)),
+        (
+            {"effects_to_discriminate": ("joint_viscous@elbow",)},
+            ("plan.effects_to_discriminate has 1 effects", "two effects or more"),
+        ),
+        ({"effects_to_discriminate": ("joint_viscous", "joint_coulomb@elbow")}, ("has no location", "KIND@LOCATION")),
+        ({"effects_to_discriminate": ("joint_viscus@elbow", PAIR[0])}, ("no effect 'joint_viscus'", "joint_viscous")),
+        ({"effects_to_discriminate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
         ({"start_joint_positions": {"shoulder": 1.5}}, ("0.3 beyond its limit",)),
         ({"limits": PlanLimits(effort_fraction=1e-4)}, ("exceed their limits before they move", "limit 0.004")),
         ({"n_random_starts": 0}, ("n_random_starts = 0", "from 1")),

@@ -186,11 +186,15 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
     section = discrimination_plan_settings([[pair(label) for label in PAIR]], folder)
-    assert section == {"goal": "information", "discriminate": list(PAIR), "parameter_run_folder": str(folder)}
+    assert section == {
+        "goal": "information",
+        "effects_to_discriminate": list(PAIR),
+        "parameter_run_folder": str(folder),
+    }
     assert discrimination_plan_settings([], folder) is None
     command = _planning_command(section)
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
-    overrides = [f"plan.discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run_folder={folder}"]
+    overrides = [f"plan.effects_to_discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run_folder={folder}"]
     assert all(f"'{text}'" in command or text in command for text in overrides)
     outcome = run_plan(load_config(informing, [*overrides, "plan.max_iterations=3"]), tmp_path / "out")
     assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
@@ -204,7 +208,10 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.identify=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")),
+        (
+            ["plan.parameters_to_identify=[elbow.stifness]"],
+            ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml"),
+        ),
         (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
         (["recordings.estimate=[]"], ("no recording to estimate on",)),
         (

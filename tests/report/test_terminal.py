@@ -256,11 +256,11 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     assert not any("yid-ocp plan" in line for line in lines)
     section = {
         "goal": "information",
-        "discriminate": ["density@T3", "point_mass@w_T3"],
+        "effects_to_discriminate": ["density@T3", "point_mass@w_T3"],
         "parameter_run_folder": "runs/mine",
     }
     command = next(line for line in told("yid-diagnosis/2", result | {"next_plan": section}) if "yid-ocp plan" in line)
-    assert "'plan.discriminate=[density@T3, point_mass@w_T3]'" in command
+    assert "'plan.effects_to_discriminate=[density@T3, point_mass@w_T3]'" in command
 
 
 @pytest.mark.parametrize(

@@ -292,7 +292,7 @@ model:
   arms: {{joints: [shoulder, elbow], mode: prescribed}}
   object:
     kind: segments
-    segments: {{T1: {{length: 0.6, mass: 0.1, radius: 0.02, links: 3}}}}
+    named_segments: {{T1: {{length: 0.6, mass: 0.1, radius: 0.02, links: 3}}}}
     mount: {{xyz: {base}}}
   grasp: {{hand: {{holder_frame: tool, held_frame: w_T1, kind: point}}}}
 recordings: {{estimate: [run.h5]}}

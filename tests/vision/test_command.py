@@ -79,7 +79,7 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
         (["track.frames_path=nowhere"], "no such file or folder"),
         (["recordings.estimate=[]"], "no recording with the joint angles"),
         (["track.camera_pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
-        (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_point_distance_in_radii'"),
+        (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_mean_surface_distance_in_radii'"),
         (["track.options.filters.robot_padding=-1"], "robot_padding = -1"),
     ],
 )
@@ -128,7 +128,7 @@ def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
-    monkeypatch.setattr(FrameTracker, "estimate_sequence_calibration", None)  # it is known
+    monkeypatch.setattr(FrameTracker, "estimate_shared_values", None)  # it is known
     again = carried_out("track", config, "--workers", "2", settings=(PLAIN, UNDRAWN))
     assert again.result["frames"][0]["seconds"] == worked[0].cpu_seconds
     assert not (tmp_path / "run.partial").exists()

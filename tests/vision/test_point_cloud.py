@@ -74,7 +74,7 @@ def test_where_the_object_can_be(system, run):
     [
         (CloudFilterOptions, "robot_padding"),
         (SkeletonOptions, "neighbour_radius"),
-        (TrackOptions, "max_point_distance_in_radii"),
+        (TrackOptions, "max_mean_surface_distance_in_radii"),
         (ShapeFitOptions, "surface_noise_std"),
     ],
 )

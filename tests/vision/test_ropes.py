@@ -27,7 +27,7 @@ model:
   robot: null
   object:
     kind: segments
-    segments: {rope: {length: 1.0, mass: 0.1, radius: 0.006, links: 16}}
+    named_segments: {rope: {length: 1.0, mass: 0.1, radius: 0.006, links: 16}}
   measured_points: ["rope:0%", w_rope]
 track:
   frames_path: FRAMES

@@ -38,7 +38,7 @@ model:
   object:
     kind: segments
     mount: {{parent_frame: hub}}
-    segments:
+    named_segments:
 {segments}
   measured_points: [{points}]
 recordings:

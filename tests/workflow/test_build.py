@@ -59,7 +59,7 @@ def test_an_object_of_segments_on_a_robots_hand(built):
         f"  arms: {{mode: prescribed, joints: [{', '.join(f'panda_joint{i}' for i in range(1, 8))}]}}\n"
         "  object:\n    kind: segments\n"
         "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
-        "    segments:\n"
+        "    named_segments:\n"
         "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, "
         "stiffness_given_as_rigidity: true, clamped_at_base: true}\n"
         "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
@@ -78,7 +78,7 @@ def test_an_object_of_segments_on_a_robots_hand(built):
 @pytest.mark.parametrize("finer", [1, 2, 3])
 def test_a_branch_stays_at_its_place_of_a_finer_parent(built, finer):
     text = (
-        "model:\n  object:\n    kind: segments\n    segments:\n"
+        "model:\n  object:\n    kind: segments\n    named_segments:\n"
         "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 4}\n"
         "      b: {length: 0.1, mass: 0.1, radius: 0.01, links: 1, parent: a, parent_link_index: 0}\n"
     )
@@ -124,7 +124,7 @@ def test_effects_bring_their_parameters(written):
         (EFFECTS.replace("scale: 1.1", "scale: much"), "model.effects.1.values"),
         ("model:\n  robot: package:baxterr\n", "line 2: model.robot"),
         ("model:\n  robot: package:baxter\n  damping: {left_s9: 1}\n", "line 3: model.damping.left_s9"),
-        ("model:\n  object: {kind: segments, segments: {a: {mass: 1, radius: 0.1}}}\n", "line 2: model.object"),
+        ("model:\n  object: {kind: segments, named_segments: {a: {mass: 1, radius: 0.1}}}\n", "line 2: model.object"),
         ("model:\n  object: {kind: foam_y}\n  measured_points: [w_T9]\n", "line 1: model"),
     ],
 )
@@ -145,7 +145,7 @@ def test_a_problem_from_a_file(repository):
 
 
 SEGMENTED = (
-    "model:\n  object:\n    kind: segments\n    segments:\n"
+    "model:\n  object:\n    kind: segments\n    named_segments:\n"
     "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 2}\n"
     "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, "
     "stiffness_given_as_rigidity: true, separate_twist_damping: true}\n"

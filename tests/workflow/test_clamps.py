@@ -24,19 +24,19 @@ model:
   object:
     kind: segments
     mount: {xyz: [0.1, 0.2, 0.3], rpy: [0.0, 1.5707963267948966, 0.0]}
-    segments:
+    named_segments:
       beam:
         {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_given_as_rigidity: true,
          clamped_at_base: true, joint_axes: y}
   frames:
-    mark: {parent_frame: w_beam, marker_reference_pose: true}
+    mark: {parent_frame: w_beam, position_from_recordings: true}
 recordings: {estimate: [beam.h5]}
 sensors: {points: {std: 1.0e-4}}
 parameters:
   beam.bend: {free: true, initial: 0.02}
   beam.damping: {free: true, initial: 5.0e-5}
 problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, duration: 0.4}
-output: {write_report: false, checked_discretisations: none}
+output: {write_report: false, discretisation_check: none}
 """
 STRAIGHT = np.array([0.2, 0.2, 0.32])  # the tip's face is at 0.2, 0.2, 0.3
 
@@ -145,7 +145,7 @@ def test_a_folder_that_says_nothing_of_parameters_is_refused(tmp_path, change, w
 def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
     folder_of(tmp_path / "old")
     (tmp_path / "old" / "config.yaml").write_text(BEAM.replace("links: 2", "links: 3"), encoding="utf-8")
-    run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
+    run = settings(tmp_path, None, ("diagnosis.baseline_run_folders=[old]",))
     with pytest.raises(ConfigError, match=r"model\.object differs"):
         run_history.estimates_of_each_baseline_run(run)
 
@@ -153,7 +153,7 @@ def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
 def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_path):
     folder = folder_of(tmp_path / "old")
     (folder / "config.yaml").write_text(BEAM.replace("[beam.h5]", "[../beam.h5]"), encoding="utf-8")
-    run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
+    run = settings(tmp_path, None, ("diagnosis.baseline_run_folders=[old]",))
     [found], message = run_history.load_reference_or_baseline_recordings(run)
     assert (found.name, message) == ("beam (without)", "")
     assert found.sha256 == read_recordings_of_role(run, "estimate")[0].sha256

@@ -213,7 +213,7 @@ def problem_of(urdf_folder):
 
 
 SETTINGS = SimpleNamespace(
-    diagnosis=SimpleNamespace(noise_fraction_of_std=SHARE),
+    diagnosis=SimpleNamespace(noise_fraction_of_stated_std=SHARE),
     config_error=lambda what, *where, **more: ConfigError(what, where=".".join(where), **more),
 )
 
@@ -286,7 +286,7 @@ def test_a_diagnosis_leaves_a_run_folder(carried_out, pendulum):
     ("setting", "said"),
     [
         ("diagnosis.candidates=[kelvin_voigt]", "kelvin_voigt is not possible for this model"),
-        ("diagnosis.noise_fraction_of_std=0.1", "set sensors.joints.effort.std"),
+        ("diagnosis.noise_fraction_of_stated_std=0.1", "set sensors.joints.effort.std"),
     ],
 )
 def test_what_cannot_be_diagnosed_is_said(cli, pendulum, tmp_path, setting, said):
@@ -300,7 +300,7 @@ def test_a_deviation_that_is_mostly_the_models_error(carried_out, pendulum):
     chosen = ("diagnosis.candidates=[joint_coulomb]", "output.write_report=false")
     found = []
     for std, share in ((0.01, 1.0), (0.1, 0.1)):
-        settings = (f"sensors.joints.effort.std={std}", f"diagnosis.noise_fraction_of_std={share}", *chosen)
+        settings = (f"sensors.joints.effort.std={std}", f"diagnosis.noise_fraction_of_stated_std={share}", *chosen)
         done = carried_out("diagnose", pendulum, settings=settings, out=f"run_{share}")
         found.append(done.result["gap"]["before"]["chi2_per_dof"])
     assert found[1] == pytest.approx(found[0], rel=0.01)

@@ -9,7 +9,7 @@ import pytest
 from yid_ocp.data import PointGroup, Recording, write_recording
 
 TIMES = 0.01 * np.arange(31)
-ROD = "segments: {T1: {length: LENGTH, mass: 0.1, radius: 0.02, links: 2}}"
+ROD = "named_segments: {T1: {length: LENGTH, mass: 0.1, radius: 0.02, links: 2}}"
 HANGING = f"""\
 model:
   object: {{kind: segments, mount: {{rpy: [3.141592653589793, 0, 0]}}, {ROD.replace("LENGTH", "0.6")}}}

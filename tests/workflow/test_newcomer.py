@@ -34,7 +34,7 @@ model:
   object:
     kind: segments
     mount: {{parent_frame: {frame}}}
-    segments:
+    named_segments:
 {segments}
   damping: {damping}
   measured_points: [{points}]

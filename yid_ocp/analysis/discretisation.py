@@ -428,7 +428,7 @@ class AlternatingErrorGrowth:
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
     @property
-    def description(self) -> str:
+    def stability_message(self) -> str:
         """Sentence that states whether the time step is stable, with a remedy if it is not."""
         step = f"{self.recording_name}: the step of {self.time_step:g} s is"
         if self.keeps_errors_below_resolution:

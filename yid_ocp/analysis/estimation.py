@@ -165,10 +165,10 @@ def _checked_solution_and_step_stability(
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.keeps_errors_below_resolution:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
-        message = f"at the estimate {end.description} ({solution.message})"
+        message = f"at the estimate {end.stability_message} ({solution.message})"
         return replace(solution, status=status, message=message), found
     if solution.status == Status.FAILED and begin is not None and not begin.keeps_errors_below_resolution:
-        return replace(solution, message=f"at the start {begin.description} ({solution.message})"), found
+        return replace(solution, message=f"at the start {begin.stability_message} ({solution.message})"), found
     return solution, found
 
 

@@ -50,7 +50,7 @@ _GraspKind = Literal["point", "axis", "weld"]
 class _FrameSettings(MountSettings):
     """An additional named frame on the robot, the object or in the world, such as a tool tip or a marker."""
 
-    marker_reference_pose: Annotated[
+    position_from_recordings: Annotated[
         bool,
         OptionInfo(
             "whether the dataset `straight` of each recording gives the position of the point of this name, "
@@ -93,7 +93,7 @@ class EffectSettings:
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
     values: Annotated[Mapping[str, float], OptionInfo("parameters that are not neutral")] = field(default_factory=dict)
     depends_on: Annotated[TorqueLawQuantitiesName | None, OptionInfo("quantities on which a law depends")] = None
-    table: Annotated[_FilePath | None, OptionInfo("table of a law, in the format of a diagnosis' law.csv")] = None
+    law_csv: Annotated[_FilePath | None, OptionInfo("table of a law, in the format of a diagnosis' law.csv")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +205,7 @@ class RecordingsSettings:
 
     estimate: Annotated[_Recordings, OptionInfo("recordings for the estimation")] = ()
     held_out: Annotated[_Recordings, OptionInfo("recordings that are predicted only")] = ()
-    reference_recordings: Annotated[
+    without_effect: Annotated[
         _Recordings,
         OptionInfo("recordings made without the diagnosed effect, predicted as a test; default: those of the baseline"),
     ] = ()
@@ -305,14 +305,14 @@ class DiagnosisSettings(Thresholds):
     candidates: Annotated[
         Literal["all"] | _Names, OptionInfo("effects to try: all, or a list of kind or kind@location")
     ] = "all"
-    exclude: Annotated[_Names, OptionInfo("candidates not to try, by kind or kind@location")] = ()
-    noise_fraction_of_std: Annotated[
+    excluded_candidates: Annotated[_Names, OptionInfo("candidates not to try, by kind or kind@location")] = ()
+    noise_fraction_of_stated_std: Annotated[
         float,
         Gt(0),
         Le(1),
         OptionInfo("fraction of all stated standard deviations that is noise; the rest represents model error"),
     ] = 1.0
-    baseline: Annotated[
+    baseline_run_folders: Annotated[
         tuple[_FilePath, ...],
         OptionInfo(
             "run folders of `solve` or `diagnose` with the same model; the diagnosis reports what changed since"
@@ -322,7 +322,7 @@ class DiagnosisSettings(Thresholds):
     @property
     def null_test_residual_limits(self) -> ExcessResidualCriteria:
         """Limits of the null test on the residual after a fit, in units of the sensors' stated standard deviations."""
-        return replace(self.null_test_limits, noise_fraction_of_std=self.noise_fraction_of_std)
+        return replace(self.null_test_limits, noise_fraction_of_stated_std=self.noise_fraction_of_stated_std)
 
 
 def _compared() -> dict[str, Solver]:
@@ -418,7 +418,7 @@ class OutputSettings:
 
     runs_folder: Annotated[_FilePath | None, OptionInfo("folder of run folders; default: `runs`")] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
-    checked_discretisations: Annotated[
+    discretisation_check: Annotated[
         Literal["none", "time_step", "both"] | None,
         OptionInfo(
             "what `solve` refines to test the estimates: nothing, the time step, or time step and links; "

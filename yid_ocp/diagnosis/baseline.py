@@ -145,9 +145,9 @@ class EarlierRunsBaseline:
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
-    def errors_with_effects_removed_and_added(
+    def counterfactual_prediction_errors(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> ErrorsWithEffectsRemovedAndAdded | None:
+    ) -> CounterfactualPredictionErrors | None:
         """Test found effects on recordings made with and without them, such as before and after a repair.
 
         Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
@@ -168,8 +168,8 @@ class EarlierRunsBaseline:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return ErrorsWithEffectsRemovedAndAdded(removed, _nothing(present, error.what))
-        return ErrorsWithEffectsRemovedAndAdded(removed, _predicted(last, present, then, {**then, **effects}))
+            return CounterfactualPredictionErrors(removed, _nothing(present, error.what))
+        return CounterfactualPredictionErrors(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
@@ -219,7 +219,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class ErrorsWithEffectsRemovedAndAdded:
+class CounterfactualPredictionErrors:
     """Prediction errors on reference recordings without the effects, and on diagnosed recordings with the effects."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model
@@ -272,6 +272,6 @@ def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:
         what = "the nominal model cannot be fitted to the recordings without the effects"
-        allowed, hint = "recordings that the nominal model can follow", "check recordings.reference_recordings"
+        allowed, hint = "recordings that the nominal model can follow", "check recordings.without_effect"
         raise SolverError(f"{what}: {outcome.message}", where="recordings", allowed=allowed, hint=hint)
     return {name: problem.named_values(outcome.x)[name] for name in shared}

@@ -332,7 +332,7 @@ class BlindCaseGenerator:
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
-    def draw_planned_case(self, planned: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
+    def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
         """Draw recordings and label of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
         name = f"case_{planned.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]

@@ -257,7 +257,7 @@ def _diagnosed(
         stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
-        counterfactual=earlier.errors_with_effects_removed_and_added(nominal, final, search.progress),
+        counterfactual=earlier.counterfactual_prediction_errors(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_finer_time_step=seen.stated_and_finer_time_step,
         search_seconds=clock["refits"] - clock[""],

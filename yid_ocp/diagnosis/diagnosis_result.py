@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from yid_ocp.diagnosis.baseline import EarlierRunsComparison, ErrorsWithEffectsRemovedAndAdded
+from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors, EarlierRunsComparison
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
@@ -55,7 +55,7 @@ class DiagnosisResult(NominalModelGapEvidence, Judgement, ReprMixin):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
     baseline_comparison: EarlierRunsComparison | None = None
-    counterfactual: ErrorsWithEffectsRemovedAndAdded | None = None
+    counterfactual: CounterfactualPredictionErrors | None = None
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()

@@ -79,7 +79,7 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
     Excluded candidates stay in the compiled step at their neutral values, so nothing is recompiled. Raises
     `ConfigError` if a name is not a candidate, or if no candidate is left.
     """
-    where = "diagnosis.exclude"
+    where = "diagnosis.excluded_candidates"
     known = {name for effect in effects for name in (effect.kind, effect.label)}
     for name in names:
         if name not in known:

@@ -208,7 +208,7 @@ def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_v
     return (ctypes.c_void_p * len(arrays))(*(None if array is None else array.ctypes.data for array in arrays))
 
 
-def prepare_kalman_steps(
+def kalman_steps_and_covariance(
     covariance: Array,
     observation: Array,
     row_start: Sequence[int],

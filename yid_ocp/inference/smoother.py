@@ -353,7 +353,7 @@ def select_and_smooth_unknowns(
         traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
         # the variance of a group's scores is the mean rise of r'r by unknowns of the reference size
         scores = {source: max(score, 1e-300) for source, (_, score) in _scores(models, nothing).items()}
-        detectable = {source: math.sqrt(limits.detectable_chi2 / score) for source, score in scores.items()}
+        detectable = {source: math.sqrt(limits.detectable_chi2_rise / score) for source, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
         least = limits.min_log_bayes_factor
         return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
@@ -424,7 +424,7 @@ def _alternatives(
         scores = _scores(models, without)
         # the score at zero variance is a poor predictor here: all groups are tried
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
-        least = state.log_evidence - max(limits.min_log_bayes_factor, (1 - limits.location_tie) * drop[source])
+        least = state.log_evidence - max(limits.min_log_bayes_factor, (1 - limits.tied_evidence_ratio) * drop[source])
         reached = zip(asked, _largest_evidences(models, less, asked), strict=True)
         found[source] = tuple(other for other, (reach, _) in reached if reach >= least)
     return drop, found

@@ -60,11 +60,11 @@ class SmootherThresholds:
         float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")
     ] = 5.0
     max_smoother_unknown_groups: Annotated[int, Ge(1), OptionInfo("largest number of selected groups of unknowns")] = 4
-    detectable_chi2: Annotated[float, Gt(0), OptionInfo("rise of r'r at which unknowns are detectable")] = 10.0
-    force_prior_std: Annotated[float, Gt(0), OptionInfo("unknown force relative to the load at its location")] = 0.1
+    detectable_chi2_rise: Annotated[float, Gt(0), OptionInfo("rise of r'r at which unknowns are detectable")] = 10.0
+    force_prior_std_over_load: Annotated[float, Gt(0), OptionInfo("unknown force over the load at its place")] = 0.1
     grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
-    bias_prior_std: Annotated[float, Gt(0), OptionInfo("unknown bias relative to the noise of its sensor")] = 3.0
-    location_tie: Annotated[
+    bias_prior_std_over_noise: Annotated[float, Gt(0), OptionInfo("unknown bias over its sensor's noise")] = 3.0
+    tied_evidence_ratio: Annotated[
         float, Gt(0), Le(1), OptionInfo("share of a location's evidence at which an alternative is named")
     ] = 0.9
 
@@ -118,7 +118,7 @@ class _SmootherUnknowns(NamedTuple):
 
 def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -> _SmootherUnknowns:
     """Unknowns of one recording, with their groups and reference sizes."""
-    names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std)
+    names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std_over_load)
     grasped, row = [], 0
     for grasp in course.system.grasps:
         grasped += [row, row + 1, row + 2]
@@ -130,7 +130,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
     for segment, weight in pushed.items():
         names += [f"{segment}.push_{axis}" for axis in "xyz"]
         sources += [SmoothedUnknownGroup(segment, "push")] * 3
-        reference += [limits.force_prior_std * weight] * 3
+        reference += [limits.force_prior_std_over_load * weight] * 3
     biased = []
     for k, samples in enumerate(course.episode.measurements):
         sensor = samples.sensor
@@ -143,7 +143,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
             biased.append((k, column))
             names.append(name)
             sources.append(SmoothedUnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
-            reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
+            reference.append(limits.bias_prior_std_over_noise * float(np.nanmedian(samples.std[:, column])))
     held, biases = np.array(grasped, int), tuple(biased)
     return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
 

@@ -106,7 +106,7 @@ def assess_goodness_of_fit(
                 parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
         residual = np.concatenate(parts)
     series = residual_channels(problem)
-    found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
+    found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.no_data_issue_exceeds_warning)
 

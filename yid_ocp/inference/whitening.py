@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import KalmanSteps, prepare_kalman_steps
+from yid_ocp.inference.kalman import KalmanSteps, kalman_steps_and_covariance
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
     ResidualDerivativesAtNodes,
@@ -173,7 +173,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
     still = np.eye(len(kept), len(kept) + nu)[None], 0, np.ones((1, 2 * nu)), np.zeros((1, 2 * nu))
-    kalman, covariance = prepare_kalman_steps(covariance, observe, (0, len(rows)), *still)
+    kalman, covariance = kalman_steps_and_covariance(covariance, observe, (0, len(rows)), *still)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
     last = _FilterPart(count, rows, np.full(len(rows), count), kalman, none)
     return WhiteningFilter((steps, last), errors, first, live, spread)
@@ -229,7 +229,7 @@ def _filter_steps(
         observe[own, known:] = observe[own, ns:known]
         observe[own, :ns] += before[own]
         starts, noise = (ends[span.start : span.stop + 1] - own.start).tolist(), (inputs.shape[2] - nu, decay[span])
-        steps, covariance = prepare_kalman_steps(covariance, observe[own], starts, move, *noise, variance[span])
+        steps, covariance = kalman_steps_and_covariance(covariance, observe[own], starts, move, *noise, variance[span])
         whitening.append(steps.whitening)
         projected[own] = steps.projected_covariance
         begun = span.stop

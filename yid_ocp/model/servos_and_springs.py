@@ -223,7 +223,7 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJoin
     )
 
 
-def build_joint_servos(
+def build_joint_servos_and_parameters(
     tree: Mechanism, joints: Sequence[str], options: ServoModelOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
     """Build a servo for every named joint. Returns the servos and their parameters, such as `JOINT.servo_gain`.

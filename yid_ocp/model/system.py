@@ -22,7 +22,7 @@ from yid_ocp.model.servos_and_springs import (
     PositionServo,
     RobotJointSpring,
     ServoModelOptions,
-    build_joint_servos,
+    build_joint_servos_and_parameters,
     mechanism_without_gravity,
     stiffness_and_rest_parameters,
 )
@@ -311,7 +311,7 @@ class System(ReprMixin):
             stiffness, rest = stiffness_and_rest_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
-        moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos)
+        moved, own = ({}, []) if servos is None else build_joint_servos_and_parameters(tree, driven, servos)
         tree = mechanism_without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
         segments: list[SegmentLayout] = []
         for item, frame, placement in options.get("objects", ()):

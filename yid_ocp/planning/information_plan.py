@@ -120,31 +120,33 @@ def _chosen(
     problem: EstimationProblem, options: PlanOptions, sizes: Mapping[str, Mapping[str, float]]
 ) -> tuple[tuple[str, ...], tuple[EffectBase, ...]]:
     """Parameters to identify, or effects to discriminate."""
-    if options.identify is not None and options.discriminate is not None:
-        what, hint = "plan.identify and plan.discriminate are both given", "set one of them to null"
-        raise ConfigError(what, where="plan.discriminate", allowed="one of the two", hint=hint)
-    if options.discriminate is not None:
-        return (), _effects(problem, options.discriminate, sizes)
-    wanted = problem.free if options.identify is None else options.identify
+    where, sought = "plan.parameters_to_identify", options.parameters_to_identify
+    effects = options.effects_to_discriminate
+    if sought is not None and effects is not None:
+        what, hint = f"{where} and plan.effects_to_discriminate are both given", "set one of them to null"
+        raise ConfigError(what, where="plan.effects_to_discriminate", allowed="one of the two", hint=hint)
+    if effects is not None:
+        return (), _effects(problem, effects, sizes)
+    wanted = problem.free if sought is None else sought
     if not wanted:
-        what, hint = "plan.identify is empty", "list the parameters, or set parameters.NAME.free: true"
-        raise ConfigError(what, where="plan.identify", allowed=", ".join(problem.free) or "free parameters", hint=hint)
+        what, hint = f"{where} is empty", "list the parameters, or set parameters.NAME.free: true"
+        raise ConfigError(what, where=where, allowed=", ".join(problem.free) or "free parameters", hint=hint)
     for name in wanted:
         if name not in problem.system.parameters:
             said = unknown_name_error_arguments(name, problem.system.parameters.names)
-            raise ConfigError(f"there is no parameter '{name}'", where="plan.identify", **said)
+            raise ConfigError(f"there is no parameter '{name}'", where=where, **said)
         if name not in problem.free:
             hint, allowed = f"set parameters.{name}.free: true", ", ".join(problem.free)
-            raise ConfigError(f"'{name}' is not a free parameter", where="plan.identify", allowed=allowed, hint=hint)
+            raise ConfigError(f"'{name}' is not a free parameter", where=where, allowed=allowed, hint=hint)
     return wanted, ()
 
 
 def _effects(
     problem: EstimationProblem, labels: Sequence[str], sizes: Mapping[str, Mapping[str, float]]
 ) -> tuple[EffectBase, ...]:
-    where = "plan.discriminate"
+    where = "plan.effects_to_discriminate"
     if len(set(labels)) < 2:
-        what, hint = f"plan.discriminate has {len(set(labels))} effects", "list the effects to tell apart"
+        what, hint = f"plan.effects_to_discriminate has {len(set(labels))} effects", "list the effects to tell apart"
         raise ConfigError(what, where=where, allowed="two effects or more, each KIND@LOCATION", hint=hint)
     there = {f"{effect.kind}@{effect.location}" for effect in problem.system.effects}
     found = []
@@ -249,12 +251,13 @@ def _check_seen(
         what = f"no motion gives information about {', '.join(lost)}: a change by its whole value changes all readings "
         what += f"together by {worst:.1g} standard deviations"
         hint = "; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost)
-        raise ConfigError(what, where="plan.identify", allowed="a parameter that changes readings", hint=hint)
+        where = "plan.parameters_to_identify"
+        raise ConfigError(what, where=where, allowed="a parameter that changes readings", hint=hint)
     for effect in rivals:
         if all(name in unseen for name in effect.amplitude_parameter_names):
             what = f"{effect.label} is unobservable: its first-order sensitivity is zero in every sensor"
             allowed, hint = "effects that change readings", "add a sensor whose readings it changes, or leave it out"
-            raise ConfigError(what, where="plan.discriminate", allowed=allowed, hint=hint)
+            raise ConfigError(what, where="plan.effects_to_discriminate", allowed=allowed, hint=hint)
 
 
 def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
@@ -322,7 +325,7 @@ def _judged(
     experiment: SplineMotionExperiment, criterion: DOptimalityOrDiscriminationCriterion, found: MotionSearchResult
 ) -> float:
     try:
-        rows = experiment.configured_problem_sensitivities(found.w)
+        rows = experiment.planned_recording_sensitivities(found.w)
     except SolverError:
         return -math.inf
     return criterion.value_and_gradient_by_sensitivities(rows, False)[0]
@@ -355,7 +358,7 @@ def _distances(
     w: Array,
 ) -> dict[tuple[str, str], tuple[float, float]]:
     assert isinstance(criterion, EffectDiscriminationCriterion)
-    recorded, planned = experiment.existing_recording_sensitivities, experiment.configured_problem_sensitivities(w)
+    recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_recording_sensitivities(w)
     before, after = criterion.pairwise_effect_distances(recorded), criterion.pairwise_effect_distances(planned)
     labels = [effect.label for effect in rivals]
     pairs = itertools.permutations(range(len(labels)), 2)

@@ -89,11 +89,11 @@ class PlanOptions:
     minimize_parameter_sensitivity: Annotated[
         bool, OptionInfo("whether the error due to the parameters' uncertainty is minimised as well")
     ] = False
-    identify: Annotated[
+    parameters_to_identify: Annotated[
         tuple[str, ...] | None,
         OptionInfo("goal information: parameters to determine most precisely together; default: all free parameters"),
     ] = None
-    discriminate: Annotated[
+    effects_to_discriminate: Annotated[
         tuple[str, ...] | None, OptionInfo("goal information: effects to discriminate, kind@location")
     ] = None
     n_random_starts: Annotated[

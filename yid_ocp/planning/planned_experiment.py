@@ -172,7 +172,7 @@ class SplineMotionExperiment:
         problem = EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra)
         return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
-    def configured_problem_sensitivities(self, w: Array) -> Array:
+    def planned_recording_sensitivities(self, w: Array) -> Array:
         """Whitened sensitivities of the planned recording to relative changes. `SolverError` if its rollout fails."""
         return self._weighted(self.planned_estimation_problem(w))
 

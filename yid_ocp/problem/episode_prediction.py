@@ -255,7 +255,7 @@ class EpisodePredictor:
             return start.failure_message
         by_start = start.state_sensitivity
         inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, start.state, by_start)
-        feedback, driven = episode.feedback_about_smoother_estimate, self.system.driven_coordinate_indices
+        feedback, driven = episode.tracking_feedback_about_smoothed_motion, self.system.driven_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity

@@ -199,7 +199,7 @@ class Episode:
     equilibrium_guess: Array | None = None  # near the initial equilibrium, if that is not of least energy, (n,)
 
     @property
-    def feedback_about_smoother_estimate(self) -> TrackingFeedback | None:
+    def tracking_feedback_about_smoothed_motion(self) -> TrackingFeedback | None:
         """Tracking filter about the Kalman smoother's estimate, or unchanged if there is no such estimate."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback

@@ -48,12 +48,12 @@ class ExcessResidualCriteria:
     """Criteria by which a residual exceeds its noise: a significance level and a smallest excess of chi2.
 
     A residual exceeds its noise if it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`. The fraction
-    `noise_fraction_of_std` of stated standard deviations is noise; the rest represents model error.
+    `noise_fraction_of_stated_std` of stated standard deviations is noise; the rest represents model error.
     """
 
     significance_level: float = 0.01
     min_excess_chi2_per_dof: float = 0.1
-    noise_fraction_of_std: float = 1.0
+    noise_fraction_of_stated_std: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ _MIN_ARM_COVERAGE = 0.6  # fraction of the arm's visible, unoccluded surface tha
 class CameraClockOptions:
     """Settings for the estimation of the camera clock's offset and drift relative to the joints' clock."""
 
-    initial_offset: Annotated[float, OptionInfo("initial value of stamp minus joint time", "s")] = 0.0
+    initial_stamp_minus_joint_time: Annotated[float, OptionInfo("initial value of stamp minus joint time", "s")] = 0.0
     search_half_width: Annotated[
         float, Ge(0), OptionInfo("half width of the search for the offset around the initial value; 0: no search", "s")
     ] = 0.5
@@ -224,8 +224,9 @@ class CameraCalibration:
 
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
     """Make a calibration from the given pose and clock offset, without estimation. `reason` says why."""
-    text = f"clock offset {1e3 * options.initial_offset:.0f} ms as given" + (f": {reason}" if reason else "")
-    state = CalibrationState(pose, clock_offset=options.initial_offset)
+    offset = options.initial_stamp_minus_joint_time
+    text = f"clock offset {1e3 * offset:.0f} ms as given" + (f": {reason}" if reason else "")
+    state = CalibrationState(pose, clock_offset=offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
 
@@ -246,7 +247,7 @@ def calibrate_camera(
     does not match the clouds, or moves too little to determine the clock.
     """
     about = float(np.mean([g.stamp for g in frames])) if frames else 0.0
-    told = CalibrationState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
+    told = CalibrationState(pose, clock_offset=clock.initial_stamp_minus_joint_time, clock_reference_stamp=about)
     try:
         return _Calibrator(arm, told, rng, options, clock).run(frames)
     except _UntoldError as reason:
@@ -313,7 +314,7 @@ class _Calibrator:
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < _MAX_CLOCK_OFFSET_STD:
             told = f"it moves too little to determine the clock offset: its std is {1e3 * std:.0f} ms"
-            known = "give the clock's offset with track.options.clock.initial_offset and search_half_width: 0"
+            known = "set track.options.clock.initial_stamp_minus_joint_time, and search_half_width: 0"
             raise _UntoldError(told, f"record a livelier motion, or {known}")
         used_state = state
         if self.options.fix_pose:
@@ -325,7 +326,7 @@ class _Calibrator:
 
     def _about_the_arm(self, glimpse: CalibrationFrame) -> CalibrationFrame | None:
         """The points around the arm, as seen by the specified camera; None if the arm is out of view."""
-        own = self.told.world_to_measured_points(self.arm.visible_surface_points(self.told, glimpse.stamp)[0])
+        own = self.told.world_to_measured_points(self.arm.visible_surface_points_and_parts(self.told, glimpse.stamp)[0])
         points = glimpse.points[glimpse.points[:, 2] > 0]
         if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):
             return None
@@ -394,7 +395,7 @@ class _Calibrator:
         words = [f"clock offset {1e3 * state.clock_offset:.1f} ms {known if searched else 'as given'}"]
         if abs(state.clock_drift) > 2 * (drift := stds[CLOCK_DRIFT_INDEX]):
             words.append(f"its drift {1e3 * state.clock_drift:.2f} ms in a second ± {1e3 * drift:.2f}")
-        points = self.arm.visible_surface_points(state, stamp)[0].mean(axis=0, keepdims=True)
+        points = self.arm.visible_surface_points_and_parts(state, stamp)[0].mean(axis=0, keepdims=True)
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
         change = state.difference_from(self.told)
         if away > _MIN_REPORTED_DISPLACEMENT and self.options.fix_pose:

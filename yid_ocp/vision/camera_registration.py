@@ -159,7 +159,7 @@ class ArmSurface:
     def _part_poses_at_time(self, t: float) -> Array:
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
-    def visible_surface_points(self, state: CalibrationState, stamp: float) -> tuple[Array, IntArray]:
+    def visible_surface_points_and_parts(self, state: CalibrationState, stamp: float) -> tuple[Array, IntArray]:
         """World points on moving surfaces that an unobstructed camera sees, and the surface part of each point."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
@@ -322,7 +322,7 @@ def _add_costs(
     """Add the costs of the arm's points, `delays` [s] earlier and shifted by cells, to `total` (delays, cells)."""
     from scipy.ndimage import distance_transform_edt  # slow to import; only needed to search for the camera's pose
 
-    points, part = arm.visible_surface_points(told, glimpse.stamp)
+    points, part = arm.visible_surface_points_and_parts(told, glimpse.stamp)
     own = told.world_to_measured_points(points)
     at, towards = (p[:, :2] / p[:, 2:] for p in (glimpse.points, own))
     view = np.array([at.min(axis=0), at.max(axis=0)])
@@ -375,7 +375,7 @@ def pooled_surface_visibility_fractions(
     """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)
     for glimpse in frames:
-        points, _ = arm.visible_surface_points(state, glimpse.stamp)
+        points, _ = arm.visible_surface_points_and_parts(state, glimpse.stamp)
         own, (places, rays) = state.world_to_measured_points(points), glimpse._trees
         away, _ = places.query(own, distance_upper_bound=within)
         # as wide as the gaps between points of a thinned cloud

@@ -20,7 +20,7 @@ from yid_ocp.vision.fit import ShapeFitOptions, ShapeFitter
 from yid_ocp.vision.point_cloud import CloudFilterOptions, SkeletonOptions, XyzTuple
 from yid_ocp.vision.sequence_calibration import (
     ForeignObject,
-    SequenceCalibration,
+    SharedFrameEstimates,
     TubeDimensionEstimates,
     TubeDimensionKind,
 )
@@ -58,7 +58,7 @@ class TrackOptions:
         tuple[TubeDimensionKind, ...],
         OptionInfo("sizes of the tubes estimated from the clouds if these determine them; all sizes are checked"),
     ] = ()
-    max_point_distance_in_radii: Annotated[
+    max_mean_surface_distance_in_radii: Annotated[
         PositiveFloat,
         OptionInfo(
             "a frame is dropped if the mean distance of its points from the fitted shape, beyond noise, is larger; "
@@ -121,14 +121,14 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
     widest, noise = (
-        options.max_point_distance_in_radii * float(shape.link_radii.mean()),
+        options.max_mean_surface_distance_in_radii * float(shape.link_radii.mean()),
         shape.options.surface_noise_std,
     )
     limit = math.hypot(widest, _MEAN_ABS_DEVIATION * noise)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
-        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_point_distance_in_radii"
+        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_mean_surface_distance_in_radii"
         return f"{_NO_FIT}: {off} allows {1e3 * limit:.1f} mm"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > _MAX_BEND_ANGLE:
@@ -166,7 +166,7 @@ def _good_fits(frames: Sequence[FrameReport]) -> dict[int, FrameShapeFit]:
 def tracked_states_and_points(
     frames: Sequence[FrameReport],
     columns: Sequence[int],
-    common: SequenceCalibration,
+    common: SharedFrameEstimates,
     foreign_objects: Sequence[ForeignObject],
     options: TrackOptions,
     source: str,

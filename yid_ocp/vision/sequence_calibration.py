@@ -316,8 +316,8 @@ def _changed(system: System, given: Mapping[str, float] | None, change: Array) -
 
 
 @dataclass(frozen=True, eq=False)
-class SequenceCalibration:
-    """Camera calibration, object dimensions and background of a sequence."""
+class SharedFrameEstimates:
+    """Estimates shared by all frames of a sequence: camera calibration, tube dimensions and background."""
 
     camera_calibration: CameraCalibration  # the camera's pose, how it scales depth, and its clock
     dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them

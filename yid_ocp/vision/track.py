@@ -34,7 +34,7 @@ from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, Wei
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
     ForeignObject,
-    SequenceCalibration,
+    SharedFrameEstimates,
     TubeDimensionEstimates,
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
@@ -71,7 +71,7 @@ def track_object(
     reasons). Raises `ConfigError` if a point does not exist in the system, and `ModelError` if meshes cannot be read.
     """
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
-    common = tracker.estimate_sequence_calibration()
+    common = tracker.estimate_shared_values()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
     return tracker.track_result_from_frame_reports(*tracker.drop_outlying_frames_and_choose_root_end(frames), common)
 
@@ -163,8 +163,8 @@ class FrameTracker:
             q[index] = self.joint_angles_at(t)
         return q
 
-    def estimate_sequence_calibration(self) -> SequenceCalibration:
-        """Estimate the calibration shared by the sequence from some of its frames."""
+    def estimate_shared_values(self) -> SharedFrameEstimates:
+        """Estimate what all frames share, from some of them: camera calibration, tube dimensions and background."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
         seen = (
@@ -197,7 +197,7 @@ class FrameTracker:
             near = self.shape_fitter.max_informative_surface_distance
             found = BackgroundPoints.from_point_clouds(clouds, 2 * filters.voxel_size, noise, shapes, near)
             background = found.merged_with(background)
-        return SequenceCalibration(calibration, sizes, background)
+        return SharedFrameEstimates(calibration, sizes, background)
 
     def _calibration(self) -> CameraCalibration:
         options = self.options
@@ -218,12 +218,13 @@ class FrameTracker:
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.joint_time_span is None or not usable:
             return
-        stamps, offset = self.sequence.stamps[list(usable)], self.options.clock.initial_offset
+        stamps, offset = self.sequence.stamps[list(usable)], self.options.clock.initial_stamp_minus_joint_time
         first, last = float(stamps.min()) - offset, float(stamps.max()) - offset
         (begin, end), reach = self.joint_time_span, self.options.clock.search_half_width
         if first > end + reach or last < begin - reach:
             spans = f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {begin:.3f} s to {end:.3f} s"
-            hint = f"set track.options.clock.initial_offset, {first + offset - begin:.3f} s if both started together"
+            hint = f"set track.options.clock.initial_stamp_minus_joint_time ({first + offset - begin:.3f} s if they "
+            hint += "started together)"
             what, where = f"the clocks differ: {spans}", self.sequence.source
             raise DataError(what, where=where, allowed="times that overlap", hint=hint)
 
@@ -288,7 +289,7 @@ class FrameTracker:
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
-    def process_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
+    def process_frame(self, index: int, common: SharedFrameEstimates) -> FrameReport:
         """Process one frame, independent of other frames, and return its report."""
         work, look = self._look(index, common.camera_calibration, common.background)
         if look is None:
@@ -308,7 +309,7 @@ class FrameTracker:
         work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
         return work.report
 
-    def frame_processing_stages(self, frame: FrameReport, common: SequenceCalibration) -> FrameProcessingStages | None:
+    def frame_processing_stages(self, frame: FrameReport, common: SharedFrameEstimates) -> FrameProcessingStages | None:
         """Processing stages of a frame, for figures. None if its cloud cannot be read."""
         calibration = common.camera_calibration
         try:
@@ -331,7 +332,7 @@ class FrameTracker:
         return frame_selection.mark_outlying_frames(rooted, self.options), note
 
     def track_result_from_frame_reports(
-        self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration
+        self, frames: Sequence[FrameReport], note: str, common: SharedFrameEstimates
     ) -> TrackResult:
         """Make the tracking result from frame reports. Raises `DataError` if no frame is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]

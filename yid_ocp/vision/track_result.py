@@ -46,7 +46,7 @@ class FrameReport:
         return not self.drop_reason
 
 
-def count_drop_reasons(frames: Iterable[FrameReport]) -> dict[str, int]:
+def count_dropped_frames_by_reason(frames: Iterable[FrameReport]) -> dict[str, int]:
     """Count dropped frames by reason, without the numbers in the reasons."""
     return dict(Counter(frame.drop_reason.partition(":")[0] for frame in frames if not frame.is_good).most_common())
 
@@ -92,7 +92,7 @@ class TrackResult:
     @property
     def frame_drop_reason_counts(self) -> dict[str, int]:
         """Number of frames dropped for each reason."""
-        return count_drop_reasons(self.frame_reports)
+        return count_dropped_frames_by_reason(self.frame_reports)
 
     @property
     def dimension_and_foreign_object_notes(self) -> tuple[str, ...]:

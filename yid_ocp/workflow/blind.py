@@ -265,7 +265,7 @@ def _draw_case(
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     ensemble.set_candidate_sensitivities_from_plain_data(read_input_json(detectable))
-    case, label = ensemble.draw_planned_case(blind.PlannedBlindCase(**planned))
+    case, label = ensemble.draw_recordings_and_ground_truth(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")
     told = {
@@ -466,9 +466,9 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
 
 
 def _require_compatible(run: RunSettings) -> None:
-    if run.diagnosis.noise_fraction_of_std < 1 or any(entry.std is not None for entry in run.sensors.values()):
+    if run.diagnosis.noise_fraction_of_stated_std < 1 or any(entry.std is not None for entry in run.sensors.values()):
         what = "the settings have noise levels, but virtual recordings have the noise of `run_virtual_experiment`"
-        allowed, hint = "settings without noise levels", "leave sensors.*.std and diagnosis.noise_fraction_of_std out"
+        allowed, hint = "no noise levels", "leave sensors.*.std and diagnosis.noise_fraction_of_stated_std out"
         raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:

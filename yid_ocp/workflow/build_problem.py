@@ -88,7 +88,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
                 sensors[name] = replace(said, used_points=cable.unclamped_vertex_names)
         for recording in recordings:
             lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording], _START_FRAMES)
-            if values := run.model.object.parameter_values_for_edge_lengths(lengths):
+            if values := run.model.object.recording_edge_length_parameters(lengths):
                 own[recording.name] = values
     return replace(
         run.problem,
@@ -107,7 +107,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
 
 def _checked_discretisations(run: RunSettings) -> tuple[RefinedDiscretisation, ...]:
     """Discretisations that are checked after a solve: from the settings, by default those relevant to the object."""
-    said, item = run.output.checked_discretisations, run.model.object
+    said, item = run.output.discretisation_check, run.model.object
     if said is None:
         said = "both" if item is not None and item.default_link_refinement else "time_step"
     kinds: dict[str, tuple[RefinedDiscretisation, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}

@@ -188,7 +188,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
     x = problem.initial_unknowns
     growth = discretisation.largest_alternating_error_growth(problem, x)
     if growth is not None and not growth.keeps_errors_below_resolution:
-        warnings.append(f"with the initial parameters {growth.description}")
+        warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")
         return {}

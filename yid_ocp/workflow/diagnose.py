@@ -64,7 +64,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     settings = load_config(arguments.config, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
-        settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
+        settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline_run_folders=said))
     return run_command_and_print(arguments, lambda shown: run_diagnose(settings, arguments.out, shown))
 
 
@@ -90,7 +90,7 @@ def run_diagnose(
             problem = add_baseline_prior(problem, pool_estimates_and_chi2(runs)[0])
         nominal: Solution | None = None
         try:
-            if run.diagnosis.noise_fraction_of_std < 1 and problem.held_out:
+            if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
                 # in units of noise, the solver would reject any fit and restart
                 logged.begin_stage("solving the nominal model", 5.0, 16.0)
                 nominal = solve(problem, run.solver, callback=logged.report_iterate)
@@ -101,7 +101,7 @@ def run_diagnose(
                 progress=logged,
                 known_fits=NominalSolutionAndRefitStore(nominal, refits),
                 baseline=EarlierRunsBaseline.from_runs(runs, without),
-                exclude=run.diagnosis.exclude,
+                exclude=run.diagnosis.excluded_candidates,
             )
         except KeyboardInterrupt:
             if len(refits):
@@ -192,22 +192,22 @@ class _LoggedProgress(Progress):
 
 def _flags(run: RunSettings) -> list[str]:
     said = run.key_locations
-    if any(at.startswith("--set") or key[:2] == ("diagnosis", "baseline") for key, at in said.items()):
+    if any(at.startswith("--set") or key[:2] == ("diagnosis", "baseline_run_folders") for key, at in said.items()):
         return []
-    return [part for folder in run.diagnosis.baseline for part in ("--baseline", folder)]
+    return [part for folder in run.diagnosis.baseline_run_folders for part in ("--baseline", folder)]
 
 
 def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> EstimationProblem:
-    """The problem with all stated standard deviations scaled by `diagnosis.noise_fraction_of_std` to noise alone."""
-    share, options = run.diagnosis.noise_fraction_of_std, problem.options
+    """Problem with all stated standard deviations scaled by `diagnosis.noise_fraction_of_stated_std` to noise alone."""
+    share, options = run.diagnosis.noise_fraction_of_stated_std, problem.options
     if share == 1:
         return problem
     sensors = dict(options.sensors)
     for group, field in sorted(_noise_levels(problem)):
         level = getattr(sensors[group], field) if group in sensors else None
         if level is None:
-            what = f"diagnosis.noise_fraction_of_std needs the {field} of '{group}', which is not set"
-            where, hint = ("diagnosis", "noise_fraction_of_std"), f"set sensors.{group}.{field}"
+            what = f"diagnosis.noise_fraction_of_stated_std needs the {field} of '{group}', which is not set"
+            where, hint = ("diagnosis", "noise_fraction_of_stated_std"), f"set sensors.{group}.{field}"
             raise run.config_error(what, *where, allowed="all noise levels under `sensors`, or 1", hint=hint)
         by_name = isinstance(level, Mapping)
         smaller: Any = {name: share * std for name, std in level.items()} if by_name else share * level

@@ -6,8 +6,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis import friction_ladder
-from yid_ocp.analysis.friction_ladder import FrictionLawFit, mean_and_std_error_over_motion_kinds
+from yid_ocp.analysis import friction_law_comparison
+from yid_ocp.analysis.friction_law_comparison import FrictionLawFit, mean_and_std_error_over_motion_kinds
 from yid_ocp.config.settings import FrictionLawSettings, RunSettings
 from yid_ocp.display import Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
@@ -33,8 +33,8 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         for law in EFFECT_KINDS_BY_FRICTION_LAW:
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
             settings = replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
-            problem = friction_ladder.problem_estimating_on_held_out_too(build_problem(settings))
-            kinds = friction_ladder.recording_names_by_name_stem(problem)
+            problem = friction_law_comparison.problem_estimating_on_held_out_too(build_problem(settings))
+            kinds = friction_law_comparison.recording_names_by_name_stem(problem)
             if len(kinds) < 2:
                 allowed = "two recordings or more in which the motors are on"
                 hint = "list more under recordings.estimate or recordings.held_out"
@@ -44,16 +44,17 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
                 continue
-            fits.append(friction_ladder.cross_validate_friction_law(law, problem, solution, kinds))
+            fits.append(friction_law_comparison.cross_validate_friction_law(law, problem, solution, kinds))
             solved[law] = (settings, problem, solution)
         if not fits:
             what, hint = "no friction law could be fitted", "run `yid-ocp check` with this configuration"
             where = run.setting_location("recordings")
             raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
-        best = friction_ladder.simplest_fit_within_std_error(fits, kinds)
+        best = friction_law_comparison.simplest_fit_within_std_error(fits, kinds)
         settings, problem, solution = solved[best.law]
         names = friction_parameter_names(settings, problem.system.parameters)
-        more = {"friction_clouds": friction_ladder.measured_and_predicted_friction_torques(problem, solution, names)}
+        clouds = friction_law_comparison.measured_and_predicted_friction_torques(problem, solution, names)
+        more = {"friction_clouds": clouds}
         result: dict[str, Any] = {
             "format": "yid-friction/1",
             "kinds": {kind: list(own) for kind, own in kinds.items()},
@@ -70,7 +71,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
 
 def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:
     mean, error = mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)
-    difference, paired = friction_ladder.prediction_error_difference_and_std_error(fit, best, kinds)
+    difference, paired = friction_law_comparison.prediction_error_difference_and_std_error(fit, best, kinds)
     return {
         "mean_error": mean,
         "standard_error": error,

@@ -233,7 +233,7 @@ def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> 
     rest = "unseen=unobservable_parameters open=unidentifiable_directions"
     starts = "first=initial_criterion value=final_criterion judged=configured_criterion finished=is_converged"
     return {
-        **attributes_by_name(run.plan, "inform=identify separate=discriminate"),
+        **attributes_by_name(run.plan, "inform=parameters_to_identify separate=effects_to_discriminate"),
         "parameters": {name: attributes_by_name(own, stds) for name, own in found.parameter_precisions.items()},
         "distances": [
             {"effect": first, "explained_by": second, "before": before, "after": after}
@@ -253,6 +253,6 @@ def discrimination_plan_settings(
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]
     return {
         "goal": "information",
-        "discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS],
+        "effects_to_discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS],
         "parameter_run_folder": str(folder),
     }

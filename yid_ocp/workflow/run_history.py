@@ -126,10 +126,10 @@ def read_result_file(file: Path) -> dict[str, Any]:
 
 
 def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]:
-    """Estimates of the runs in `diagnosis.baseline`. `ConfigError` if one has another model or is listed twice."""
+    """Estimates of `diagnosis.baseline_run_folders`. `ConfigError` if one has another model or is listed twice."""
     found: list[RunEstimates] = []
-    for i, folder in enumerate(run.diagnosis.baseline):
-        where = ("diagnosis", "baseline", i)
+    for i, folder in enumerate(run.diagnosis.baseline_run_folders):
+        where = ("diagnosis", "baseline_run_folders", i)
         try:
             own = read_estimates(folder)
         except DataError as error:
@@ -142,10 +142,10 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
             hint = f"compare model.{differing} with {Path(folder) / 'config.yaml'}"
             raise run.config_error(what, *where, allowed=_SAME_MODEL, hint=hint)
         found.append(own)
-    dependent = _dependent(run.diagnosis.baseline)
+    dependent = _dependent(run.diagnosis.baseline_run_folders)
     if dependent:
         allowed, hint = "runs without a common baseline", "give the later run only"
-        raise run.config_error(dependent, "diagnosis", "baseline", allowed=allowed, hint=hint)
+        raise run.config_error(dependent, "diagnosis", "baseline_run_folders", allowed=allowed, hint=hint)
     return tuple(found)
 
 
@@ -217,14 +217,14 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
     """Load recordings without the sought effect, from settings or baseline, and the reason if there are none."""
     found: list[Recording] = []
-    for i, path in enumerate(run.recordings.reference_recordings):
+    for i, path in enumerate(run.recordings.without_effect):
         file = resolve_recording_path(path)
         if not is_file(file):
-            where = ("recordings", "reference_recordings", i)
+            where = ("recordings", "without_effect", i)
             what, allowed = f"there is no such recording: {file}", "the path of an existing file"
             raise run.config_error(what, *where, allowed=allowed, hint="check the path")
         found.append(read_recording(file))
-    for folder in () if found else run.diagnosis.baseline:
+    for folder in () if found else run.diagnosis.baseline_run_folders:
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
@@ -241,10 +241,10 @@ def require_recordings_not_in_baseline(
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
-            where = ("diagnosis", "baseline")
+            where = ("diagnosis", "baseline_run_folders")
             what = f"{episode.name} is also a recording of the baseline, and would count twice"
-            if not runs or run.recordings.reference_recordings:
-                where = ("recordings", "reference_recordings")
+            if not runs or run.recordings.without_effect:
+                where = ("recordings", "without_effect")
                 what = f"{episode.name} is one of the reference recordings"
             hint = "leave it out of one of the two"
             raise run.config_error(what, *where, allowed="recordings of another time", hint=hint)

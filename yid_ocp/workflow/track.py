@@ -38,7 +38,7 @@ from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
-from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionEstimates
+from yid_ocp.vision.sequence_calibration import ForeignObject, SharedFrameEstimates, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import SceneModel, VirtualFramesWithTruth
 from yid_ocp.vision.track import FrameTracker
@@ -72,7 +72,7 @@ def _run_track(
                 tracker, recording = _frame_tracker(tasks.settings, system)
                 doubts = [] if recording is None else recording_quality_issues_with_model(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
-                common = tasks.estimate_sequence_calibration()
+                common = tasks.estimate_shared_values()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
                 frames, note = tracker.drop_outlying_frames_and_choose_root_end(done)
@@ -127,7 +127,7 @@ def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
 
 def _track_result(
     frames: Sequence[FrameReport],
-    common: SequenceCalibration,
+    common: SharedFrameEstimates,
     things: Sequence[ForeignObject],
     found: TrackResult | None,
 ) -> dict[str, Any]:
@@ -140,7 +140,7 @@ def _track_result(
         "things": [asdict(thing) for thing in things],
         "points": {} if found is None else _points(found),
         "truth_errors": {},
-        "dropped": track_result.count_drop_reasons(frames),
+        "dropped": track_result.count_dropped_frames_by_reason(frames),
         "fit_seconds": float(np.mean(spent)) if spent else 0.0,
         "frames": [_frame_result(frame, frame.shape_fit) for frame in frames],
     }
@@ -258,14 +258,14 @@ class _FrameTasks:
     input_hashes: dict[str, str]
     own_files: tuple[Path, ...] = ()
 
-    def estimate_sequence_calibration(self) -> SequenceCalibration:
+    def estimate_shared_values(self) -> SharedFrameEstimates:
         [found] = require_task_values(self._run(_calibrate_sequence_task, {"what is common": {}}, InlineExecutor()))
         if "refused" in found:
             raise DataError(**found["refused"])
-        return dataclass_from_plain_data(SequenceCalibration, found)
+        return dataclass_from_plain_data(SharedFrameEstimates, found)
 
     def track_frames(
-        self, tracker: FrameTracker, common: SequenceCalibration, workers: WorkerConfig | Executor, progress: Progress
+        self, tracker: FrameTracker, common: SharedFrameEstimates, workers: WorkerConfig | Executor, progress: Progress
     ) -> list[FrameReport]:
         names, told = tracker.sequence.frame_names, to_lossless_plain_data(common)
         tasks = {names[i]: {"common": told, "index": i} for i in tracker.frame_order}
@@ -335,7 +335,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # part of the key of the result
     try:
-        return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).estimate_sequence_calibration()))
+        return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).estimate_shared_values()))
     except DataError as error:
         return {"refused": attributes_by_name(error, "what where allowed hint")}
 
@@ -343,7 +343,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     del inputs
     tracker = _tracker(read_input_text(config), config)
-    found = tracker.process_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
+    found = tracker.process_frame(index, dataclass_from_plain_data(SharedFrameEstimates, common))
     return dict(to_lossless_plain_data(found))
 
 

@@ -257,7 +257,7 @@ class ClampedObject(Protocol):
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
         """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
 
-    def parameter_values_for_edge_lengths(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         """Parameter values from one recording's edge lengths [m]; empty if all recordings share the lengths."""
 
 

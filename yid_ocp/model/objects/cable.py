@@ -322,7 +322,7 @@ model:
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
         return clamped_cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
 
-    def parameter_values_for_edge_lengths(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         return (
             edge_length_parameter_values(self.topology(), edge_lengths) if self.has_edge_lengths_per_recording else {}
         )

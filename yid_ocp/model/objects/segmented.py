@@ -56,7 +56,8 @@ class FlexibleSegmentSettings:
     def _build_segment(self, name: str, damping: float, link_division: int) -> Segment:
         """Build the named `Segment`. Links are divided into `link_division` links at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
-            what, where, hint = f"segment '{name}' has no length", f"model.object.segments.{name}", "set one of the two"
+            what, hint = f"segment '{name}' has no length", "set one of the two"
+            where = f"model.object.named_segments.{name}"
             raise ModelError(what, where=where, allowed="length or link_lengths [m]", hint=hint)
         n = link_division
         # a rigidity does not depend on the number of links, a stiffness per joint does
@@ -96,7 +97,7 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
 
 
 def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
-    item = _SegmentedObject(segments=segments)
+    item = _SegmentedObject(named_segments=segments)
     return InitCommandObject(
         item, base.initial_parameters_with_comments(item.segment_definitions(), _RIGIDITY_RATIO[word])
     )
@@ -193,15 +194,15 @@ model:
   object:
     kind: segments
     mount: {parent_frame: tool0}
-    segments:
+    named_segments:
       trunk: {length: 0.5, mass: 0.05, radius: 0.01}                           # [m], [kg], [m]
       twig: {parent: trunk, length: 0.3, mass: 0.02, radius: 0.006, rpy: [0.5, 0.0, 0.0]}
 """,
-        "model.object.segments.NAME": """\
+        "model.object.named_segments.NAME": """\
 model:
   object:
     kind: segments
-    segments:
+    named_segments:
       beam: {length: 0.52, mass: 0.33, cross_section_size: [0.001, 0.08], links: 8, joint_axes: y, \
 stiffness_given_as_rigidity: true, clamped_at_base: true}
 """,
@@ -209,9 +210,9 @@ stiffness_given_as_rigidity: true, clamped_at_base: true}
 
     kind: Annotated[Literal["segments"], OptionInfo("kind of object")] = "segments"
     mount: Annotated[base.MountSettings, OptionInfo("pose of the root")] = field(default_factory=base.MountSettings)
-    segments: Annotated[Mapping[str, FlexibleSegmentSettings], OptionInfo("segments by name, parents first")] = field(
-        default_factory=dict
+    named_segments: Annotated[Mapping[str, FlexibleSegmentSettings], OptionInfo("segments by name, parents first")] = (
+        field(default_factory=dict)
     )
 
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        return [s._build_segment(name, damping, link_division) for name, s in self.segments.items()]
+        return [s._build_segment(name, damping, link_division) for name, s in self.named_segments.items()]
