@@ -246,6 +246,15 @@ def test_a_stiffness_that_is_known_to_be_small_is_found():
     assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))
 
 
+def test_a_small_value_is_found_where_no_rollout_succeeds_at_the_typical_size():
+    start = {"a.bend": 20.0, "b.bend": 1.2}
+    problem = Formula(
+        lambda x: [100 * (x["a.bend"] - 20.0), 300.0 * (x["b.bend"] - 1.2)], start, fails=lambda v: v["b.bend"] > 9.0
+    )
+    found = judged(problem, estimate(1.2, 0.003))
+    assert (found.verdict, found.std) == ("identifiable", 0.003)
+
+
 def test_the_papers_cost_and_a_failed_fit_have_no_intervals():
     problem = Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0})
     fitted = replace(solution(a=estimate(3.0, 10.0, "weak")), x=problem.initial_unknowns)

@@ -160,7 +160,7 @@ def mark_unidentifiable_near_zero_estimate(
         return entry
     rise = _Walk(problem, x, index, evaluation).rise(size)
     log.info("%s = %.3g: chi2 rises by %.3g up to %.3g", problem.unknown_names[index], entry.value, rise, size)
-    if rise > _CHI2_QUANTILE_999:
+    if not rise <= _CHI2_QUANTILE_999:  # also if no rollout succeeds there (nan), as with a payload of 9 kg
         return entry
     return replace(entry, verdict="not_identifiable", std=math.inf, interval=None)
 
