@@ -13,11 +13,8 @@ from heard import Heard
 from yid_ocp.diagnosis.refit import (
     RefitContext,
     StoredFit,
-    _block_duration,
     _effect_p_values,
-    _half_done,
     _held_out_loss,
-    load_stored_refit,
     refit_with_each_effect,
     refit_with_effects,
 )
@@ -39,6 +36,7 @@ class Problem:
         self.cost, self.rows, self.unknown_names, self.nominal_free_parameters = cost, rows, names, ("k",)
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters, self.has_process_noise = None, (), False
+        self.step = SimpleNamespace(time_step=0.01)
 
     @property
     def problem(self):
@@ -113,81 +111,33 @@ def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
     assert problem.at == 2 * [{**problem.named_values(np.ones(5)), "k": 2.0, A: 3.0, S: 0.9}]
 
 
-def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_runs_ended(solved):
-    problem, memory = fitting(good=7.0), Memory()
+def test_held_out_recordings_are_seen_about_the_torques_where_the_run_ended(solved):
+    problem, memory = Problem(lambda values: 7.0), Memory()
     found = refit_with_effects(problem, [FRICTION], START, memory)
-    assert len(solved.runs) == 2
     assert problem.foreseen == solved.losses == [found.values]
-    load_stored_refit(problem, [FRICTION], memory)
+    refit_with_effects(problem, [FRICTION], START, memory)
     assert problem.foreseen == solved.losses == 2 * [found.values]
 
 
 @pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
     monkeypatch.setattr(module, "torque_bias_change_in_stds", lambda before, after: apart)
-    monkeypatch.setattr(module, "_relinearizing", lambda problem: problem.evaluate)
+    monkeypatch.setattr(module, "problem_relinearized_at_torque_bias", lambda problem, x, frozen: problem)
     refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
-
-
-@cases(
-    "before, after, half",
-    {
-        "hardly anything is": (100.0, 98.0, False),
-        "a fifth of the excess": (100.0, 81.0, False),
-        "more than a fifth of the excess": (100.0, 80.9, True),
-        "all is": (100.0, 5.4, False),
-        "just not all": (100.0, 5.5, True),
-        "nothing to compare with": (None, 60.0, False),
-    },
-)
-def test_a_refit_that_explains_much_but_not_all_is_half_done(before, after, half):
-    """With ten residuals noise alone costs five; the excess of 100 is 95, and all is explained below 1.1 times five."""
-    problem = Problem(lambda values: before)
-    finish = costing(after, 10)
-    assert _half_done(problem, [FRICTION], {"k": 3.0, A: 9.0, S: 9.0}, finish, LIMITS) is half
-    # compared with the same model without the effect
-    assert all((asked["k"], asked[A], asked[S]) == (3.0, 0.25, 0.5) for asked in problem.asked)
 
 
 START = {"k": 5.0, "k[run]": 6.0, "start.q.k[run]": 7.0, A: 0.75, S: 0.9}
 
 
-def fitting(good, bad=60.0, plain=100.0):
-    """Cost `bad` from the nominal fit's values, `good` from the nominal initial ones, `plain` without the effect."""
-
-    def cost(values):
-        return plain if values[A] == 0.25 else bad if values["k"] == 5.0 else good
-
-    return Problem(cost)
-
-
-def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved):
-    problem = fitting(good=7.0)
+def test_a_refit_is_evaluated_where_it_ended(solved):
+    problem = Problem(lambda values: 7.0)
     found = refit_with_effects(problem, [FRICTION], START)
-    assert [run["k"] for run in solved.runs] == [5.0, 1.0]
-    again = {"k": 1.0, "k[run]": 1.0, "start.q.k[run]": 1.0, A: 0.75, S: 0.9}
-    assert solved.runs[1] == again
-    assert found.values == again
+    assert solved.runs == solved.losses == [found.values] == [START]
     assert found.cost == pytest.approx(7.0)
-    assert solved.losses == [again]
     assert found.std == dict.fromkeys(problem.unknown_names, 0.1)
-    assert (found.effects, found.solver_message, found.is_from_store) == ((FRICTION,), "done", False)
-    assert problem.warmed == ["there", (), "there"], "the shape at rest is looked for where it was"
-
-
-@cases(
-    "good, bad, runs",
-    {
-        "worse from there": (70.0, 60.0, [5.0, 1.0]),
-        "impossible from there": (None, 60.0, [5.0, 1.0]),
-        "not half done": (1.0, 5.0, [5.0]),
-    },
-)
-def test_the_first_of_two_refits_stands_unless_the_second_is_better(solved, good, bad, runs):
-    found = refit_with_effects(fitting(good, bad), [FRICTION], START)
-    assert [run["k"] for run in solved.runs] == runs
-    assert (found.values["k"], found.cost) == (5.0, pytest.approx(bad))
+    assert (found.effects, found.solver_message) == ((FRICTION,), "done")
+    assert problem.warmed == ["there"], "the shape at rest is looked for where it was"
 
 
 @pytest.mark.parametrize(("largest", "drawn"), [(2.0, 2.25), (1.3, 1.25), (0.7, 0.65), (0.4, 0.35), (0.26, 0.25)])
@@ -243,32 +193,27 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
-    store = Memory({"friction@elbow": StoredFit(values, std, {FRICTION.label: 0.2}, "long ago")})
+    store = Memory({"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2}, "long ago")})
     problem = Problem(lambda values: 5.0)
     found = refit_with_effects(problem, [FRICTION], START, store)
     assert solved.runs == []
-    assert (found.values, found.std, found.solver_message, found.is_from_store) == (values, std, "long ago", True)
+    assert (found.values, found.std, found.solver_message) == (values, std, "long ago")
     assert found.p_values == {FRICTION.label: 0.2}
     assert found.cost == pytest.approx(5.0)
     assert solved.losses == [values]
     assert problem.freed == (FRICTION,)
-    assert load_stored_refit(problem, [FRICTION], store).values == values
-    assert load_stored_refit(problem, [FRICTION], store, "another") is None
-    assert load_stored_refit(problem, [FRICTION], None) is None
+    # another start, or another time step, is another refit
+    assert refit_with_effects(problem, [FRICTION], START, store, "another").values == START
+    problem.step.time_step = 0.005
+    assert refit_with_effects(problem, [FRICTION], START, store).values == START
+    assert [*store] == ["friction@elbow at 0.01 s", "another at 0.01 s", "friction@elbow at 0.005 s"]
 
 
-@cases(
-    "values, std, known, cost",
-    {
-        "other unknowns": ({"k": 1.0}, {"k": 1.0}, {FRICTION.label: 0.2}, 5.0),
-        "deviations of others": (START, {"k": 1.0}, {FRICTION.label: 0.2}, 5.0),
-        "other effects": (START, dict.fromkeys(START, 0.3), {"k": 0.2}, 5.0),
-        "cannot be rolled out": (START, dict.fromkeys(START, 0.3), {FRICTION.label: 0.2}, None),
-    },
-)
-def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, known, cost):
-    store = Memory({"friction@elbow": StoredFit(values, std, known, "")})
-    assert load_stored_refit(Problem(lambda _: cost), [FRICTION], store) is None
+def test_a_stored_refit_that_cannot_be_rolled_out_is_solved_again(solved):
+    store = Memory({"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2}, "")})
+    found = refit_with_effects(Problem(lambda values: 5.0 if values[A] < 9.0 else None), [FRICTION], START, store)
+    assert solved.runs == [found.values] == [START]
+    assert store["friction@elbow at 0.01 s"].solver_message == "done"
 
 
 def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
@@ -277,8 +222,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
 
     def one(problem, effects, start, store, name, limits):
         asked.append((problem, [e.kind for e in effects], start, store, name, limits))
-        made = fit(effects, loss(1.2345, 1.2345))
-        return None if effects[-1] is third else SimpleNamespace(**vars(made) | {"is_from_store": effects[-1] is other})
+        return None if effects[-1] is third else fit(effects, loss(1.2345, 1.2345))
 
     monkeypatch.setattr(module, "refit_with_effects", one)
     search = RefitContext("problem", LIMITS, heard, "store")
@@ -286,15 +230,16 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     found = refit_with_each_effect(search, (effect("base@x"),), tried, {"k": 2.0})
     assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
     by_kind = {kinds[-1]: (problem, kinds, *rest) for problem, kinds, *rest in asked}
-    assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", "", LIMITS)
+    name = "base@x and friction@elbow"
+    assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", name, LIMITS)
     assert by_kind["offset"][2] == {"k": 3.0}
-    assert heard.stages == ["refitting with each of 3 effects beside base@x"]
+    assert heard.stages == ["refitting base@x with each of 3 effects"]
     both = [(f"base@x and {label}", "1.234") for label in ("friction@elbow", "offset@elbow")]
     assert (heard.table[0], sorted(heard.table[1:])) == (("effects", "held-out chi2/n"), both)
     assert sorted(text for done, _, text in heard.parts if done) == [
-        "no fit with third@x",
         "refitted with friction@elbow: held-out chi2/n 1.234",
-        "resumed the refit with offset@elbow: held-out chi2/n 1.234",
+        "refitted with offset@elbow: held-out chi2/n 1.234",
+        "refitted with third@x: no fit",
     ]
     # from elsewhere they have names of their own in the store
     refit_with_each_effect(search, (effect("base@x"),), tried, {}, "from there")
@@ -310,7 +255,7 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     def one(problem, effects, start, store, name, limits):
         now[0] += 10.0
         left = 9.0 - ord(effects[-1].kind)
-        return SimpleNamespace(**vars(fit(effects, loss(left, left))) | {"is_from_store": False})
+        return fit(effects, loss(left, left))
 
     def batched(function, entries):
         batches.append([of.kind for (of,), _ in entries])
@@ -335,14 +280,6 @@ def episode(name="other", steps=100, time_step=0.01, of=()):
     return SimpleNamespace(name=name, grid=grid, measurements=tuple(of))
 
 
-@cases(
-    "seconds, length",
-    {"short": ((10.0,), 0.5), "forty seconds": ((40.0,), 1.0), "two": ((30.0, 30.0), 1.5), "long": ((200.0,), 2.0)},
-)
-def test_held_out_time_is_cut_in_some_forty_blocks(seconds, length):
-    assert _block_duration([episode(steps=round(s / 0.01)) for s in seconds]) == pytest.approx(length)
-
-
 def measured(times, value, weight, time_step=0.01):
     t = np.asarray(times) / time_step
     node = np.floor(t + 1e-9).astype(int)
@@ -356,7 +293,7 @@ def predicting(monkeypatch):
 
     def channel_errors(results, episodes):
         told["episodes"] = [e.name for e in episodes]
-        return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}}
+        return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}} if results else {}
 
     monkeypatch.setattr(module, "rmse_unit_and_count_by_channel", channel_errors)
 
@@ -386,6 +323,18 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     np.testing.assert_allclose(found.block_sample_counts, [2 + 1 + 2, 4, 2])
     assert found.channel_rmse == {"a": (0.25, "m")}
     assert told["episodes"] == ["other"]
+
+
+@cases(
+    "seconds, length",
+    {"short": ((10.0,), 0.5), "forty seconds": ((40.0,), 1.0), "two": ((30.0, 30.0), 1.5), "long": ((200.0,), 2.0)},
+)
+def test_held_out_time_is_cut_in_some_forty_blocks(predicting, seconds, length):
+    """Of a sample at the begin and two about the end of the first block, the last one is alone."""
+    group = measured([0.0, 0.99 * length, 1.01 * length], np.ones((3, 2)), np.ones((3, 2)))
+    outputs = SimpleNamespace(predicted_outputs=(np.ones((3, 2)),))
+    problem, _ = predicting(*((episode(steps=round(s / 0.01), of=[group]), outputs) for s in seconds))
+    np.testing.assert_array_equal(_held_out_loss(problem, np.zeros(1)).block_sample_counts, [4.0, 2.0] * len(seconds))
 
 
 def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting):

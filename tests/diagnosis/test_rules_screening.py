@@ -147,7 +147,7 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
     weaker, larger = signature(of, [[0.0, 3.0]], s=0.3), signature(of, [[10.0, 0.0]], s=0.4)
     for pair, name, size, is_seen in (
         ((hidden, seen), "y", 0.5, True),
-        ((seen, hidden), "x", 0.1, True),
+        ((seen, hidden), "y", 0.5, True),
         ((seen, weaker), "y", 0.5, True),
         ((hidden, larger), "x", 0.1, False),
     ):

@@ -1,16 +1,13 @@
 """The steps of a diagnosis, each on its own."""
 
 import itertools
-import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from heard import Heard
 from made_series import series
 
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
-from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
+from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import (
     AllCandidatesLinearization,
     _candidate_detectable_amplitudes,
@@ -20,7 +17,6 @@ from yid_ocp.diagnosis.screening import (
     _score_candidates,
     linearize_candidates,
 )
-from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.null_test import residual_channels
 from yid_ocp.problem import EstimationProblem
@@ -113,28 +109,3 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     point = AllCandidatesLinearization(residual[:, 0], signatures)
     best = _score_candidates(point, [series(range(200))], _candidate_detectable_amplitudes(point))[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
-
-
-@pytest.mark.parametrize(
-    ("costs", "kept"),
-    [((99.0, 90.0, 94.0), 2.0), ((95.1, None, 120.0), None), ((94.9, None, 96.0), 4.0), ((98.0, 99.0, 80.0), 10.0)],
-)
-def test_the_nominal_model_starts_again_where_another_start_ends_far_likelier(monkeypatch, costs, kept):
-    """By a log Bayes factor of 5, from multiples of its start within bounds."""
-    module, asked = sys.modules["yid_ocp.diagnosis.diagnose"], {}
-
-    def refitted(composed, effects, start, store, name, limits):
-        factor = float(name.split()[4])
-        asked[factor] = tuple(start.values())
-        cost = dict(zip((4.0, 2.0, 10.0), costs, strict=True))[factor]
-        return None if cost is None else SimpleNamespace(cost=cost, values=factor)
-
-    monkeypatch.setattr(module, "refit_with_effects", refitted)
-    monkeypatch.setattr(module, "_settled", lambda search, start, name: start)
-    problem = SimpleNamespace(
-        initial_unknowns=np.array([1.0, -1.0]), positive_unknowns_mask=np.array([True, False]),
-        bounds=(np.array([0.0, -9.0]), np.array([8.0, 9.0])), named_values=lambda x: dict(zip("ab", x, strict=True)),
-    )  # fmt: skip
-    search = RefitContext(SimpleNamespace(problem=problem), Thresholds(), Heard(), None)
-    assert module._better_nominal_fit(search, SimpleNamespace(cost=100.0)) == kept
-    assert asked == {4.0: (4.0, -1.0), 2.0: (2.0, -1.0), 10.0: (8.0, -1.0)}

@@ -497,7 +497,7 @@ def diagnose_blind_case(
     ensemble: BlindCaseGenerator,
     case: BlindCase,
     candidates: CandidateNamesOrAll = "all",
-    thresholds: Thresholds | None = None,
+    thresholds: Thresholds = DEFAULT_THRESHOLDS,
 ) -> DiagnosisResult:
     """Diagnose a blind case from its recordings and exclusions, without its label."""
     problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]

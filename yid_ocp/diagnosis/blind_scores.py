@@ -542,7 +542,7 @@ def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> 
 
     The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
     `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,
-    time step, other starts) are not repeated. `DataError` if another version recorded the case.
+    time step) are not repeated. `DataError` if another version recorded the case.
     """
     if data.get("format") != _EVIDENCE_FORMAT:
         what = f"the evidence has the format '{data.get('format')}'"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import logging
@@ -31,54 +32,33 @@ from yid_ocp.diagnosis.hypotheses import (
     CandidateNamesOrAll,
     TruncatedHeldOutRecording,
     exclude_candidates,
-    join_effect_labels,
     make_candidate_effects,
 )
-from yid_ocp.diagnosis.law import GapLaw, find_gap_law
+from yid_ocp.diagnosis.law import find_gap_law
 from yid_ocp.diagnosis.refit import (
-    FinerStepRefitStore,
     NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
     RefittedModel,
-    StoredFit,
-    load_stored_refit,
     refit_in_all_candidates_step,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.screening import CandidateScore, screen_candidates
+from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
-from yid_ocp.errors import DataError, SolverError, failed_rollout_error
-from yid_ocp.inference.null_test import (
-    NullTestResult,
-    assumed_channel_noise_levels,
-    encoder_noise_residual_factor,
-    residual_channels,
-    residual_chi2_null_test,
-    residuals_exceed_noise,
-    whiten_with_extra_errors,
-)
-from yid_ocp.inference.smoother import (
-    GapLocation,
-    SmoothedUnknownsResult,
-    gap_locations_by_smoother_evidence,
-    gap_locations_from_effect_closures,
-    merge_time_intervals,
-    select_and_smooth_unknowns,
-)
+from yid_ocp.errors import SolverError, failed_rollout_error
+from yid_ocp.inference import null_test, smoother
+from yid_ocp.inference.null_test import NullTestResult
+from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
-from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.measurements import subtract_estimated_biases
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.measurements import ResidualAndJacobian, subtract_estimated_biases
 from yid_ocp.solvers import GaussNewton, Solution, solve
-from yid_ocp.solvers.base import INITIAL_VALUE_RESTART_FACTORS
 
-log = logging.getLogger(__name__)
-
-_SAME_WEIGHTS_STDS = 0.05  # change of a fit in stds from which its whitening is repeated
+_LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
@@ -87,9 +67,9 @@ def diagnose(
     candidates: CandidateNamesOrAll = "all",
     held_out: Sequence[Recording] = (),
     *,
-    thresholds: Thresholds | None = None,
-    progress: Progress | None = None,
-    known_fits: NominalSolutionAndRefitStore | None = None,
+    thresholds: Thresholds = DEFAULT_THRESHOLDS,
+    progress: Progress = _LOG_PROGRESS,
+    known_fits: NominalSolutionAndRefitStore = _NOTHING_KNOWN,
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
@@ -107,9 +87,9 @@ def diagnose(
         Effects to try, and exceptions from these, as `kind` or `kind@location`.
     held_out : sequence of Recording
         Recordings that no fit uses. Default: those of the problem. Without any, alternate blocks are held out.
-    progress : Progress, optional
+    progress : Progress
         Default: the package's log.
-    baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline, optional
+    baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
         Estimates of earlier runs of the same model (`read_estimates`), used as priors, so that changes since then are
         diagnosed. A problem that already has these priors (`add_baseline_prior`) is used as it is. An
         `EarlierRunsBaseline` can also hold reference recordings made without the sought effects; these are predicted
@@ -121,18 +101,22 @@ def diagnose(
         Verdict, effects with parameters in their own units, and fractions of the gap [1]; `to_dict` has all with units.
     """
     with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
-        clock = {"": time.perf_counter()}
-        told = progress or LoggingProgress(log)
-        known = known_fits or NominalSolutionAndRefitStore()
+        begun = time.perf_counter()
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
         earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_runs(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = add_baseline_prior(problem, earlier.combined_estimates)
-        composed = _composed(problem, candidates, exclude, held_out, told)
-        clock["compose"] = time.perf_counter()
-        limits = thresholds or DEFAULT_THRESHOLDS
-        search = RefitContext(composed, limits, told, known.store, clock[""] + (limits.budget or math.inf))
-        return _diagnosed(problem, _examined(problem, search, known.solution, clock), earlier, clock)
+        composed = _composed(problem, candidates, exclude, held_out, progress)
+        deadline = begun + (thresholds.budget or math.inf)
+        search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
+        _end_stage(search, "compose")
+        progress.begin_stage("fitting the nominal model", 3.0, 10.5)
+        nominal = fit_nominal_model(problem, composed, known_fits.solution, known_fits.store, thresholds)
+        return _diagnosed(problem, _examined(search, nominal), earlier)
+
+
+def _end_stage(search: RefitContext, stage: str) -> None:
+    search.stage_ends[stage] = time.perf_counter()
 
 
 @dataclass(frozen=True)
@@ -144,107 +128,191 @@ class _Examined:
     truncated: tuple[TruncatedHeldOutRecording, ...]
     whole: EstimationProblem  # the problem with all samples
     events: EventSet
-    smoothed: SmoothedUnknownsResult | None  # about the fit, on all recordings, if it was run
+    smoothed: SmoothedUnknownsResult | None  # about the fit, on all its recordings, if it was run
     evidence: NominalModelGapEvidence
-    stated_and_finer_time_step: tuple[float, float] | None = None  # if the error of the stated step was part of the gap
-
-    @property
-    def is_search_worthwhile(self) -> bool:
-        """Whether there is a gap, and enough samples to determine its cause."""
-        limits = self.search.thresholds
-        return self.evidence.has_gap(limits) and self.evidence.has_enough_samples(limits)
 
 
 def _examined(
-    problem: EstimationProblem, search: RefitContext, solution: Solution | None, clock: dict[str, float]
+    search: RefitContext, nominal: RefittedModel, known: tuple[TruncatedHeldOutRecording, ...] = ()
 ) -> _Examined:
-    limits, stated = search.thresholds, problem.step.time_step
-    search.progress.begin_stage("fitting the nominal model", 3.0, 10.5)
-    nominal = fit_nominal_model(problem, search.problem, solution, search.store, limits)
+    """Null tests and screening of the nominal model on data without events, at a time step that makes no gap."""
+    limits, residual = search.thresholds, nominal.evaluation.residual
+    excess = _excess_of(residual)
     # neither events nor candidates are sought while the step makes most of the gap
-    while finer := _at_finer_step_that_explains_gap(search, nominal):
-        search, nominal = finer
-    problem = problem.with_time_step(nominal.problem.step.time_step)
-    search, nominal, cuts = _followed(search, nominal)
-    clock["nominal"] = time.perf_counter()
-    found = _examined_about_fit(problem, search, nominal, cuts, clock)
-    while found.is_search_worthwhile:
-        ranked, own = found.evidence.screening.candidate_scores, found.search
-        own = replace(own, problem=replace(own.problem, candidate_effects=search.problem.candidate_effects))
-        if (finer := _at_finer_step_that_explains_gap(own, found.nominal, found.events, ranked)) is None:
-            break
-        problem = problem.with_time_step(finer[1].problem.step.time_step)
-        found = _examined_about_fit(problem, *_followed(*finer, found.truncated), clock)
-    little = 1 + limits.min_excess_chi2_per_dof
-    poor = found.is_search_worthwhile and found.evidence.nominal_test.chi2_per_dof < little
-    may_restart = poor and not search.record_skip_if_past_deadline("the nominal model from other starts")
-    if may_restart and (other := _better_nominal_fit(found.search, found.nominal)) is not None:
-        # the smoother's result belongs to another fit
-        found = _tested(*_followed(found.search, other, found.truncated), found.whole, found.events, None)
-    clock["other_starts"] = time.perf_counter()
-    used = found.nominal.problem.step.time_step
-    return found if used == stated else replace(found, stated_and_finer_time_step=(stated, used))
-
-
-def _examined_about_fit(
-    problem: EstimationProblem,
-    search: RefitContext,
-    nominal: RefittedModel,
-    cuts: tuple[TruncatedHeldOutRecording, ...],
-    clock: dict[str, float],
-) -> _Examined:
-    """Remove events found with a nominal fit, then run null tests and screening."""
+    is_poor = excess >= limits.min_excess_chi2_per_dof * len(residual)
+    if is_poor and (finer := _at_finer_step_that_explains(excess, search, nominal)):
+        return _examined(*finer, known)
+    search, nominal, cuts = _followed(search, nominal, known)
+    _end_stage(search, "nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
-    whole = _undivided(search.problem, problem)
+    whole = _undivided(search.problem)
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
-    clock["events"] = time.perf_counter()
-    found = _tested(search, nominal, cuts, whole, events, smoothed)
-    clock["screening"] = time.perf_counter()
-    return found
+    _end_stage(search, "events")
+    angles = _largest_joint_angles(nominal)
+    effects = tuple(effect.with_prior_ranges_scaled_to_angles(angles) for effect in search.problem.candidate_effects)
+    tests = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
+    search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
+    # the whitening of all hypotheses is fixed here
+    composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
+    screened = screen_candidates(composed, (), nominal.values, limits)
+    evidence = NominalModelGapEvidence(nominal, *tests, screened, _offsets_stated(nominal.problem))
+    _end_stage(search, "screening")
+    if evidence.has_gap(limits) and evidence.has_enough_samples(limits):
+        gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
+        if finer := _at_finer_step_that_explains(gap, search, nominal, events):
+            return _examined(*finer, cuts)
+    return _Examined(replace(search, problem=composed), nominal, cuts, whole, events, smoothed, evidence)
 
 
-def _diagnosed(
-    problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline, clock: dict[str, float]
-) -> DiagnosisResult:
-    search, nominal, evidence = seen.search, seen.nominal, seen.evidence
-    limits, held = search.thresholds, evidence.nominal_held_out_test
-    evidence = replace(evidence, has_left_baseline=earlier.fit_parameters_differ_significantly(nominal, limits))
+def _at_finer_step_that_explains(
+    gap: float, search: RefitContext, fit: RefittedModel, events: EventSet = NO_EVENTS
+) -> tuple[RefitContext, RefittedModel] | None:
+    """Hypotheses and nominal fit at half the time step, if that lowers r'r - n by more than half of a gap."""
+    search.progress.begin_stage("trying half the time step", 1.0, 8.5)
+    h, x, residual = fit.problem.step.time_step / 2, fit.problem.unknown_vector(fit.values), fit.evaluation.residual
+    finer = search.problem.with_time_step(h)
+    fine = problem_corrected_for_events(finer.problem, events)
+    left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
+    if left is None or (fall := _excess_of(residual) - _excess_of(left)) <= gap / 2:
+        return None
+    search.progress.begin_stage(f"half the time step lowers chi2 by {fall:.3g}: going on at {h:g} s")
+    search = replace(search, problem=finer)
+    return search, _fitted_nominal_model(search, fit.values)
+
+
+def _followed(
+    search: RefitContext, nominal: RefittedModel, known: tuple[TruncatedHeldOutRecording, ...]
+) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
+    """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
+    found = {cut.recording: cut for cut in known}
+    for margin in SIMULATED_DURATION_FRACTIONS_TO_KEEP:
+        if np.isfinite(nominal.held_out_loss.chi2_per_sample):
+            break
+        composed = replace(search.problem, problem=nominal.problem)
+        composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, margin)
+        for cut in cuts:
+            search.progress.begin_stage(held_out_truncation_message(cut))
+            found[cut.recording] = cut
+        search = replace(search, problem=composed)
+        name = f"the nominal model, limited to the part that it can follow ({margin:g})"
+        nominal = _fitted_nominal_model(search, nominal.values, name)
+    return search, nominal, tuple(found.values())
+
+
+def _undivided(composed: AllCandidatesProblem) -> EstimationProblem:
+    """The composed problem with all samples, even if a diagnosis divides a single recording in blocks."""
+    if not composed.is_split_in_blocks:
+        return composed.problem
+
+    def joined(own: Episode, other: Episode) -> Episode:
+        pairs = zip(own.measurements, other.measurements, strict=True)
+        parts = [replace(a, value=np.fmax(a.value, b.value), weight=a.weight + b.weight) for a, b in pairs]
+        return replace(own, measurements=tuple(parts))
+
+    return composed.problem.with_episodes(list(map(joined, composed.problem.episodes, composed.problem.held_out)), ())
+
+
+def _without_events(
+    search: RefitContext, nominal: RefittedModel, whole: EstimationProblem
+) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
+    """Remove what events explain, refit the nominal model, and examine it again."""
+    first = search.problem
+    events, smoothed = _happened(whole, nominal, search.thresholds)
+    for round_ in range(_MAX_EVENT_ROUNDS):
+        if not events:
+            break
+        less = replace(first, problem=problem_corrected_for_events(first.problem, events))
+        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events", 3.0, 8.5)
+        search, name = replace(search, problem=less), f"the nominal model without events, round {round_ + 1}"
+        nominal, before = _fitted_nominal_model(search, nominal.values, name), events
+        # the smoother's result includes the events
+        events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
+        if events.has_same_disturbances(before):
+            break
+    return search, nominal, events, None if first.is_split_in_blocks else smoothed
+
+
+def _happened(
+    whole: EstimationProblem, fit: RefittedModel, limits: Thresholds
+) -> tuple[EventSet, SmoothedUnknownsResult | None]:
+    """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
+    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.unknown_vector(fit.values)
+    guesses = fit.evaluation.equilibrium_guesses
+    judged = problem_with_whitening_at(own, x, guesses)
+    residual = judged.evaluate(x, False, guesses)
+    if not residual.ok:
+        return NO_EVENTS, None
+    test = _null_test(judged, residual.residual, len(fit.values), limits)
+    is_flagged = any(window.is_flagged for window in test.windows)
+    evaluation = own.evaluate(x, is_flagged, guesses)
+    if not evaluation.ok:
+        return NO_EVENTS, None
+    smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits) if is_flagged else None
+    found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
+    (pushed, others), share = found.split_force_from_other_events(), 1 - limits.min_event_chi2_fraction
+    if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
+        found = others
+    return found, smoothed
+
+
+def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
+    """r'r of a fit minus the number of used samples, over all recordings; infinite if they cannot be predicted."""
+    x, guesses = problem.unknown_vector(fit.values), fit.evaluation.equilibrium_guesses
+    judged = problem_with_whitening_at(problem, x, guesses)
+    evaluation = judged.evaluate(x, False, guesses)
+    if not evaluation.ok:
+        return math.inf
+    with contextlib.suppress(SolverError):
+        held_out = [part.residual for part in _held_out_residuals(judged, x)]
+        return _excess_of(np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out]))
+    return math.inf
+
+
+def _excess_of(residual: Array) -> float:
+    """r'r minus the number of used samples."""
+    return float(residual @ residual) - np.count_nonzero(residual)
+
+
+def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
+    search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
+    steps, end_stage = (problem.step.time_step, nominal.problem.step.time_step), functools.partial(_end_stage, search)
+    moved = earlier.fit_parameters_differ_significantly(nominal, limits)
+    evidence = replace(seen.evidence, has_left_baseline=moved)
     smoothed: SmoothedUnknownsResult | None = None
+    gap: GapLocalization | None = None
 
     def locate() -> GapLocalization:
-        nonlocal smoothed
+        nonlocal smoothed, gap
         search.progress.begin_stage("locating the gap", 1.0, 8.5)
         # without events, the smoother already ran on all fitted data
-        known = None if search.problem.is_split_in_blocks else seen.smoothed
-        smoothed = _smooth_about_model(nominal, limits) if known is None else known
+        smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
         by_chance = smoothed.dof_before - smoothed.dof_after
-        places = gap_locations_by_smoother_evidence(smoothed, limits.location_z)
-        return GapLocalization(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
+        places = smoother.gap_locations_by_smoother_evidence(smoothed, limits.location_z)
+        gap = GapLocalization(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
+        return gap
 
-    located = functools.cache(locate)
-
-    def finished(stage: str) -> None:
-        clock[stage] = time.perf_counter()
-
-    judged = judge(search, evidence, located, finished)
-    where = () if smoothed is None else located().locations
-    accepted, final = judged.accepted_selections, nominal
-    if accepted:
+    judged = judge(search, evidence, locate, end_stage)
+    where = rest = () if gap is None else gap.locations
+    remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
+    if accepted := judged.accepted_selections:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
         final = refit_in_all_candidates_step(search.problem, accepted[-1].refitted_model)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
-    remaining, rest = held, where
-    if accepted:
         remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
-    law = _law(problem, seen, judged.verdict, final, rest)
-    finished("law")
-    # a disturbance that a better model explains was no event
-    events = _happened(seen.whole, final, limits)[0] if accepted else seen.events
-    finished("remaining")
+        # a disturbance that a better model explains was no event
+        events = _happened(seen.whole, final, limits)[0]
+    end_stage("remaining")
+    # what no effect explains
+    open_ = rest if judged.verdict not in ("no_gap", "insufficient_data") else ()
+    places = [name for place in open_ for name in (place.location, *place.indistinguishable_from)]
+    is_finer = steps[0] != steps[1]
+    law = find_gap_law(search, problem.with_time_step(steps[1]) if is_finer else problem, final, places, seen.events)
+    end_stage("law")
+    ends = search.stage_ends
     finding = DiagnosisResult(
         **(vars(evidence) | vars(judged)),
-        noise_floor=assumed_channel_noise_levels(nominal.problem),
-        located_gap=None if smoothed is None else located(),
+        noise_floor=null_test.assumed_channel_noise_levels(nominal.problem),
+        located_gap=gap,
         record=search.record,
         smoother_result=smoothed,
         gap_locations=where,
@@ -254,162 +322,17 @@ def _diagnosed(
         is_split_in_blocks=search.problem.is_split_in_blocks,
         thresholds=limits,
         truncated_recordings=seen.truncated,
-        stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
+        stage_seconds={name: ends[name] - ends[last] for last, name in itertools.pairwise(ends)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
         counterfactual=earlier.counterfactual_prediction_errors(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
-        stated_and_finer_time_step=seen.stated_and_finer_time_step,
-        search_seconds=clock["refits"] - clock[""],
+        stated_and_finer_time_step=steps if is_finer else None,
+        search_seconds=ends["refits"] - ends[""],
         law=law,
     )
     finding = replace(finding, next_experiment=recommended_experiment_text(finding))
     return replace(finding, summary=diagnosis_summary_text(finding))
-
-
-def _law(
-    problem: EstimationProblem, seen: _Examined, verdict: str, final: RefittedModel, where: Sequence[GapLocation]
-) -> GapLaw | None:
-    """The law of the remaining gap, if no effect explains it or the accepted effects leave a gap."""
-    if verdict != "unknown" and not (final.effects and where):
-        return None
-    places = [name for place in where for name in (place.location, *place.indistinguishable_from)]
-    if seen.stated_and_finer_time_step is not None:
-        problem = problem.with_time_step(seen.stated_and_finer_time_step[1])
-    return find_gap_law(seen.search, problem, final, places, seen.events)
-
-
-def _at_finer_step_that_explains_gap(
-    search: RefitContext, fit: RefittedModel, events: EventSet = NO_EVENTS, ranked: Sequence[CandidateScore] = ()
-) -> tuple[RefitContext, RefittedModel] | None:
-    """Hypotheses and nominal fit at half the step, if it explains half of the best candidate's decrease or of all."""
-    h, residual = fit.problem.step.time_step / 2, fit.evaluation.residual
-    excess = float(residual @ residual) - np.count_nonzero(residual)
-    gap = max((score.predicted_chi2_decrease for score in ranked), default=excess)
-    if not ranked and excess < search.thresholds.min_excess_chi2_per_dof * len(residual):
-        return None
-    search.progress.begin_stage("trying half the time step", 1.0, 8.5)
-    finer, x = search.problem.with_time_step(h), fit.problem.unknown_vector(fit.values)
-    fine = problem_corrected_for_events(finer.problem, events)
-    left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
-    if left is None or excess - (rest := float(left @ left) - np.count_nonzero(left)) <= gap / 2:
-        return None
-    search.progress.begin_stage(f"half the time step lowers chi2 by {excess - rest:.3g}: going on at {h:g} s")
-    store = None if search.store is None else FinerStepRefitStore(search.store, h)
-    search = replace(search, problem=finer, store=store)
-    return None if (again := _settled(search, fit.values, "")) is None else (search, again)
-
-
-def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> EstimationProblem:
-    """The composed problem with all samples, even if a diagnosis divides a single recording in blocks."""
-    pairs = zip(composed.problem.episodes, problem.episodes, strict=True)
-    episodes = [replace(episode, measurements=own.measurements) for episode, own in pairs]
-    return composed.problem.with_episodes(episodes, () if composed.is_split_in_blocks else composed.problem.held_out)
-
-
-def _happened(
-    whole: EstimationProblem, fit: RefittedModel, limits: Thresholds, weighted: EstimationProblem | None = None
-) -> tuple[EventSet, SmoothedUnknownsResult | None]:
-    """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
-    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.unknown_vector(fit.values)
-    smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
-    if own.system.unprescribed_coordinate_indices:
-        judged = weighted or problem_with_whitening_at(own, x, guesses)
-        residual = judged.evaluate(x, False, guesses)
-        if not residual.ok:
-            return NO_EVENTS, None
-        test = _null_test(judged, residual.residual, len(fit.values), limits)
-        is_flagged = any(window.is_flagged for window in test.windows)
-    evaluation = own.evaluate(x, is_flagged, guesses)
-    if is_flagged:
-        smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits)
-    if not evaluation.ok:
-        return NO_EVENTS, None
-    found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
-    (pushed, others), share = found.split_force_from_other_events(), 1 - limits.min_event_chi2_fraction
-    if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
-        found = others
-    return found, smoothed
-
-
-def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
-    """r'r of a fit minus the number of used samples, over all recordings that can be predicted."""
-    x, guesses = problem.unknown_vector(fit.values), fit.evaluation.equilibrium_guesses
-    judged = problem_with_whitening_at(problem, x, guesses)
-    evaluation = judged.evaluate(x, False, guesses)
-    if not evaluation.ok:
-        return math.inf
-    rows = [evaluation.residual[judged.residual_rows.data]]
-    for i, (episode, result) in enumerate(judged.predict_held_out(x)):
-        if not isinstance(result, str):
-            rows.append(judged.whitened_held_out_prediction_residual(i, episode, result).residual)
-    counted = np.concatenate(rows)
-    return float(counted @ counted) - np.count_nonzero(counted)
-
-
-def _without_events(
-    search: RefitContext, nominal: RefittedModel, whole: EstimationProblem
-) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
-    """Remove what events explain, refit the nominal model, and examine it again."""
-    first, own = search.problem, None if search.problem.is_split_in_blocks else nominal.problem
-    events, smoothed = _happened(whole, nominal, search.thresholds, own)
-    for round_ in range(_MAX_EVENT_ROUNDS):
-        if not events:
-            break
-        less = replace(first, problem=problem_corrected_for_events(first.problem, events))
-        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events", 3.0, 8.5)
-        cleaned = replace(search, problem=less)
-        again = _settled(cleaned, nominal.values, f"the nominal model without events, round {round_ + 1}")
-        if again is None:
-            break
-        search, nominal, before = cleaned, again, events
-        # the smoother's result includes the events
-        events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
-        if events.has_same_disturbances(before):
-            break
-    return search, nominal, events, smoothed
-
-
-def _tested(
-    search: RefitContext,
-    nominal: RefittedModel,
-    cuts: tuple[TruncatedHeldOutRecording, ...],
-    whole: EstimationProblem,
-    events: EventSet,
-    smoothed: SmoothedUnknownsResult | None,
-) -> _Examined:
-    """Null tests and screening at a nominal fit, where the whitening of all hypotheses is fixed."""
-    angles, limits = _largest_joint_angles(nominal), search.thresholds
-    effects = tuple(effect.with_prior_ranges_scaled_to_angles(angles) for effect in search.problem.candidate_effects)
-    composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
-    before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
-    search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
-    screened = screen_candidates(composed, (), nominal.values, limits)
-    evidence = NominalModelGapEvidence(nominal, before, held, screened, _offsets_stated(nominal.problem))
-    return _Examined(replace(search, problem=composed), nominal, cuts, whole, events, smoothed, evidence)
-
-
-def _followed(
-    search: RefitContext, nominal: RefittedModel, before: tuple[TruncatedHeldOutRecording, ...] = ()
-) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
-    """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
-    found = before
-    for margin in SIMULATED_DURATION_FRACTIONS_TO_KEEP:
-        if np.isfinite(nominal.held_out_loss.chi2_per_sample):
-            break
-        composed = replace(search.problem, problem=nominal.problem)
-        composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, margin)
-        for cut in cuts:
-            search.progress.begin_stage(held_out_truncation_message(cut))
-        names = {cut.recording for cut in cuts}
-        found = (*(cut for cut in found if cut.recording not in names), *cuts)
-        shorter = replace(search, problem=composed)
-        again = _settled(
-            shorter, nominal.values, f"the nominal model, limited to the part that it can follow ({margin:g})"
-        )
-        if again is not None:
-            search, nominal = shorter, again
-    return search, nominal, found
 
 
 def _offsets_stated(problem: EstimationProblem) -> bool:
@@ -419,41 +342,19 @@ def _offsets_stated(problem: EstimationProblem) -> bool:
     return torques or any(episode.has_uncertain_sensor_biases for episode in problem.episodes)
 
 
-def _better_nominal_fit(search: RefitContext, nominal: RefittedModel) -> RefittedModel | None:
-    """The nominal model refitted from another start with a much higher likelihood; None if there is none."""
-    search.progress.begin_stage("fitting the nominal model from other starts", 6.0, 9.5)
-    problem, limits = search.problem.problem, search.thresholds
-
-    def begun(factor: float) -> RefittedModel | None:
-        x = problem.initial_unknowns
-        start = problem.named_values(np.where(problem.positive_unknowns_mask, np.clip(factor * x, *problem.bounds), x))
-        name = f"the nominal model from {factor:g} times its start"
-        return refit_with_effects(search.problem, (), start, search.store, name, limits)
-
-    best = nominal
-    for found in map_with_merged_calls(begun, INITIAL_VALUE_RESTART_FACTORS):
-        if found is not None and found.cost < best.cost - limits.min_log_bayes_factor:
-            best = found
-    return None if best is nominal else _settled(search, best.values, "the nominal model from a better start")
-
-
-def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> RefittedModel | None:
-    """The nominal model fitted from a start, with whitening fixed near its end."""
-    composed, limits = search.problem, search.thresholds
-    if composed.problem.has_process_noise:
-        composed = composed.whitened_at(start)
-        first = refit_with_effects(composed, (), start, limits=limits)
-        if first is not None:
-            slopes, vector = first.evaluation.jacobian, first.problem.unknown_vector
-            moved = vector(first.values) - vector(start)
-            if slopes is not None and float(np.linalg.norm(slopes @ moved)) < _SAME_WEIGHTS_STDS:
-                if search.store is not None:
-                    known = StoredFit(first.values, first.std, first.p_values, first.solver_message)
-                    search.store.put(name or join_effect_labels(()), known)
-                return first
-            start = first.values
-        composed = composed.whitened_at(start)
-    return refit_with_effects(composed, (), start, search.store, name, limits)
+def _fitted_nominal_model(search: RefitContext, start: Mapping[str, float], name: str = "") -> RefittedModel:
+    """The nominal model fitted from a start, with whitening fixed near its end. Raises `SolverError` if it fails."""
+    problem, limits = search.problem, search.thresholds
+    for store in (None, search.store) if problem.problem.has_process_noise else (search.store,):
+        problem = problem.whitened_at(start)
+        # a gap may move parameters so far that the solver's equilibrium is not found again from there
+        runs = (refit_with_effects(problem, (), own, store, name, limits) for own in (start, {}))
+        fit = next(filter(None, runs), None)
+        if fit is None:
+            raise failed_rollout_error("it fails at the fitted values", "nominal model")
+        start = fit.values
+    assert fit is not None
+    return fit
 
 
 def _composed(
@@ -479,11 +380,12 @@ def _after(
     before: NullTestResult, last: RefittedModel, where: tuple[GapLocation, ...], judged: Judgement, limits: Thresholds
 ) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
     """Held-out null test with the accepted effects, locations of the gap, and locations of the residual gap."""
-    remaining = _held_out_null_test(last, limits)
-    left = residuals_exceed_noise((_estimation_null_test(last, limits), remaining), limits.null_test_limits)
-    rest = gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.location_z) if left else ()
-    windows = merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
-    return remaining, gap_locations_from_effect_closures(where, judged.closure_by_location, rest, windows), rest
+    tests, rest = (_estimation_null_test(last, limits), _held_out_null_test(last, limits)), tuple[GapLocation, ...]()
+    if null_test.residuals_exceed_noise(tests, limits.null_test_limits):
+        rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.location_z)
+    windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
+    where = smoother.gap_locations_from_effect_closures(where, judged.closure_by_location, rest, windows)
+    return tests[1], where, rest
 
 
 def fit_nominal_model(
@@ -494,28 +396,13 @@ def fit_nominal_model(
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
     """Fit the nominal model within the problem with all candidates. Raises `SolverError` if the fit fails."""
-    known = load_stored_refit(composed, (), store)
-    if known is not None and composed.problem.has_process_noise:
-        known = load_stored_refit(composed.whitened_at(known.values), (), store)
-    if known is not None:
-        return known
     start: Mapping[str, float] = {}
-    begun = composed
     # a single recording that is both fitted and held out has no solution yet
-    if solution is not None or not composed.is_split_in_blocks:
-        found = solve(problem, GaussNewton(max_iterations=30), verdicts=False) if solution is None else solution
-        if found.evaluation is None:
-            raise failed_rollout_error(f"its fit fails: {found.message}", "nominal model")
-        start = dict(zip(found.unknown_names, map(float, found.x), strict=True))
-        if found.problem is not None and composed.problem.has_process_noise:
-            begun = composed.linearized_about_estimated_input_errors(found.problem)
-    fit = _settled(RefitContext(begun, limits, NULL_PROGRESS, store), start, "")
-    if fit is None and start:
-        # a gap may move parameters so far that the solver's equilibrium is not found again from there
-        fit = _settled(RefitContext(composed, limits, NULL_PROGRESS, store), {}, "the nominal model from its start")
-    if fit is None:
-        raise failed_rollout_error("it fails at the fitted values", "nominal model")
-    return fit
+    if solution is None and not composed.is_split_in_blocks:
+        solution = solve(problem, GaussNewton(max_iterations=30), verdicts=False)
+    if solution is not None:
+        start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
+    return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
 
 
 def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
@@ -530,47 +417,43 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 
 def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
     """The null test of a residual after a fit of the given number of parameters."""
-    samples = residual_channels(problem)
-    return residual_chi2_null_test(samples, residual, fitted, limits.significance_level, limits.residual_window)
+    samples, level = null_test.residual_channels(problem), limits.significance_level
+    return null_test.residual_chi2_null_test(samples, residual, fitted, level, limits.residual_window)
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
-    spread = encoder_noise_residual_factor(fit.problem, fit.problem.unknown_vector(fit.values))
-    residual = whiten_with_extra_errors(fit.evaluation.residual, spread)
+    spread = null_test.encoder_noise_residual_factor(fit.problem, fit.problem.unknown_vector(fit.values))
+    residual = null_test.whiten_with_extra_errors(fit.evaluation.residual, spread)
     return _null_test(fit.problem, residual, len(fit.values), limits)
+
+
+def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool = False) -> list[ResidualAndJacobian]:
+    """Whitened residual of each held-out recording. Raises `SolverError` if one cannot be predicted."""
+    found = []
+    for i, (episode, result) in enumerate(problem.predict_held_out(x, derivatives)):
+        if isinstance(result, str):
+            raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
+        found.append(problem.whitened_held_out_prediction_residual(i, episode, result))
+    return found
 
 
 def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
     """The null test of a model on the held-out recordings."""
-    problem, shared = fit.problem, len(fit.problem.shared_parameters)
-    residuals, slopes = [], []
-    for i, (episode, result) in enumerate(problem.predict_held_out(problem.unknown_vector(fit.values), True)):
-        if isinstance(result, str):
-            what, allowed = (
-                f"the held-out recording cannot be predicted: {result}",
-                "recordings that the model can follow",
-            )
-            hint = "hold out another recording"
-            raise DataError(what, where=f"recording '{episode.name}'", allowed=allowed, hint=hint)
-        rows = problem.whitened_held_out_prediction_residual(i, episode, result)
-        assert rows.jacobian is not None
-        residuals.append(rows.residual)
-        slopes.append(rows.jacobian[:, :shared])
-    x, own = problem.unknown_vector(fit.values), problem.with_episodes(problem.held_out, ())
+    problem, x, shared = fit.problem, fit.problem.unknown_vector(fit.values), len(fit.problem.shared_parameters)
+    own, filters = problem.with_episodes(problem.held_out, ()), problem.held_out_whitening_filters
 
-    def predicted(moved: EstimationProblem) -> Array | None:
-        other = problem.with_episodes(problem.episodes, moved.episodes)
-        parts = []
-        for i, (episode, result) in enumerate(other.predict_held_out(x)):
-            if isinstance(result, str):
-                return None
-            parts.append(other.whitened_held_out_prediction_residual(i, episode, result).residual)
-        return np.concatenate(parts)
+    def residual_of(moved: EstimationProblem) -> Array | None:
+        other = problem.with_episodes(problem.episodes, moved.episodes, problem.whitening_filters, filters)
+        with contextlib.suppress(SolverError):
+            return np.concatenate([part.residual for part in _held_out_residuals(other, x)])
+        return None
 
-    spread = np.vstack(slopes) @ unknowns_covariance_factor(problem, fit.evaluation)[:shared]
-    if (by_path := encoder_noise_residual_factor(own, x, predicted)).size:
-        spread = np.hstack([spread, by_path])
-    residual = whiten_with_extra_errors(np.concatenate(residuals), spread)
+    found = _held_out_residuals(problem, x, True)
+    residual = np.concatenate([part.residual for part in found])
+    slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
+    by_parameters = slopes @ unknowns_covariance_factor(problem, fit.evaluation)[:shared]
+    by_path = null_test.encoder_noise_residual_factor(own, x, residual_of)[: len(residual)]
+    residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
     return _null_test(own, residual, 0, limits)
 
 
@@ -587,4 +470,4 @@ def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnkno
         ]
         problem = problem.with_episodes(less, ())
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
-    return select_and_smooth_unknowns(problem, x, evaluation, limits)
+    return smoother.select_and_smooth_unknowns(problem, x, evaluation, limits)

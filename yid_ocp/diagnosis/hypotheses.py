@@ -164,19 +164,13 @@ class AllCandidatesProblem:
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
         """Problem whitened by sensor and torque noise, with filters linearised at `values`."""
+        if not self.problem.has_process_noise:
+            return self
         # filters are linearised about the estimated torques, so these must be known first
         x, errors = self.problem.unknown_vector(values), (episode.input_errors for episode in self.problem.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
         made = problem_with_whitening_at(self.problem, x, rounds=1 if known else 2)
         return replace(self, problem=problem_with_held_out_kalman_whitening(made, x))
-
-    def linearized_about_estimated_input_errors(self, solved: EstimationProblem) -> AllCandidatesProblem:
-        """Problem linearised about the input errors that a solved problem of the same recordings estimated."""
-        pairs = list(zip(self.problem.episodes, solved.episodes, strict=True))
-        if any(own.grid.steps != other.grid.steps for own, other in pairs):
-            return self
-        episodes = [replace(own, input_errors=other.input_errors) for own, other in pairs]
-        return replace(self, problem=self.problem.with_episodes(episodes, self.problem.held_out))
 
     def with_time_step(self, time_step: float) -> AllCandidatesProblem:
         """Problem with another time step [s] and the whole recordings, whitened by sensor noise alone."""

@@ -44,7 +44,7 @@ REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_toleranc
 """A refit starts near its end and must be good to a small part of its std only."""
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
-_HALF_DONE_FRACTION = 0.2  # explained fraction of the excess from which a refit that leaves more than noise is repeated
+_BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -110,7 +110,10 @@ class RefittedModel(RefitStatistics):
 
     problem: EstimationProblem  # composed system; free nominal parameters and parameters of the effects
     evaluation: Evaluation
-    is_from_store: bool = False
+
+    def statistics(self) -> RefitStatistics:
+        """The fit without its problem and evaluation."""
+        return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
 
 
 class RefitStore(Protocol):
@@ -121,22 +124,6 @@ class RefitStore(Protocol):
 
     def put(self, name: str, refitted: StoredFit) -> None:
         """Store a refit under a name."""
-
-
-@dataclass(frozen=True)
-class FinerStepRefitStore:
-    """Refits of another store made at a finer time step [s] than stated, under separate names."""
-
-    store: RefitStore
-    time_step: float
-
-    def get(self, name: str) -> StoredFit | None:
-        """The refit stored under a name at this time step, or None."""
-        return self.store.get(f"{name} at {self.time_step:g} s")
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit under a name and this time step."""
-        self.store.put(f"{name} at {self.time_step:g} s", refitted)
 
 
 @dataclass(frozen=True)
@@ -153,9 +140,8 @@ class EffectSearchRecord:
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # by name; next to effects in the model
-    pairs: dict[str, tuple[ScoredCandidatePair, ...]] = field(
-        default_factory=dict
-    )  # by the label of the excluded effect
+    # by the label of the excluded effect
+    pairs: dict[str, tuple[ScoredCandidatePair, ...]] = field(default_factory=dict)
 
 
 class UnrecordedRefitError(LookupError):
@@ -176,22 +162,23 @@ class RefitContext:
     store: RefitStore | None = None
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
-    left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
+    stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
     is_finished: bool = False
 
     def record_skip_if_past_deadline(self, *what: str) -> bool:
         """Whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
         is_late = time.perf_counter() >= self.deadline
-        self.skipped.extend(what if is_late else ())
+        self.skipped.extend(what * is_late)
         return is_late
 
     def refit(
         self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str = ""
     ) -> RefitStatistics | None:
         """Refit the model with some effects; None if no rollout succeeds. `name` distinguishes different starts."""
+        name = name or join_effect_labels(effects)
         asked = (self.problem, effects, start, self.store, name, self.thresholds)
-        return self._answer(self.record.refits, name or join_effect_labels(effects), lambda: refit_with_effects(*asked))
+        return self._answer(self.record.refits, name, lambda: refit_with_effects(*asked))
 
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
         """Fit the same effects on the held-out recordings. None if that is not possible."""
@@ -205,17 +192,15 @@ class RefitContext:
         self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
         problem = self.problem.problem
         turned = replace(self.problem, problem=problem.with_episodes(problem.held_out, problem.episodes))
-        turned = turned.whitened_at(fit.values) if problem.has_process_noise else turned
         # parameters shared by both sets of recordings, without initial states
-        names = {*turned.nominal_free_parameters, *(n for effect in fit.effects for n in effect.parameters.names)}
-        start = {name: value for name, value in fit.values.items() if name in names}
-        return refit_with_effects(turned, fit.effects, start, self.store, name, self.thresholds)
+        names = (*problem.free, *(name for effect in fit.effects for name in effect.parameters.names))
+        start = {name: fit.values[name] for name in fit.values.keys() & names}
+        return refit_with_effects(turned.whitened_at(fit.values), fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
         """Screen all candidates in addition to some effects. `name` says which fit provides `values`."""
-        return self._answer(
-            self.record.screenings, name, lambda: screen_candidates(self.problem, base, values, self.thresholds)
-        )
+        asked = (self.problem, base, values, self.thresholds)
+        return self._answer(self.record.screenings, name, lambda: screen_candidates(*asked))
 
     def ranked_candidate_pairs(self, screened: ScreeningResult, without: str = "") -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, without one label. See `_MAX_RECORDED_PAIRS`."""
@@ -231,9 +216,8 @@ class RefitContext:
             return answers[name]
         found = work()
         # a model's rollouts would fill the memory
-        light = isinstance(found, RefittedModel)
-        kept = {own.name: getattr(found, own.name) for own in fields(RefitStatistics)} if light else {}
-        answers.setdefault(name, cast(_Answer, RefitStatistics(**kept)) if light else found)
+        light = found.statistics() if isinstance(found, RefittedModel) else found
+        answers.setdefault(name, cast(_Answer, light))
         return found
 
 
@@ -241,13 +225,8 @@ _MAX_RECORDED_PAIRS = 48
 """Number of recorded pairs of candidates; all further pairs predict a smaller decrease than the refitted pairs."""
 
 
-@dataclass(frozen=True)
-class _Attempt:
-    """End of a run, and its problem, with filters linearised about the torques there."""
-
-    problem: EstimationProblem
-    outcome: SolverResult
-    finish: Evaluation
+_Attempt = tuple[EstimationProblem, SolverResult, Evaluation]
+"""Problem with filters linearised about the torques at the end of a run, the run, and the evaluation at its end."""
 
 
 def refit_with_effects(
@@ -260,108 +239,65 @@ def refit_with_effects(
 ) -> RefittedModel | None:
     """Fit nominal and effect parameters, and predict held-out recordings. Returns None if no rollout succeeds.
 
-    `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` is
-    the name in the store of refits; the default, the labels of the effects, suffices if no other start is tried.
+    `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name`, by
+    default the labels of the effects, and the time step are the name in the store of refits.
     """
     problem = problem.restricted_to_effect_location(effects)
-    known = load_stored_refit(problem, effects, store, name)
-    if known is not None:
+    name = f"{name or join_effect_labels(effects)} at {problem.problem.step.time_step:g} s"
+    if store is not None and (stored := store.get(name)) and (known := _restored(problem, effects, stored)):
         return known
-    best = _attempt(problem, effects, start)
-    if best is not None and _half_done(problem, effects, start, best.finish, limits):
-        # the nominal fit may have moved its parameters to a point from which this model does not return
-        fresh = {
-            key: value
-            for key, value in start.items()
-            if key.split("[")[0] not in problem.nominal_free_parameters and not key.startswith("start.")
-        }
-        best = _cheaper(best, _attempt(problem, effects, fresh) if len(fresh) < len(start) else None)
-    # earlier effects were already tried from both starts
-    for effect in effects[-1:]:
-        moved = effect.alternative_start(start)
-        if moved is None or (best is not None and _leaves_noise(best.finish, limits)):
-            continue
-        best = _cheaper(best, _attempt(problem, effects, {**start, **moved}))
+    runs = [_attempt(problem, effects, start)]
+    runs += [_attempt(problem, effects, other) for other in _other_starts(problem, effects, start, runs[0], limits)]
+    best = min(filter(None, runs), key=lambda run: run[-1].cost, default=None)
     if best is None:
         return None
-    x, finish = best.outcome.x, best.finish
-    values = best.problem.named_values(x)
-    own = problem.with_relinearized_held_out_filters(best.problem, effects, values)
+    own, outcome, finish = best
+    values = own.named_values(outcome.x)
+    own = problem.with_relinearized_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
     std = _mark_uninformative_std(effects, own.named_values(np.linalg.norm(factor, axis=1)))
-    found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, x, factor), best.outcome.message)
+    found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
     if store is not None:
-        store.put(name or join_effect_labels(effects), found)
-    return _model(found, effects, own, finish, x)
+        store.put(name, found)
+    return _model(found, effects, own, finish)
 
 
-def load_stored_refit(
-    problem: AllCandidatesProblem, effects: Sequence[EffectBase], store: RefitStore | None, name: str = ""
-) -> RefittedModel | None:
-    """Restore a refit from the store by one evaluation. None if it is not in the store."""
-    known = None if store is None else store.get(name or join_effect_labels(effects))
-    unknowns = {*problem.with_nominal_and_effects_free(effects).unknown_names}
-    labels = {effect.label for effect in effects}
-    if known is None or not (set(known.values) == set(known.std) == unknowns and set(known.p_values) == labels):
-        return None
+def _restored(problem: AllCandidatesProblem, effects: Sequence[EffectBase], known: StoredFit) -> RefittedModel | None:
+    """A refit evaluated at its known values. None if the rollout fails."""
     own = problem.with_effects_and_relinearized_filters(effects, known.values)
-    x = own.unknown_vector(known.values)
-    finish = own.evaluate(x)
-    if not finish.ok:
-        return None
+    finish = own.evaluate(own.unknown_vector(known.values))
     own = problem.with_relinearized_held_out_filters(own, effects, known.values)
-    return _model(known, effects, own, finish, x, True)
+    return _model(known, effects, own, finish) if finish.ok else None
 
 
 def refit_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
-    """A refit with its problem and evaluation in the step of all candidates; its statistics are kept."""
+    """A refit with its problem and evaluation in the step of all candidates; its estimates are kept."""
     if fit.problem.step is problem.problem.step:
         return fit
-    own = problem.with_effects_and_relinearized_filters(fit.effects, fit.values)
-    finish = own.evaluate(own.unknown_vector(fit.values))
-    own = problem.with_relinearized_held_out_filters(own, fit.effects, fit.values)
-    return replace(fit, problem=own, evaluation=finish)
+    return _restored(problem, fit.effects, fit) or fit
 
 
 def _model(
-    known: StoredFit,
-    effects: Sequence[EffectBase],
-    own: EstimationProblem,
-    finish: Evaluation,
-    x: Array,
-    is_from_store: bool = False,
+    known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, finish: Evaluation
 ) -> RefittedModel:
     kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), finish.cost)
-    size = (len(finish.residual), own.has_process_noise)
-    return RefittedModel(*kept, _held_out_loss(own, x), *size, own, finish, is_from_store)
+    loss = _held_out_loss(own, own.unknown_vector(known.values))
+    return RefittedModel(*kept, loss, len(finish.residual), own.has_process_noise, own, finish)
 
 
-def _half_done(
+def _other_starts(
     problem: AllCandidatesProblem,
     effects: Sequence[EffectBase],
     start: Mapping[str, float],
-    finish: Evaluation,
+    first: _Attempt | None,
     limits: Thresholds,
-) -> bool:
-    """Whether a refit explains much, but by far not all, of the gap left without its effects."""
-    own, count = problem.with_nominal_and_effects_free(effects), len(finish.residual)
-    x = own.unknown_vector({**start, **neutral_effect_parameter_values(effects)})
-    before = own.evaluate(x, False, finish.equilibrium_guesses)
-    if 2 * finish.cost < (1 + limits.min_excess_chi2_per_dof) * count or not before.ok:
-        return False
-    return before.cost - finish.cost > _HALF_DONE_FRACTION * (before.cost - count / 2)
-
-
-def _leaves_noise(finish: Evaluation, limits: Thresholds) -> bool:
-    """Whether a refit leaves no more than noise, so that no other start can be better."""
-    return chi2_p_value(2 * finish.cost, len(finish.residual)) >= limits.significance_level
-
-
-def _cheaper(first: _Attempt | None, second: _Attempt | None) -> _Attempt | None:
-    """The attempt with the lower cost, the first if equal."""
-    if first is None or second is None:
-        return first or second
-    return second if second.finish.cost < first.finish.cost else first
+) -> list[Mapping[str, float]]:
+    """Further starts of a refit whose first run failed or leaves more than noise."""
+    if first is not None and chi2_p_value(2 * first[-1].cost, len(first[-1].residual)) >= limits.significance_level:
+        return []
+    # earlier effects were already tried from both starts
+    moved = [effect.alternative_start(start) for effect in effects[-1:]]
+    return [{**start, **values} for values in moved if values is not None]
 
 
 def _attempt(
@@ -379,34 +315,28 @@ def _attempt(
     # without effects, all filters are fixed anew at the end of the run
     if found is None or not effects:
         return found
-    filters = problem.problem.whitening_filters, found.problem.whitening_filters
-    if torque_bias_change_in_stds(*filters) < _RELINEARIZE_Z:
+    moving = found[0]
+    if torque_bias_change_in_stds(problem.problem.whitening_filters, moving.whitening_filters) < _RELINEARIZE_Z:
         return found
-    # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
-    outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _relinearizing(found.problem))
-    return found if outcome.status == Status.FAILED else _cheaper(found, _seen(problem, effects, outcome))
-
-
-def _relinearizing(problem: EstimationProblem) -> Callable[..., Evaluation]:
-    """Evaluate with filters linearised about the torques at each point, starting from the previous filters."""
 
     def evaluate(
         x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
-        nonlocal problem
-        problem = problem_relinearized_at_torque_bias(problem, x, x)
-        return problem.evaluate(x, derivatives, equilibrium_guesses)
+        nonlocal moving
+        moving = problem_relinearized_at_torque_bias(moving, x, x)
+        return moving.evaluate(x, derivatives, equilibrium_guesses)
 
-    return evaluate
+    # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
+    again = _seen(problem, effects, REFIT_SOLVER.minimize_cost(moving, outcome.x, None, evaluate))
+    return again if again is not None and again[-1].cost < found[-1].cost else found
 
 
 def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt | None:
     """The end of a run, linearised about the torques there."""
-    placed = problem.with_effects_and_relinearized_filters(
-        effects, problem.with_nominal_and_effects_free(effects).named_values(outcome.x)
-    )
+    values = problem.with_nominal_and_effects_free(effects).named_values(outcome.x)
+    placed = problem.with_effects_and_relinearized_filters(effects, values)
     finish = placed.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses)
-    return _Attempt(placed, outcome, finish) if finish.ok else None
+    return (placed, outcome, finish) if finish.ok else None
 
 
 def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
@@ -458,64 +388,52 @@ def refit_with_each_effect(
     """
     if not tried:
         return []
-    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
-    noun, head = "effects" if len(tried[0][0]) == 1 else "pairs", ("effects", "held-out chi2/n")
+    noun, head = ("effects", "pairs")[len(tried[0][0]) - 1], ("effects", "held-out chi2/n")
+    text = f"refitting {join_effect_labels(base)} with each of {len(tried)} {noun}"
     # one effect is often enough; otherwise pairs, more effects and replacements follow
-    ahead = 11.0 if noun == "pairs" else {0: 8.0, 1: 14.0}.get(len(base), 9.0)
-    search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}", 2 + 0.5 * len(tried), ahead)
+    search.progress.begin_stage(text, 2 + 0.5 * len(tried), (8.0, 14.0, 9.0)[min(len(base), 2)])
     parts = PartsDoneCounter(search.progress, len(tried), join_effect_labels(tried[0][0]))
+
+    def table() -> list[tuple[str, str]]:
+        known = {name: fit.held_out_loss.chi2_per_sample for name, fit in [*search.record.refits.items()] if fit}
+        return [head, *((name, f"{left:.4g}") for name, left in sorted(known.items(), key=lambda entry: entry[1]))]
 
     def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefitStatistics | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
-        name = f"{join_effect_labels(effects)} {where}" if where else ""
-        fit = search.refit(effects, {**values, **entry[1]}, name)
-        text = f"no fit with {label}"
-        if fit is not None:
-            how = "resumed the refit" if getattr(fit, "is_from_store", False) else "refitted"
-            search.left_by[join_effect_labels(effects)] = left = f"{fit.held_out_loss.chi2_per_sample:.4g}"
-            text = f"{how} with {label}: held-out chi2/n {left}"
-        parts.count_done(text, lambda: [head, *sorted(search.left_by.items(), key=lambda entry: float(entry[1]))])
+        fit = search.refit(effects, {**values, **entry[1]}, f"{join_effect_labels(effects)} {where}".strip())
+        left = "no fit" if fit is None else f"held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"
+        parts.count_done(f"refitted with {label}: {left}", table)
         return fit
 
     fits: list[RefitStatistics | None] = []
     rest, begun = list(tried), time.perf_counter()
     while rest and not search.record_skip_if_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
         # a batch is cheaper than single refits; with a deadline, only as many as fit, best first
-        count, now = len(rest), time.perf_counter()
-        if search.deadline < math.inf:
-            count = int((search.deadline - now) * len(fits) / max(now - begun, 1e-9)) if fits else 1
-        batch, rest = rest[: max(count, 1)], rest[max(count, 1) :]
+        now = time.perf_counter()
+        paced = len(rest) if search.deadline == math.inf else (search.deadline - now) * len(fits) / (now - begun + 1e-9)
+        count = max(int(paced), 1)
+        batch, rest = rest[:count], rest[count:]
         fits += map_with_merged_calls(one, batch)
     return [fit for fit in fits if fit is not None]
 
 
-def _block_duration(episodes: Sequence[Episode]) -> float:
-    """Length of the held-out time blocks [s]: about forty blocks of 0.5 s to 2 s."""
-    total = sum(episode.grid.steps * episode.grid.time_step for episode in episodes)
-    return float(np.clip(total / 40, 0.5, 2.0))
-
-
 def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
     """Loss of a model on the held-out recordings; initial states are found in the same way for every model."""
-    length, found = _block_duration(problem.held_out), problem.predict_held_out(x)
-    squares: list[Array] = []
-    counts: list[Array] = []
+    total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
+    length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
+    found, squares, counts = problem.predict_held_out(x), [], []
     for i, (episode, result) in enumerate(found):
-        number = int(episode.grid.steps * episode.grid.time_step / length) + 1
         blocks = []
         for samples in episode.measurements:
-            used, block = samples.positive_weight_mask, times_since_recording_start(episode, samples) / length
-            block = np.minimum(block.astype(int), number - 1).reshape(len(block), -1)
+            used, times = samples.positive_weight_mask, times_since_recording_start(episode, samples)
+            block = np.trunc(times / length).reshape(len(times), -1)
             blocks.append(np.broadcast_to(block, used.shape)[used])
-        of_row = np.concatenate(blocks)
-        count = np.bincount(of_row, minlength=number).astype(float)
-        if isinstance(result, str):
-            total = np.full(number, np.inf)
-        else:
-            rows = problem.whitened_held_out_prediction_residual(i, episode, result).residual
-            total = np.bincount(of_row, weights=rows**2, minlength=number)
-        squares.append(total[count > 0])
-        counts.append(count[count > 0])
+        block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
+        residual = np.full(len(block), np.inf)
+        if not isinstance(result, str):
+            residual = problem.whitened_held_out_prediction_residual(i, episode, result).residual
+        squares.append(np.bincount(block, weights=residual**2))
+        counts.append(np.bincount(block).astype(float))
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
         found = problem_with_sensor_noise_only(problem).predict_held_out(x)
@@ -528,13 +446,12 @@ def held_out_rmse_and_unit_by_channel(
 ) -> dict[str, tuple[float, str]]:
     """Root mean square error and unit of each channel over the predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
-    errors = rmse_unit_and_count_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
+    errors = rmse_unit_and_count_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])
     return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
 
 
 def _contradiction(problem: EstimationProblem, x: Array) -> float:
     """Sum of squares of the joint prior's residuals."""
     joint = problem.options.multivariate_prior.restricted_to(problem.shared_parameters)
-    at = [problem.unknown_names.index(name) for name in joint.parameter_names]
-    apart = (x - problem.initial_unknowns)[at]
-    return float(apart @ np.linalg.solve(joint.covariance, apart)) if at else 0.0
+    apart = (x - problem.initial_unknowns)[[problem.unknown_names.index(name) for name in joint.parameter_names]]
+    return float(apart @ np.linalg.solve(joint.covariance, apart))

@@ -34,8 +34,6 @@ from yid_ocp.inference.null_test import (
     residual_channels,
 )
 
-_DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
-
 
 @dataclass(frozen=True)
 class _EffectSignature:
@@ -95,38 +93,32 @@ def linearize_candidates(
     model. `grid` is the number of values per shape parameter. Raises `SolverError` if the rollout at `values` fails.
     """
     labels = {effect.label for effect in base}
-    grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
-    own = [name for effect in base for name in effect.parameters.names]
-    residual, basis, scatter, warm = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0)), None
+    tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
     placed = problem.with_effects_and_relinearized_filters(base, values)
-    series, factor = residual_channels(problem.problem), problem.problem.options.stated_std_factor
-    rows = problem.problem.residual_rows
-    signatures: list[_EffectSignature] = []
-    for k in range(max(map(len, grids.values()), default=0)):
-        chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
-        shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
-        amplitudes = [name for effect in chosen for name in effect.amplitude_parameter_names]
-        trial = placed.with_free_parameters_without_recompiling((*problem.nominal_free_parameters, *own, *amplitudes))
-        trial = trial.with_parameter_values(shape)
+    series, rows = residual_channels(problem.problem), problem.problem.residual_rows
+    scatter = encoder_noise_residual_factor(placed, placed.unknown_vector(values))[rows.data]
+    residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
+    for shapes in itertools.zip_longest(*(_shape_grid(effect, grid) for effect in tried)):
+        chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]
+        amplitudes = [name for effect, _ in chosen for name in effect.amplitude_parameter_names]
+        trial = placed.with_free_parameters_without_recompiling((*placed.free, *amplitudes))
+        trial = trial.with_parameter_values({name: value for _, shape in chosen for name, value in shape.items()})
         evaluation = trial.evaluate(trial.unknown_vector(values), equilibrium_guesses=warm)
-        if not evaluation.ok or evaluation.jacobian is None:
+        if not evaluation.ok:
             raise failed_rollout_error(evaluation.message, "model with the candidate effects")
-        names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
+        warm = evaluation.equilibrium_guesses
         data, jacobian = residual_and_jacobian_without_weak_priors(trial, evaluation)
-        places = [names.index(name) for name in amplitudes]
-        if k == 0:
-            basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
-            residual = data - basis @ (basis.T @ data)
-            scatter = encoder_noise_residual_factor(trial, trial.unknown_vector(values))[: len(data)]
-        moved = jacobian[:, places]
-        moved = moved - basis @ (basis.T @ moved)
-        edges = np.cumsum([len(effect.amplitude_parameter_names) for effect in chosen])[:-1]
-        for effect, part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
+        places = [trial.unknown_names.index(name) for name in amplitudes]
+        basis = _basis(np.delete(jacobian, places, axis=1))
+        residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
+        edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
+        for (effect, shape), part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
             columns = np.ascontiguousarray(part)
-            driven, priors = columns.T @ scatter, columns[rows.stated_priors] / factor
+            driven = columns[rows.data].T @ scatter
+            priors = columns[rows.stated_priors] / problem.problem.options.stated_std_factor
             by_priors = priors.T @ priors
             noise = _covariance_of_scores(columns, series) + driven @ driven.T + by_priors
-            signatures.append(_EffectSignature(effect, grids[effect.label][k], columns, noise, by_priors))
+            signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors))
     return AllCandidatesLinearization(residual, tuple(signatures))
 
 
@@ -141,25 +133,21 @@ def _candidate_detectable_amplitudes(
     point: AllCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
 ) -> tuple[DetectableAmplitudes, ...]:
     """Smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
-    found: dict[str, DetectableAmplitudes] = {}
+    found: dict[str, list[DetectableAmplitudes]] = {}
     for signature in point.signatures:
-        effect, neutral = signature.effect, signature.effect.neutral_values
+        effect, names = signature.effect, signature.effect.amplitude_parameter_names
         information = signature.projected_sensitivity.T @ signature.projected_sensitivity
         inverse = _pinv(information)
         variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
         sizes = np.where(np.diag(information) > 1e-16, z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
-        detectable = dict(zip(effect.amplitude_parameter_names, map(float, sizes), strict=True))
-        widths = {
-            n: max(abs(bound - neutral[n]) for bound in effect.prior_ranges[n])
-            for n in effect.amplitude_parameter_names
-        }
-        visible = any(size < widths[name] for name, size in detectable.items())
-        new, best = DetectableAmplitudes(effect, detectable, visible), found.get(effect.label)
-        if best is None or (visible and not best.is_detectable):
-            found[effect.label] = new
-        elif min(detectable.values()) < min(best.detectable_amplitudes.values()):
-            found[effect.label] = replace(new, is_detectable=visible or best.is_detectable)
-    return tuple(found.values())
+        room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
+        entry = DetectableAmplitudes(
+            effect, dict(zip(names, map(float, sizes), strict=True)), bool(np.any(sizes < room))
+        )
+        found.setdefault(effect.label, []).append(entry)
+    return tuple(
+        min(own, key=lambda e: (not e.is_detectable, min(e.detectable_amplitudes.values()))) for own in found.values()
+    )
 
 
 def _pinv(matrix: Array) -> Array:
@@ -168,18 +156,14 @@ def _pinv(matrix: Array) -> Array:
 
 def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannel]) -> Array:
     """X' Omega X under the noise's known autocorrelation."""
-    total = np.zeros((columns.shape[1], columns.shape[1]))
-    least = 1e-6 * float(np.max(np.abs(columns), initial=0.0))
-    for s in series:
-        x, rho = columns[s.residual_indices], s.noise_autocorrelation
-        if not np.any(np.abs(x) > least):
-            continue
-        seen = x
-        if len(rho) > 1:
-            import scipy.signal  # slow to import
+    import scipy.signal  # slow to import
 
-            both = np.concatenate([rho[:0:-1], rho])[:, None]
-            seen = scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(rho) - 1 :][: len(x)]
+    total = np.zeros((columns.shape[1], columns.shape[1]))
+    for s in series:
+        seen = x = columns[s.residual_indices]
+        if (lags := len(s.noise_autocorrelation) - 1) > 0:
+            both = np.concatenate([s.noise_autocorrelation[:0:-1], s.noise_autocorrelation])[:, None]
+            seen = scipy.signal.oaconvolve(x, both, mode="full", axes=0)[lags:][: len(x)]
         total += x.T @ seen
     return (total + total.T) / 2
 
@@ -204,18 +188,13 @@ def _score_candidates(
 ) -> tuple[CandidateScore, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
-    scores: dict[str, list[CandidateScore]] = {}
+    tries: dict[str, list[CandidateScore]] = {}
     for signature in point.signatures:
-        if signature.effect.label in seen:
-            scores.setdefault(signature.effect.label, []).append(_score(signature, point.projected_residual, series))
-    found = []
-    for tries in scores.values():
-        best = tries[0]
-        # shape values that make no difference differ by rounding alone: the first one stays
-        for score in tries[1:]:
-            if score.predicted_chi2_decrease > best.predicted_chi2_decrease * (1 + _DECREASE_RTOL):
-                best = score
-        found.append(replace(best, p_value=min(1.0, best.p_value * len(tries))))
+        if (label := signature.effect.label) in seen:
+            tries.setdefault(label, []).append(_score(signature, point.projected_residual, series))
+    # shape values that make no difference differ by rounding alone: the first one stays
+    best = [(max(own, key=lambda s: float(f"{s.predicted_chi2_decrease:.6g}")), len(own)) for own in tries.values()]
+    found = [replace(score, p_value=min(1.0, score.p_value * count)) for score, count in best]
     return tuple(sorted(found, key=lambda s: -s.predicted_chi2_decrease))
 
 
@@ -224,35 +203,32 @@ def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[CandidateScore])
     return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
 
-def _room(effect: EffectBase) -> tuple[Array, Array]:
-    """Largest changes of amplitudes from neutral, downwards and upwards."""
+def _room(effect: EffectBase) -> Array:
+    """Largest changes of amplitudes from neutral, downwards and upwards, shape (2, p)."""
     own = [q for q in effect.definitions if not q.is_shape_parameter]
-    return np.array([q.lower - q.neutral_value for q in own]), np.array([q.upper - q.neutral_value for q in own])
+    return np.array([[q.lower - q.neutral_value for q in own], [q.upper - q.neutral_value for q in own]])
 
 
-def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Step of the linear model within bounds, and its decrease of r'r, for one model or a stack of models."""
-    plain = (_pinv(information) @ slope[..., None])[..., 0]
-    step = np.clip(plain, lower, upper)
-    return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
+def _promised(information: Array, slope: Array, room: Array) -> tuple[Array, float]:
+    """Step of the linear model within bounds, and its decrease of r'r."""
+    step = np.clip(_pinv(information) @ slope, *room)
+    return step, float((2 * slope - information @ step) @ step)
 
 
 def _score(signature: _EffectSignature, residual: Array, series: Sequence[ResidualChannel]) -> CandidateScore:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = -(x.T @ residual)
-    lower, upper = _room(effect)
-    step, decrease = _promised(x.T @ x, slope, lower, upper)
+    room = _room(effect)
+    step, decrease = _promised(x.T @ x, slope, room)
     # without the candidate's share of the residual, which would hide its significance
     covariance = _newey_west_covariance(x, residual + x @ step, series) + signature.score_prior_covariance
     # a residual below the noise must not make a score significant
-    covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
-    statistic = float(slope @ _pinv(covariance) @ slope)
+    statistic = float(slope @ _pinv(max(floor, covariance, key=np.trace)) @ slope)
     p_value = chi2_p_value(statistic, len(step))
-    if len(step) == 1 and lower[0] == 0:
-        statistic = statistic if step[0] > 0 else 0.0
-        p_value = p_value / 2 if statistic > 0 else 1.0
+    if room[0].tolist() == [0.0]:
+        statistic, p_value = (statistic, p_value / 2) if step[0] > 0 else (0.0, 1.0)
     values = _values(effect, step) | signature.shape_values
-    return CandidateScore(effect, values, max(float(decrease), 0.0), statistic, p_value)
+    return CandidateScore(effect, values, max(decrease, 0.0), statistic, p_value)
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
@@ -289,32 +265,26 @@ class AllCandidatesScoreModel:
 
     @property
     def _columns(self) -> list[IntArray]:
-        return np.split(
-            np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_parameter_names) for e in self.effects])
-        )
+        ends = np.cumsum([len(effect.amplitude_parameter_names) for effect in self.effects])
+        return np.split(np.arange(len(self.score_vector)), ends)
 
     def ranked_candidate_pairs(self, among: Sequence[str]) -> Iterator[ScoredCandidatePair]:
         """Yield all pairs of the candidates `among`, largest penalised decrease of r'r first (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
         """
-        bounds = [_room(effect) for effect in self.effects]
-        lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
-        columns, wanted = self._columns, [i for i, effect in enumerate(self.effects) if effect.label in set(among)]
-        by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        for i, j in itertools.combinations(wanted, 2):
-            by_size.setdefault((len(columns[i]), len(columns[j])), []).append((i, j))
+        rooms, columns = [_room(effect) for effect in self.effects], self._columns
+        wanted = [i for i, effect in enumerate(self.effects) if effect.label in among]
         found: list[tuple[float, int, int, Array]] = []
-        for members in by_size.values():
-            at = np.array([[*columns[i], *columns[j]] for i, j in members])
-            information, slope = self.information[at[:, :, None], at[:, None, :]], self.score_vector[at]
-            steps, decrease = _promised(information, slope, lower[at], upper[at])
-            found += [(w, *both, s) for w, both, s in zip(decrease - at.shape[1], members, steps, strict=True)]
+        for i, j in itertools.combinations(wanted, 2):
+            at = np.concatenate([columns[i], columns[j]])
+            room = np.concatenate([rooms[i], rooms[j]], axis=1)
+            step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], room)
+            found.append((decrease - len(at), i, j, step))
         for penalized, i, j, step in sorted(found, key=lambda entry: -entry[0]):
             (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
             values = _values(one, step[:width]) | _values(other, step[width:])
-            values |= self.shape_values[i] | self.shape_values[j]
-            yield (one, other), values, float(penalized)
+            yield (one, other), values | self.shape_values[i] | self.shape_values[j], penalized
 
 
 def _make_joint_score_model(
