@@ -18,18 +18,22 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_by_name
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
-from yid_ocp.inference.uncertainty import free_estimates_marked_not_trusted, typical_parameter_magnitudes
+from yid_ocp.inference.uncertainty import (
+    EstimateChecks,
+    free_estimates_marked_not_trusted,
+    typical_parameter_magnitudes,
+)
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodeAndPrediction, EpisodePrediction
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_and_count_by_channel
 from yid_ocp.sensors.base import Sensor
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers import base as solvers
-from yid_ocp.solvers.base import EpisodeAndPrediction, EstimateChecks, IterationCallback, Solver
+from yid_ocp.solvers.base import IterationCallback, Solver
 
 _UNCOUNTED_ERROR_TEXTS = {"links": "of the object's links", "time_step": "of the time step"}
 

@@ -221,3 +221,15 @@ def size_limited_damped_step(
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
     return size * bounded_levenberg_marquardt_step(jacobian * size, residual, mu, low, high)
+
+
+def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
+    """Infinity norm of the scaled gradient, without components that push against an active bound."""
+    free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
+    return float(np.max(np.abs(scale * gradient)[free], initial=0.0))
+
+
+def move_in_stds(evaluation: Evaluation | None, moved: Array) -> float:
+    """Norm |J d| of a move d of the unknowns (nx,), which bounds all |d_i| / std_i; infinite without a Jacobian."""
+    slopes = evaluation.jacobian if evaluation is not None and evaluation.ok else None
+    return math.inf if slopes is None else float(np.linalg.norm(slopes @ moved))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import scipy.special
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
+from yid_ocp.data.channel_checks import Issue
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import (
     DEFAULT_EXCESS_RESIDUAL_CRITERIA,
@@ -18,6 +19,7 @@ from yid_ocp.inference.null_test import (
     residual_chi2_null_test,
     residuals_exceed_noise,
 )
+from yid_ocp.problem.episodes import EpisodeAndPrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
@@ -498,3 +500,32 @@ def priors_that_determine_unknown(data: Array, priors: Array, column: int) -> Bo
     if _PRIOR_STD_RATIO**2 * by_data < by_all and away.any():
         found[others] = away >= _MIN_PRIOR_SHARE * away.max()
     return found
+
+
+@dataclass(frozen=True)
+class EstimateChecks:
+    """Checks of an estimate beyond its fit: finer discretisations, held-out recordings and step stability.
+
+    Attributes
+    ----------
+    data_std : mapping of str to float
+        Standard deviation of every free parameter, without discretisation error.
+    discretisation_shifts : mapping of str to EstimateShiftByLinksAndTimeStep
+        Shift of every free parameter in each finer model that was tried.
+    notes, uncounted_errors : tuple of str
+        Why a shift is unknown; discretisations whose error the standard deviations do not include.
+    expected_prediction_errors : mapping of recording to mapping of channel to float
+        Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
+    step_stability : mapping
+        Growth of alternating errors at the `estimate`, and at the `start` of a search that failed.
+    """
+
+    data_std: Mapping[str, float] = field(default_factory=dict)
+    discretisation_shifts: Mapping[str, EstimateShiftByLinksAndTimeStep] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    uncounted_errors: tuple[str, ...] = ()
+    held_out_predictions: tuple[EpisodeAndPrediction, ...] = ()
+    expected_prediction_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    data_issues: tuple[Issue, ...] = ()
+    step_stability: Mapping[str, Any] = field(default_factory=dict)
+    cable_memory_message: str = ""

@@ -327,12 +327,14 @@ def problem_with_whitening_at(
     equilibrium_guesses: EquilibriumGuesses | None = None,
     predictions: Sequence[EpisodePrediction] = (),
     rounds: int = 1,
+    keep_weights: bool = False,
 ) -> EstimationProblem:
     """Return a problem whose residuals are whitened by sensor and process noise, linearized at `x`.
 
     The problem itself is returned if it has no process noise, or if the rollout fails at `x`. If it is already
     whitened, the new filter is linearized about the motion and torques that the old filter smooths. `rounds` is the
-    number of linearizations (2 at a fit). `equilibrium_guesses` are configurations from which the search for equilibria
+    number of linearizations (2 at a fit). With `keep_weights`, the gains of known filters are kept, which suffices
+    after a step of a standard deviation. `equilibrium_guesses` are configurations from which the search for equilibria
     starts. `predictions` of all recordings by this problem at `x`, if known, save rollouts.
     """
     x = np.asarray(x, float)
@@ -342,7 +344,7 @@ def problem_with_whitening_at(
         before = _own_filter(problem.whitening_filters[i])
         own = problem.theta_and_initial_state_deviation(x, i)
         known = predictions[i] if predictions else None
-        return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before, known)
+        return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before, known, keep_weights)
 
     if not problem.has_process_noise:
         return problem

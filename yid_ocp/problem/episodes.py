@@ -350,3 +350,7 @@ def _samples(
         allowed = "points on frames of the model, or channels of its joints"
         raise DataError(what, where=where, allowed=allowed, hint="check `sensors` and the names of the recorded points")
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
+
+
+EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
+"""A recording and its prediction, or the reason why it has no prediction."""

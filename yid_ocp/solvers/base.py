@@ -6,24 +6,28 @@ import importlib
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.channel_checks import Issue
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ConfigError, YidError, missing_package_error
-from yid_ocp.inference.linearized_residual import is_stationary_point
+from yid_ocp.inference.linearized_residual import (
+    is_stationary_point,
+    move_in_stds,
+    projected_gradient_norm,
+    size_limited_damped_step,
+)
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
-    EstimateShiftByLinksAndTimeStep,
+    EstimateChecks,
     GoodnessOfFit,
     ParameterEstimate,
     assess_goodness_of_fit,
@@ -35,7 +39,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
 from yid_ocp.options import check_option_bounds
-from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
@@ -71,39 +75,6 @@ class Iterate:
     note: str = ""  # anything unusual, such as a shortened horizon
 
 
-EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
-"""A recording and its prediction, or the reason why it has no prediction."""
-
-
-@dataclass(frozen=True)
-class EstimateChecks:
-    """Checks of an estimate beyond its fit: finer discretisations, held-out recordings and step stability.
-
-    Attributes
-    ----------
-    data_std : mapping of str to float
-        Standard deviation of every free parameter, without discretisation error.
-    discretisation_shifts : mapping of str to EstimateShiftByLinksAndTimeStep
-        Shift of every free parameter in each finer model that was tried.
-    notes, uncounted_errors : tuple of str
-        Why a shift is unknown; discretisations whose error the standard deviations do not include.
-    expected_prediction_errors : mapping of recording to mapping of channel to float
-        Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
-    step_stability : mapping
-        Growth of alternating errors at the `estimate`, and at the `start` of a search that failed.
-    """
-
-    data_std: Mapping[str, float] = field(default_factory=dict)
-    discretisation_shifts: Mapping[str, EstimateShiftByLinksAndTimeStep] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    uncounted_errors: tuple[str, ...] = ()
-    held_out_predictions: tuple[EpisodeAndPrediction, ...] = ()
-    expected_prediction_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    data_issues: tuple[Issue, ...] = ()
-    step_stability: Mapping[str, Any] = field(default_factory=dict)
-    cable_memory_message: str = ""
-
-
 @dataclass(frozen=True, repr=False)
 class Solution(ReprMixin):
     """Solution of an estimation problem, with estimates, covariance, goodness of fit and history.
@@ -128,10 +99,8 @@ class Solution(ReprMixin):
         Cost [1], unknowns (nx,) and seconds [s] of every accepted iterate.
     wall_time : float
         Duration of the search [s].
-    evaluation : Evaluation or None
-        Evaluation at `x`.
-    problem : EstimationProblem, optional
-        The problem, whitened at `x`.
+    evaluation, problem : Evaluation or None, EstimationProblem or None
+        Evaluation at `x`; the problem, whitened there.
     checks : EstimateChecks, optional
         Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only.
     """
@@ -241,7 +210,7 @@ class Solver(Protocol):
     Optional class attributes, with their defaults: `needs_rollout` (True), whether the rollout must succeed at the
     start; `uses_process_noise_covariance` (False), whether the solver can whiten residuals by process noise;
     `estimates_torque_errors` (False), whether torque errors are unknowns; `with_coarse_tolerances` (the solver itself),
-    a quicker solver for the early passes of a fit beside torque noise; `cost_tolerance` (0), a relative change of cost.
+    a quicker solver where process noise is whitened anew; `cost_tolerance` (0), a relative change of cost.
     """
 
     @property
@@ -306,15 +275,12 @@ _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
 # If the arm folds the object for a moment, minima can be close together. If the model does not explain the recording,
 # the best fit is multiplied by these factors and tried again: a stiffer object folds less.
 _NEARBY_START_FACTORS = (1.25, 1.6)
-# Process noise is linearised at the start of a pass; passes end when one changes nothing.
-_MAX_WHITENING_PASSES = 6
-# A search that comes this close to a known fit returns that fit [standard deviations]. Two searches can end farther
-# apart in the same minimum, because of solver tolerance or the last pass's whitening; the better end is kept.
-_SAME_FIT_STDS = 0.01
-# Another start is first followed under the weights of the best fit, to a coarse tolerance. It ends in the same minimum
-# where it comes this near to that fit [standard deviations] without this gain, what a tenth of a standard deviation is
-# worth, and in a worse one above this multiple of its cost.
-_SAME_MINIMUM_STDS, _MIN_COST_GAIN_OF_START, _MAX_COST_RATIO_OF_START = 0.3, 0.005, 1.15
+# With process noise, residuals are whitened anew after every step, at most this often. Short steps [stds] keep gains
+# and need not lower the cost; the last step is negligible. Positive unknowns fall by no more than this factor.
+_MAX_LINEARIZATIONS, _SHORT_STEP_STDS, _LAST_STEP_STDS, _LEAST_FACTOR, _MIN_STEP_FRACTION = 15, 1.0, 0.01, 0.1, 0.2
+# Another start leads to the best fit's minimum if it comes this near [stds] without this gain of the cost and with less
+# than twice the rise of the linear model, and to a worse minimum above this multiple of the best fit's cost.
+_SAME_MINIMUM_STDS, _MIN_COST_GAIN_OF_START, _MAX_COST_RATIO_OF_START = 2.0, 0.005, 1.15
 _STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
@@ -332,9 +298,8 @@ def solve(
     `yid_ocp.solve` (`analysis.estimation`) adds the discretisation error and checks of the fit. Without
     `initial_unknowns`, free effects start with a small amplitude (`unknowns_with_neutral_effects_activated`). If the
     rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over a short horizon,
-    which then grows. With process noise, methods that can whiten by process noise run in several passes, each with a
-    fixed covariance (`problem_with_whitening_at`). The result of a method whose unknowns include torque errors is
-    judged in the same way. A search that does not converge raises no error; see `status` and `message` of the solution.
+    which then grows. Methods that can whiten by process noise are followed by steps with renewed weights. Torque errors
+    among the unknowns are judged by the same weights. A search that does not converge raises no error; see `status`.
 
     Parameters
     ----------
@@ -430,7 +395,7 @@ class _MultiStartSearch:
         log.info("starting again: %s", note)
         try:
             again = self._no_better_minimum(x, note)
-            again = again or _fit_from(self._problem, self._solver, x, _noting(self._callback, note), self._fits)
+            again = again or _fit_from(self._problem, self._solver, x, _noting(self._callback, note))
         except YidError as error:
             # a failed restart must not lose the present fit
             log.info("no fit from there: %s", error)
@@ -442,16 +407,22 @@ class _MultiStartSearch:
         best, coarse = self._best, getattr(self._solver, "with_coarse_tolerances", None)
         if coarse is None or not (best.evaluation.ok and self._problem.has_process_noise):
             return None
-        near = _minimize_cost(coarse, best.weighted, x, _noting(self._callback, note))
-        cost = near.history[-1].cost if near.history else 0.0
-        distance = _stds_apart(best.evaluation, near.x - best.result.x)
-        is_worse = cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
+        noted, reached = _noting(self._callback, note) or (lambda entry: None), list[bool]()
         # along an unknown that the data hardly inform the better end counts, beyond the solver's own tolerance
         least = max(_MIN_COST_GAIN_OF_START, getattr(self._solver, "cost_tolerance", 0.0) * best.evaluation.cost)
-        is_same = distance < _SAME_MINIMUM_STDS and cost > best.evaluation.cost - least
-        if near.status == Status.FAILED or not (is_worse or is_same or near.stopped_by_callback):
+
+        def watched(entry: Iterate) -> None:
+            noted(entry)
+            distance, gain = move_in_stds(best.evaluation, entry.x - best.result.x), best.evaluation.cost - entry.cost
+            if distance < _SAME_MINIMUM_STDS and -(distance**2) - least < gain < least:
+                reached.append(True)
+                raise StopSearch
+
+        near = _minimize_cost(coarse, best.weighted, x, watched)
+        is_worse = bool(near.history) and near.history[-1].cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
+        if near.status == Status.FAILED or not (is_worse or near.stopped_by_callback):
             return None
-        same = replace(best.result, stopped_by_callback=near.stopped_by_callback)
+        same = replace(best.result, stopped_by_callback=near.stopped_by_callback and not reached)
         return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
 
     def solution(self, limits: ExcessResidualCriteria, verdicts: bool) -> Solution:
@@ -507,9 +478,7 @@ def _minimize_cost(
         return SolverResult(*found, stopped_by_callback=True)
 
 
-def _fit_from(
-    problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None, known: Sequence[_Fit] = ()
-) -> _Fit:
+def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None) -> _Fit:
     """The fit from one start, with shorter horizons first if the rollout fails there."""
     history: list[Iterate] = []
     evaluations, known_at_x = 0, problem.evaluate(x, False) if getattr(solver, "needs_rollout", True) else None
@@ -532,40 +501,76 @@ def _fit_from(
             known_at_x = problem.evaluate(x, derivatives=False)
             if known_at_x.ok:
                 break
-    passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
-    weighted = problem
-    for number in range(passes):
-        predictions = () if known_at_x is None else known_at_x.episode_predictions
-        weighted = problem_with_whitening_at(weighted, x, warm, predictions) if passes > 1 else problem
-        noted = _noting(callback, f"pass {number + 1} of at most {passes}" if passes > 1 else "")
-        begun, coarse = x, getattr(solver, "with_coarse_tolerances", solver) if passes > 1 else solver
-        for own in (solver,) if coarse == solver else (coarse, solver):
-            result = _minimize_cost(own, weighted, x, noted)
-            x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
-            known_at_x, history = result.evaluation, [*history, *result.history]
-            moved = _stds_apart(result.evaluation, x - begun)
-            # far from its end a pass need not be exact, as the next one weighs anew
-            if result.stopped_by_callback or (moved > _SAME_MINIMUM_STDS and number < passes - 1):
-                break
-        # the second pass is the first about torque offsets that are not guessed
-        if (number and (len(result.history) < 2 or moved < _SAME_FIT_STDS)) or result.stopped_by_callback:
-            break
-        # a search that reaches a known fit is not whitened again
-        same = [fit for fit in known if passes > 1 and _stds_apart(fit.evaluation, x - fit.result.x) < _SAME_FIT_STDS]
-        if same:
-            return replace(same[0], n_evaluations=evaluations, history=history)
-    finish = result.evaluation
-    if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
-        # torque errors were unknowns; the fit is judged by their likelihood about the result
-        weighted, finish = problem_with_whitening_at(problem, x, warm, rounds=2), None
-    finish = finish or weighted.evaluate(x, equilibrium_guesses=warm)
+    fitted = problem.has_process_noise and uses_process_noise_covariance(solver)
+    coarse = getattr(solver, "with_coarse_tolerances", solver) if fitted else solver
+    predictions = () if known_at_x is None else known_at_x.episode_predictions
+    weighted = problem_with_whitening_at(problem, x, warm, predictions) if fitted else problem
+    result = _minimize_cost(coarse, weighted, x, callback)
+    evaluations, history = evaluations + result.n_evaluations, [*history, *result.history]
+    if fitted and not result.stopped_by_callback and (at_end := result.evaluation or weighted.evaluate(result.x)).ok:
+        search = _RelinearizingSearch(weighted, at_end, coarse)
+        result = _minimize_cost(search, weighted, result.x, callback)
+        weighted, evaluations = search.weighted, evaluations + result.n_evaluations
+        history += result.history
+    finish, warm = result.evaluation, result.equilibrium_guesses
+    if problem.has_process_noise and not fitted and _accounts_for_process_noise(solver):
+        weighted, finish = problem_with_whitening_at(problem, result.x, warm, rounds=2), None
+    finish = finish or weighted.evaluate(result.x, equilibrium_guesses=warm)
     return _Fit(result, finish, weighted, evaluations, history)
 
 
-def _stds_apart(evaluation: Evaluation | None, moved: Array) -> float:
-    """|J d| of a move d, which bounds all |d_i| / std_i; infinite without a Jacobian."""
-    slopes = evaluation.jacobian if evaluation is not None and evaluation.ok else None
-    return math.inf if slopes is None else float(np.linalg.norm(slopes @ moved))
+@dataclass
+class _RelinearizingSearch:
+    """Gauss-Newton steps over unknowns and torque errors together: residuals are whitened anew after every step."""
+
+    weighted: EstimationProblem  # about the last iterate
+    evaluation: Evaluation
+    solver: Solver  # of steps that do not lower the cost
+    name: ClassVar[str] = "gauss_newton"
+
+    def minimize_cost(self, _: EstimationProblem, x: Array, callback: IterationCallback | None) -> SolverResult:
+        recorder, length = AcceptedIterateRecorder(callback), math.inf
+        moved, fraction = np.zeros(len(x)), 1.0  # the last step, as a fraction of a whole one
+
+        def ended(status: Status, message: str) -> SolverResult:
+            made = recorder.solver_result_with_iterates(status, message, x, self.evaluation.equilibrium_guesses)
+            return replace(made, evaluation=self.evaluation)
+
+        for number in range(_MAX_LINEARIZATIONS):
+            guesses, at = self.evaluation.equilibrium_guesses, self.evaluation.episode_predictions
+            kept = length < _SHORT_STEP_STDS
+            problem = self.weighted = problem_with_whitening_at(self.weighted, x, guesses, at, keep_weights=kept)
+            now = self.evaluation = problem.evaluate(x, equilibrium_guesses=guesses)
+            recorder.n_evaluations += 1
+            if now.jacobian is None:
+                return ended(Status.FAILED, now.message)
+            (lower, upper), size = problem.bounds, np.maximum(np.abs(x), problem.unknown_scales)
+            slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
+            recorder.record_iterate(now.cost, x, slope, f"weights {number + 2} of at most {_MAX_LINEARIZATIONS + 1}")
+            step = size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
+            length = move_in_stds(now, step)
+            if length < _LAST_STEP_STDS:
+                return ended(Status.CONVERGED, "a step is less than a hundredth of a standard deviation")
+            least = np.where(problem.positive_unknowns_mask, np.maximum(lower, _LEAST_FACTOR * x), lower)
+            along, whole = now.jacobian @ moved, now.jacobian @ step
+            if np.any(along):
+                # where steps alternate, the secant through the last two says how much of this one is right
+                alternation = float(along @ whole) / float(along @ along)
+                fraction = float(np.clip(1 / max(1 / fraction - alternation, 1.0), _MIN_STEP_FRACTION, 1.0))
+            ahead = np.clip(x + fraction * step, least, upper)
+            trial = problem.evaluate(ahead, False, guesses)
+            recorder.n_evaluations += 1
+            if trial.ok and (length < _SHORT_STEP_STDS or trial.cost < now.cost):
+                moved, x, self.evaluation = ahead - x, ahead, trial
+                continue
+            found = self.solver.minimize_cost(problem, x, callback)
+            recorder.n_evaluations += found.n_evaluations
+            recorder.history += found.history
+            length, moved = move_in_stds(now, found.x - x), np.zeros(len(x))
+            x, self.evaluation = found.x, found.evaluation or now
+        self.evaluation = self.weighted.evaluate(x, equilibrium_guesses=guesses)
+        status = Status.CONVERGED if length < 10 * _LAST_STEP_STDS else Status.ITERATION_LIMIT
+        return ended(status, f"steps of {length:.2g} standard deviations after {_MAX_LINEARIZATIONS} linearizations")
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:
@@ -592,9 +597,3 @@ def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
     if problem.options.weighting == "paper" or not finish.ok:
         return finish.ok
     return unknowns_covariance_and_reduced_chi2(problem, finish)[1] < _POOR_CHI2_PER_DOF
-
-
-def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
-    """Infinity norm of the scaled gradient, without components that push against an active bound."""
-    free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
-    return float(np.max(np.abs(scale * gradient)[free], initial=0.0))

@@ -17,6 +17,7 @@ from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
     is_stationary_point,
     predicted_cost_reduction,
+    projected_gradient_norm,
 )
 from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, unknowns_covariance_and_reduced_chi2
 from yid_ocp.options import OptionInfo
@@ -30,7 +31,6 @@ from yid_ocp.solvers.base import (
     SolverResult,
     SolverWithCheckedSettings,
     Status,
-    projected_gradient_norm,
 )
 
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.

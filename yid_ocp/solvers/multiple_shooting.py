@@ -13,7 +13,11 @@ from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
+from yid_ocp.inference.linearized_residual import (
+    bounded_levenberg_marquardt_step,
+    predicted_cost_reduction,
+    projected_gradient_norm,
+)
 from yid_ocp.integrator.step import simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo
@@ -27,7 +31,6 @@ from yid_ocp.solvers.base import (
     SolverWithCheckedSettings,
     Status,
     StopSearch,
-    projected_gradient_norm,
 )
 from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, mean_square_residual_without_efforts
 from yid_ocp.solvers.nonlinear_program import (

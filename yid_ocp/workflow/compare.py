@@ -9,9 +9,9 @@ from typing import Any
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import Progress
+from yid_ocp.inference.uncertainty import EstimateChecks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import SOLVERS, Iterate, Status
-from yid_ocp.solvers.base import EstimateChecks
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
 from yid_ocp.workflow.run_folder import atomic_run_folder

@@ -18,11 +18,10 @@ from yid_ocp.inference import whitening
 from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodeAndPrediction, EpisodePrediction
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.solvers import Solution
-from yid_ocp.solvers.base import EpisodeAndPrediction
 
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult

@@ -19,11 +19,12 @@ from yid_ocp.analysis.estimation import (
 )
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, covariance_to_dict
+from yid_ocp.inference.uncertainty import EstimateChecks, EstimateShiftByLinksAndTimeStep, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import EpisodeAndPrediction
 from yid_ocp.solvers import Iterate, Solution, Status
 from yid_ocp.solvers import base as solvers
-from yid_ocp.solvers.base import EpisodeAndPrediction, EstimateChecks, IterationCallback
+from yid_ocp.solvers.base import IterationCallback
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
