@@ -21,10 +21,10 @@ from yid_ocp.analysis.discretisation import (
     _FinerDiscretisationProblem,
     _gauss_newton_step_in_finer_model,
     _half_step_error,
+    estimate_shifts_by_discretisation,
     inflate_stds_by_discretisation,
     largest_alternating_error_growth,
     longest_accurate_time_step,
-    measure_discretisation_shifts,
     predicted_refit_residual_at_finer_step,
 )
 from yid_ocp.analysis.estimation import _checked_solution_and_step_stability
@@ -199,7 +199,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
     own, _ = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
     # without segments there are no links to divide
-    told, notes = measure_discretisation_shifts(coarse, found.x, found.evaluation, ("links", "time_step"))
+    told, notes = estimate_shifts_by_discretisation(coarse, found.x, found.evaluation, ("links", "time_step"))
     assert notes == []
     assert {name: entry.time_step for name, entry in told.items()} == pytest.approx(own, rel=1e-6)
     assert {entry.links for entry in told.values()} == {None}

@@ -212,7 +212,7 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
     return fine.with_episodes(episodes, (), filters)
 
 
-def measure_discretisation_shifts(
+def estimate_shifts_by_discretisation(
     problem: EstimationProblem,
     x: Array,
     at_x: Evaluation,

@@ -127,7 +127,7 @@ def _with_discretisation_errors(
     if solution.evaluation is None:
         return solution, EstimateChecks()
     kinds = problem.options.checked_discretisations
-    shifts, notes = discretisation.measure_discretisation_shifts(
+    shifts, notes = discretisation.estimate_shifts_by_discretisation(
         problem, solution.x, solution.evaluation, kinds, progress
     )
     sizes = typical_parameter_magnitudes(problem, solution.x)

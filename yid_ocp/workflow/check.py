@@ -192,7 +192,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")
         return {}
-    shifts, notes = discretisation.measure_discretisation_shifts(
+    shifts, notes = discretisation.estimate_shifts_by_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
     warnings += notes
