@@ -25,6 +25,17 @@ from typing import Any
 REPOSITORY = Path(__file__).resolve().parents[1]
 RECORDINGS = REPOSITORY.parent / "shared" / "recordings"
 _PANDA = ("diagnosis.max_effects=1", "model.frames={}")
+_BARE_PANDA = (
+    *("model.object=null", *_PANDA, "parameters={}"),
+    "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}",
+)
+_PANDA_MOTIONS = [RECORDINGS / "panda_beam" / f"ocp_z_{name}" for name in ("15cm_0.42s", "25cm_0.50s", "35cm_0.61s")]
+# friction that holds a joint differs from stop to stop: the estimate has every motion once, its repetition is held out
+_PANDA_FRICTION = (
+    "model.friction={law: presliding}",
+    f"recordings.estimate=[{', '.join(f'{motion}_1.h5' for motion in _PANDA_MOTIONS)}]",
+    f"recordings.held_out=[{', '.join(f'{motion}_2.h5' for motion in _PANDA_MOTIONS)}]",
+)
 _SERVO = RECORDINGS / "servo_pendulum"
 _ROTOR_ESTIMATE = (
     *("sines_100", "sines_400", "sweep_100", "lift_100", "lift_400", "drop_400", "up_down_100", "up_down_400"),
@@ -55,17 +66,16 @@ QUESTIONS: Mapping[str, Question] = {
         "gravity_scale.fraction",
         (1.0, 1.0),
     ),
-    "panda, beam left out": Question(
+    "panda, weight withheld, friction": Question(
         "panda_beam.yaml",
         "panda_beam",
-        (
-            "model.object=null",
-            *_PANDA,
-            "parameters={}",
-            "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}",
-        ),
-        "payload.mass",
-        (0.33, 0.33),
+        ("model.object.gravity_fraction=0", *_PANDA, *_PANDA_FRICTION),
+        "gravity_scale.fraction",
+        (1.0, 1.0),
+    ),
+    "panda, beam left out": Question("panda_beam.yaml", "panda_beam", _BARE_PANDA, "payload.mass", (0.33, 0.33)),
+    "panda, beam left out, friction": Question(
+        "panda_beam.yaml", "panda_beam", (*_BARE_PANDA, *_PANDA_FRICTION), "payload.mass", (0.33, 0.33)
     ),
     "soft beam, load withheld": Question(
         "soft_beam.yaml",
