@@ -361,11 +361,11 @@ def _remains(result: DiagnosisResult) -> list[str]:
     if result.remaining_test.p_value < result.thresholds.significance_level:
         said = f"What remains on held-out motions is model error: {', '.join([*worst.values(), *mostly])}."
     moved = [
-        f"{name} goes from {own['before']:.3g} to {own['after']:.3g}"
+        f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_changes.items()
         if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
     ]
-    return [said, _listed("With it ", moved)]
+    return [said, _listed("Changed parameters of the nominal model: ", moved)]
 
 
 def _earlier_runs(result: DiagnosisResult) -> list[str]:
