@@ -6,13 +6,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
+from yid_ocp.effects.law import torque_law_quantity_values_along_rollout
 from yid_ocp.inference.uncertainty import ParameterEstimate
-from yid_ocp.model import forward_kinematics
-from yid_ocp.model.system import MidpointState
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
@@ -140,7 +138,6 @@ def measured_and_predicted_friction_torques(
         return ()
     own = {name.rpartition(".")[0].rpartition("@")[2] for name in friction_parameters}
     parts: dict[str, list[Array]] = {name: [] for name in driven if name in own}
-    loads = _load_function(problem)
     for i, episode in enumerate(problem.episodes):
         joints = episode.recording.joints
         assert joints is not None
@@ -156,10 +153,13 @@ def measured_and_predicted_friction_torques(
         without[[system.parameters.index(name) for name in friction_parameters]] = 0.0
         lacking, given = (_missing_torque(problem, at, q, inputs.torque) for at in (without, theta))
         speed = (q[2:] - q[:-2]) / (2 * step.time_step)
-        load = np.array(loads.map(len(speed))(q[1:-1].T, speed.T, inputs.torque[1:].T, theta)).T
+        nodes = {"state": q, "torque": inputs.torque, "multipliers": np.zeros((len(inputs.torque), 0))}
+        nodes["time_step"] = np.array(step.time_step)
         for name, found in parts.items():
             at = system.mechanism.joint_index(name)
-            found.append(np.stack([speed[:, at], load[:, at], -lacking[:, at], (given - lacking)[:, at]]))
+            load = torque_law_quantity_values_along_rollout(system, name, "load", theta, nodes)[:, 0]
+            mean_load = (load[:-1] + load[1:]) / 2
+            found.append(np.stack([speed[:, at], mean_load, -lacking[:, at], (given - lacking)[:, at]]))
     clouds = []
     for name, found in parts.items():
         rows = np.concatenate(found, axis=1)
@@ -176,19 +176,6 @@ def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: 
     state = np.hstack([q, np.zeros((len(q), n))])
     found = step.kernel.linearize_step_equations(theta, state, none, torque, (), False)
     return np.asarray((found.residual[1:, :n] + found.p1[:-1]) / step.time_step)
-
-
-def _load_function(problem: EstimationProblem) -> ca.Function:
-    """Torque through each joint's gear, (n,) [N m], as a function of (q, v, u, theta)."""
-    system = problem.system
-    n, nu = system.n_coordinates, len(system.driven)
-    q, v, u = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("u", nu)
-    none = ca.SX(0, 1)
-    state = MidpointState(
-        system, forward_kinematics(system.mechanism, q), q, v, none, none, u, none, {}, ca.SX(problem.step.time_step)
-    )
-    outside = ca.vertcat(*(system.weight_and_grasp_force_on_coordinate(state, i) for i in range(n)))
-    return ca.Function("load", [q, v, u, system.parameters.symbols], [system.input_force(u, q, v) - outside])
 
 
 def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
