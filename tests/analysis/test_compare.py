@@ -206,10 +206,13 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compar
 )
 def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     hidden = estimate(5.0, verdict="not_identifiable")
-    best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden)
-    other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0))
+    best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden, e=estimate(2.0, 0.1))
+    other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0))
     found = compared({"c": 11.25}, one=best, two=other)
-    assert found.disagreements == {"one": [], "two": [f"a.b = 12.35, while one finds 10 +- 0.12: {why}"]}
+    said = (
+        f"from one (in brackets) in a.b 12.35 (10), e 3 (2): {why}"  # the reason once, and no ± of sensor noise alone
+    )
+    assert found.disagreements == {"one": [], "two": [said]}
     assert found.explanations == (
         "c (truth 11.25) is weakly determined: where it ends is the method's choice (one 5, two 99)",
         "d cannot be found: where it ends is the method's choice (one 5, two 9)",
@@ -269,7 +272,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     # what cannot weigh this noise has no verdict of its own
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
-    assert found.disagreements["single_shooting"][0].startswith("a = 7.5, while steepest_descent finds 7")
+    assert found.disagreements["single_shooting"][0].startswith("from steepest_descent (in brackets) in a 7.5 (7)")
     assert "a could be found: it takes the recorded torques as true" in found.explanations[-1]
 
 

@@ -56,7 +56,7 @@ class MethodComparison:
     has_process_noise: bool  # whether the problem has process noise; the comparison ignores it
     # result of `solve`: the checked reference or, with process noise, that of a method that models it
     verdict_solution: Solution
-    disagreements: Mapping[str, list[str]]  # a sentence for each identifiable parameter, with the reason
+    disagreements: Mapping[str, list[str]]  # identifiable parameters that differ, with the reason, as one sentence
     # sentences on unidentifiable parameters, and on errors of steepest descent relative to a known truth
     explanations: tuple[str, ...]
 
@@ -126,25 +126,22 @@ def compare_methods(
 
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
-    sentences = []
+    values = []
     for name, reference in best.solution.parameters.items():
         if judged[name].verdict != "identifiable":
             continue
         entry = run.solution.parameters[name]
-        gap = abs(entry.value - reference.value)
         # a fit that stopped early has a large ± from its misfit, which would agree with everything
         std = max(entry.std, reference.std) if run.solution.status == Status.CONVERGED else reference.std
-        if gap <= max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
-            continue
-        if run.solution.status != Status.CONVERGED:
-            why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
-        elif run.whitened_cost > best.whitened_cost + 2.0:
-            why = "it stopped in another local minimum"
-        else:
-            why = "its cost weighs the measurements otherwise"
-        text = f"{name} = {entry.value:.4g}, while {best.method} finds {reference.value:.4g} +- {reference.std:.2g}"
-        sentences.append(f"{text}: {why}")
-    return sentences
+        if abs(entry.value - reference.value) > max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
+            values.append(f"{name} {entry.value:.4g} ({reference.value:.4g})")
+    if run.solution.status != Status.CONVERGED:
+        why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
+    elif run.whitened_cost > best.whitened_cost + 2.0:
+        why = "it stopped in another local minimum"
+    else:
+        why = "its cost weighs the measurements otherwise"
+    return [f"from {best.method} (in brackets) in {', '.join(values)}: {why}"] if values else []
 
 
 def _explanations(

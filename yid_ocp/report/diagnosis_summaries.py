@@ -292,7 +292,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "What it took")
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
-    yield from (f"{n} differs: {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
+    yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
     if not [*_objections_to_agreement(result)]:
         agree = "all methods agree within their uncertainty on the parameters that are found"
