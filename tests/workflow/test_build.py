@@ -45,6 +45,15 @@ def test_the_papers_systems(repository, paper_systems, name, size, constraints):
     assert system.parameters.vector({"T1.bend": 22.0})[system.parameters.index("T1.bend")] == 22.0
 
 
+def test_an_object_mounted_on_a_driven_arm_is_refused(written):
+    """The tracking filter compares the arm's momentum with that of the arm alone."""
+    rod = "{length: 0.3, mass: 0.1, radius: 0.01, links: 2}"
+    object_ = f"{{kind: segments, mount: {{parent_frame: panda_hand}}, named_segments: {{rod: {rod}}}}}"
+    text = f"model: {{robot: package:panda, arms: {{mode: driven, joints: [panda_joint1]}}, object: {object_}}}\n"
+    with pytest.raises(ConfigError, match=r"(?s)rod_0_.* moves on a driven arm.*grasp"):
+        build_problem(load_config(written(text)))
+
+
 def test_parameters_of_a_run(built):
     given = "T*.bend: {initial: 5, free: true, bounds: [0, 50]}, T2.bend: {initial: 7}, T1.mass: {initial: 0.07}"
     parameters = built(f"model: {{object: {{kind: foam_y}}}}\nparameters: {{{given}}}\n").parameters
