@@ -20,7 +20,7 @@ from rich.table import Table
 
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.integrator.step import compile_step, simulate
-from yid_ocp.model import Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, System, flexible_object
 
 TIME_STEP = 0.01
 
@@ -32,7 +32,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=50)
     options = parser.parse_args(arguments)
 
-    beam = flexible_object([Segment("B", 0.3, 0.1, 0.01, links=options.links, bend=0.5, twist=0.2, damping=2e-3)])
+    beam = flexible_object(
+        [FlexibleSegment("B", 0.3, 0.1, 0.01, links=options.links, bend=0.5, twist=0.2, damping=2e-3)]
+    )
     system = System.build(None, objects=[(beam, None, None)])
     names = ("B.bend", "B.twist")
     theta = system.parameters.vector()

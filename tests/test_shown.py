@@ -11,7 +11,7 @@ from small_problems import joints, pendulum_step, recording, seen, taken
 import yid_ocp as yid
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.display import _MAX_TABLE_ROWS, ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.model import Segment, flexible_object
+from yid_ocp.model import FlexibleSegment, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 
@@ -57,7 +57,7 @@ def shown(urdf_folder):
     options = ProblemOptions(path_cutoff=np.inf)
     problem = EstimationProblem(step, [made], ["elbow.stiffness", "elbow.damping"], options, held_out=[taken(step, 2)])
     solution = yid.solve(problem)
-    tube = flexible_object([Segment("tube", length=0.4, mass=0.1, radius=0.01, links=2)])
+    tube = flexible_object([FlexibleSegment("tube", length=0.4, mass=0.1, radius=0.01, links=2)])
     system, [seen_channel, *_] = step.system, solution.channel_measurements_and_predictions()
     things = [made, step, system, system.mechanism, system.parameters, tube, problem, solution, solution.evaluation]
     things += [
@@ -103,7 +103,7 @@ def test_results_state_shapes_and_units(shown):
 
 
 def test_all_public_classes_that_hold_arrays_show_themselves():
-    exempt = {"Status", "YidError", "Grasp", "Segment", "ProblemOptions", "SensorOptions"}
+    exempt = {"Status", "YidError", "Grasp", "FlexibleSegment", "ProblemOptions", "SensorOptions"}
     exempt |= {"GaussNewton", "MultipleShooting", "SingleShooting", "SteepestDescent"}
     public = {name: getattr(yid, name) for name in yid.__all__}
     classes = {name for name, entry in public.items() if isinstance(entry, type) and not issubclass(entry, ReprMixin)}

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from yid_ocp.errors import YidError as YidError
     from yid_ocp.integrator.step import compile_step as compile_step
     from yid_ocp.integrator.step import simulate as simulate
+    from yid_ocp.model import FlexibleSegment as FlexibleSegment
     from yid_ocp.model import Grasp as Grasp
-    from yid_ocp.model import Segment as Segment
     from yid_ocp.model import System as System
     from yid_ocp.model import flexible_object as flexible_object
     from yid_ocp.problem import EstimationProblem as EstimationProblem
@@ -54,7 +54,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "diagnosis.diagnosis_result": ("DiagnosisResult",),
     "errors": ("YidError",),
     "integrator.step": ("compile_step", "simulate"),
-    "model": ("Grasp", "Segment", "System", "flexible_object"),
+    "model": ("Grasp", "FlexibleSegment", "System", "flexible_object"),
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
     "solvers.symbolic_transcription": ("transcribe",),
     "workflow.run_history": ("read_estimates",),

@@ -12,7 +12,7 @@ from twins import twin_recording
 from yid_ocp.data import Recording
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -96,7 +96,7 @@ def held_tube(tmp_path_factory):
     """
     motors = {"x": ("prismatic", "1 0 0"), "z": ("prismatic", "0 0 1"), "turn": ("continuous", "0 0 1")}
     robot = chain_of_motors(tmp_path_factory.mktemp("hand"), **motors)
-    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
+    tube = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
     # a hand without a y motor meets the tip all the same: the tube bends in one plane
     grasps = [Grasp("hand", "hand", "w_T1", "point")]
     names = ["x", "z", "turn"]

@@ -6,7 +6,7 @@ import numpy as np
 
 from yid_ocp.analysis.experiment_design import RecordedExperiment
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
@@ -33,7 +33,7 @@ def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):
 def holding_pendulum(folder, links=3):
     """A pendulum of two motors that takes the end of a rod on the ground."""
     robot = read_urdf(folder / "double_pendulum.urdf")
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
+    rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
     grasps = [Grasp("hand", "tip", "w_T1")]
     return System.build(robot, objects=[(rod, None, None)], grasps=grasps, driven=["shoulder", "elbow"])
 

@@ -14,7 +14,7 @@ from yid_ocp.analysis.pinocchio_comparison import (
     compare_urdf_with_pinocchio,
 )
 from yid_ocp.effects import make_effect
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import Mechanism, rotation_from_rpy
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
@@ -27,8 +27,8 @@ def branched(urdf_folder) -> System:
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     soft = {"radius": 0.02, "links": 2, "bend": 4.0, "twist": 3.0}
     turns = {"T2": rotation_from_rpy(0.7, 0.0, 0.0), "T3": rotation_from_rpy(-0.7, 0.2, 0.0)}
-    parts = [Segment("T1", 0.6, 0.1, **soft)]
-    parts += [Segment(name, 0.3, 0.05, parent="T1", rest_rotation=turn, **soft) for name, turn in turns.items()]
+    parts = [FlexibleSegment("T1", 0.6, 0.1, **soft)]
+    parts += [FlexibleSegment(name, 0.3, 0.05, parent="T1", rest_rotation=turn, **soft) for name, turn in turns.items()]
     grasps = [Grasp("hand", "tip", "w_T2")]
     return System.build(robot, objects=[(flexible_object(parts), None, None)], grasps=grasps, gravity=GRAVITY)
 

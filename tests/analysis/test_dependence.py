@@ -18,7 +18,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
@@ -51,7 +51,7 @@ def judged(problem):
 @pytest.fixture(scope="module")
 def hanging():
     """hanging(gravity, turned): a rod of three links under the ceiling or a wall, its tip seen."""
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
+    rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
     t = 0.01 * np.arange(STEPS + 1)
 
     def build(gravity=(0.0, 0.0, -9.81), turned=(math.pi, 0.0, 0.0)):
@@ -185,7 +185,7 @@ def test_without_sensors_only_rows_are_said(hanging):
 def held_pendulum(urdf_folder):
     """A double pendulum whose joints are moved, its tip tied to a rod that hangs from the ceiling."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
+    rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
     held = {"grasps": [Grasp("hand", "tip", "w_T1")], "prescribed": ["shoulder", "elbow"]}
     system = System.build(robot, objects=[(rod, None, None)], **held)
     return compile_step(system, 0.01, use_compiler=False)
@@ -266,7 +266,7 @@ def test_what_cannot_swing_says_so(urdf_folder):
 def reaching(urdf_folder):
     """A rod of 0.6 m on the ground, half a metre from the pendulum's line; the pendulum's tip takes its end."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
+    rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
 
     def build(x=0.0, grasps=1):
         place = np.eye(4)

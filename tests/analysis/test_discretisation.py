@@ -33,7 +33,7 @@ from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
 
@@ -93,7 +93,7 @@ def test_a_move_ends_at_the_bound_and_what_cannot_be_compared_says_why():
 
 
 def chain(links):
-    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, joint_axes="xy")])
+    tube = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=links, joint_axes="xy")])
     return System.build(None, objects=[(tube, None, None)])
 
 
@@ -383,7 +383,7 @@ def light(tmp_path_factory):
     robot = chain_of_motors(tmp_path_factory.mktemp("hands"), x=("prismatic", "1 0 0"), z=("prismatic", "0 0 1"))
 
     def build(stiffness, time_step):
-        segment = Segment("cable", 1.0, 0.02, 0.003, links=8, bend=stiffness, twist=stiffness, damping=1e-4)
+        segment = FlexibleSegment("cable", 1.0, 0.02, 0.003, links=8, bend=stiffness, twist=stiffness, damping=1e-4)
         grasps = [Grasp("hand", "hand", "w_cable")]
         objects = [(flexible_object([segment]), None, None)]
         system = System.build(

@@ -30,7 +30,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.whitening import problem_with_whitening_at, problem_without_input_errors
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
@@ -137,7 +137,7 @@ def test_views_add_up_over_frames_times_and_recordings(sloped):
 
 @pytest.mark.parametrize(("links", "middle"), [(1, []), (2, ["T1_0_tip"]), (3, ["T1_1_tip"]), (4, ["T1_1_tip"])])
 def test_a_segment_has_a_tip_a_middle_and_a_marker(links, middle):
-    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
+    tube = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
     *there, marker = measurable_points(System.build(None, objects=[(tube, None, None)]))
     assert [sight.name for sight in (*there, marker)] == ["w_T1", *middle, "T1_marker"]
     assert not any(sight.is_arm_measurable for sight in (*there, marker))

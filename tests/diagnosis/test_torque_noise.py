@@ -28,7 +28,7 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.integrator.step import Step, compile_step, dynamic_observable_state_mask, simulate
 from yid_ocp.model import System
-from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -153,7 +153,7 @@ def test_candidates_of_other_places_are_left_out_of_a_refit(step):
 
 def test_states_that_no_error_reaches_are_left_out_of_a_filter():
     """A neutral mount's joints stand still, although equations of a step have them in every row."""
-    bare = System.build(objects=[(flexible_object([Segment("rod", 0.4, 0.1, 0.01, links=2)]), None, None)])
+    bare = System.build(objects=[(flexible_object([FlexibleSegment("rod", 0.4, 0.1, 0.01, links=2)]), None, None)])
     mounted = compile_step(bare.with_effects([make_effect("mount_compliance", "base", bare)]), TIME_STEP)
     joints = np.array(["@" not in name for name in mounted.system.mechanism.joint_names])
     own, theta = np.tile(joints, 2), mounted.system.parameters.vector()

@@ -16,7 +16,7 @@ from yid_ocp.effects import _SENSOR_KINDS, EffectBase, candidate_kinds_and_locat
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
-from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import CableOptions, clamped_cable_system
@@ -41,9 +41,9 @@ def small_y(foot: np.ndarray):
     """Three segments of one link each."""
     turn = [rotation_from_rpy(lean, 0.2, 0.0) for lean in (-0.8, 0.8)]
     segments = (
-        Segment("T1", 0.4, 0.08, 0.03, 1, damping=0.02),
-        Segment("T2", 0.25, 0.04, 0.02, 1, parent="T1", rest_rotation=turn[0], damping=0.02),
-        Segment("T3", 0.3, 0.05, 0.02, 1, parent="T1", rest_rotation=turn[1], damping=0.02),
+        FlexibleSegment("T1", 0.4, 0.08, 0.03, 1, damping=0.02),
+        FlexibleSegment("T2", 0.25, 0.04, 0.02, 1, parent="T1", rest_rotation=turn[0], damping=0.02),
+        FlexibleSegment("T3", 0.3, 0.05, 0.02, 1, parent="T1", rest_rotation=turn[1], damping=0.02),
     )
     return flexible_object(segments, foot)
 

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate
-from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.problem import ProblemOptions
 from yid_ocp.problem.evaluation import estimated_initial_state_names, initial_internal_state_offset_bounds
@@ -31,7 +31,7 @@ JOINTS = ("T1_0_y", "T1_0_x", "T1_0_z")
 
 def link(gravity=(0.0, 0.0, 0.0), prescribed=JOINTS, links=1) -> System:
     """A tube of equal links on the ground, without damping."""
-    segment = Segment("T1", LENGTH, MASS, RADIUS, links, bend=KAPPA, damping=0.0)
+    segment = FlexibleSegment("T1", LENGTH, MASS, RADIUS, links, bend=KAPPA, damping=0.0)
     return System.build(objects=[(flexible_object([segment]), None, None)], prescribed=prescribed, gravity=gravity)
 
 
@@ -199,10 +199,10 @@ def test_a_mount_is_a_spring_in_series() -> None:
 
 
 def test_a_junction_turns_all_branches() -> None:
-    segments = [Segment("T1", LENGTH, MASS, RADIUS, 2, damping=0.0)]
+    segments = [FlexibleSegment("T1", LENGTH, MASS, RADIUS, 2, damping=0.0)]
     for name, lean in (("T2", -0.5), ("T3", 0.5)):
         turn = rotation_from_rpy(lean, 0, 0)
-        segments.append(Segment(name, 0.2, 0.05, RADIUS, 1, parent="T1", rest_rotation=turn, damping=0.0))
+        segments.append(FlexibleSegment(name, 0.2, 0.05, RADIUS, 1, parent="T1", rest_rotation=turn, damping=0.0))
     system = System.build(objects=[(flexible_object(segments), None, None)], gravity=(0.4, 0.0, 0.0))
     step, rest = rest_of(system, make_effect("junction_compliance", "w_T1", system, {"stiffness": 8.0}))
     at = step.system.mechanism.joint_index
@@ -221,7 +221,7 @@ def hanging(kind: str, **values: float):
     up = Placement.from_matrix(homogeneous_transform(np.eye(3), [0, 0, LENGTH]))
     joint = Joint("left_a", "revolute", -1, up, (0.0, 0.0, 1.0))
     robot = Mechanism("arm", (joint,), {"left_gripper": Frame(0, Placement.identity())})
-    item = flexible_object([Segment("T1", LENGTH, MASS, RADIUS, 1, bend=KAPPA, damping=0.5)])
+    item = flexible_object([FlexibleSegment("T1", LENGTH, MASS, RADIUS, 1, bend=KAPPA, damping=0.5)])
     slide = Joint("foot", "prismatic", -1, Placement.identity(), (0.0, 0.0, 1.0))
     tree = robot.with_attached_mechanism(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
     parts = {"objects": [(item, "rail", None)], "grasps": [Grasp("left", "left_gripper", "w_T1")]}

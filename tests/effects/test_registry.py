@@ -11,7 +11,7 @@ from yid_ocp.effects import _SENSOR_KINDS, EFFECTS, candidate_kinds_and_location
 from yid_ocp.effects import base as places
 from yid_ocp.effects.base import EffectBase
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model import Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, System, flexible_object
 from yid_ocp.model.servos_and_springs import MotorOptions, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import baxter_foam_y_system
@@ -27,7 +27,7 @@ def beam() -> System:
     """Panda with a beam on its hand, its joints prescribed."""
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names)
-    segment = Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_given_as_rigidity=True)
+    segment = FlexibleSegment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_given_as_rigidity=True)
     item = flexible_object([segment], name="beam")
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
 

@@ -15,13 +15,13 @@ from yid_ocp.errors import InsufficientMemoryError
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutInputs, TrackingFeedback
 from yid_ocp.model import (
+    EffectStepTerms,
+    FlexibleSegment,
     Grasp,
     Kinematics,
     Mechanism,
     Parameter,
     Parameters,
-    Segment,
-    StepTerms,
     System,
     flexible_object,
     forward_kinematics,
@@ -41,7 +41,7 @@ class Added:
     parameters: Parameters
     internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
     change: Callable = lambda effect, system: system
-    add: Callable = lambda effect, state: StepTerms()
+    add: Callable = lambda effect, state: EffectStepTerms()
 
     def apply_to_system(self, system):
         return self.change(self, system)
@@ -67,7 +67,7 @@ def maxwell_branch(joint: str, stiffness: float, relaxation_time: float) -> Adde
         row = state.internal_rows[name]
         stretch = state.q[state.system.mechanism.joint_index(joint)] - state.z[row]
         equation = stretch - tau * state.z_rate[row]
-        return StepTerms(lagrangian=-0.5 * k1 * stretch**2, internal_equations={name: equation})
+        return EffectStepTerms(lagrangian=-0.5 * k1 * stretch**2, internal_equations={name: equation})
 
     return Added("maxwell", joint, parameters, {name: ca.SX.sym(name)}, add=add)
 
@@ -123,7 +123,7 @@ def creeping_grasp(grasp: str, rate: float) -> Added:
         row, rate = state.internal_rows[name], effect.parameters.symbols[0]
         # where it has long stood, as far as the load would have it creep in a second
         at_rest = {name: state.z[row] - rate * load}
-        return StepTerms(internal_equations={name: state.z_rate[row] - rate * load}, static_equations=at_rest)
+        return EffectStepTerms(internal_equations={name: state.z_rate[row] - rate * load}, static_equations=at_rest)
 
     return Added("creep", grasp, parameters, internal, change, add)
 
@@ -142,7 +142,7 @@ def growing_link(joint: str, length: float, time: float) -> Added:
     def add(effect, state):
         target, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
         row = state.internal_rows[name]
-        return StepTerms(internal_equations={name: target - state.z[row] - tau * state.z_rate[row]})
+        return EffectStepTerms(internal_equations={name: target - state.z[row] - tau * state.z_rate[row]})
 
     return Added("growth", joint, parameters, internal, change, add)
 
@@ -177,7 +177,7 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
             by_rate[:, j] = slope @ screws[j]
             by_turn[:, j] = slope @ added + motion_cross_force_product(screws[j], wrench)
         closed = ForceWithDerivativeFactors(force, by_rate, by_turn)
-        return StepTerms(dissipative_force=-b * v, force_with_derivatives=closed)
+        return EffectStepTerms(dissipative_force=-b * v, force_with_derivatives=closed)
 
     return Added("air", joint, parameters, change=change, add=add)
 
@@ -185,7 +185,7 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
 def cable_object(**changes):
     """Three links, nine coordinates."""
     options = {"mass": 0.3, "radius": 0.05, "links": 3, "bend": 2.0, "twist": 1.0, "damping": 0.01, **changes}
-    return flexible_object([Segment("C", 0.6, **options)], name="cable")
+    return flexible_object([FlexibleSegment("C", 0.6, **options)], name="cable")
 
 
 def cable(**options) -> System:

@@ -15,7 +15,7 @@ from yid_ocp.integrator.tracking_feedback import (
     lqr_tracking_feedback,
     proportional_tracking_feedback,
 )
-from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model import FlexibleSegment, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.urdf import read_urdf
 
@@ -31,7 +31,7 @@ def robot(urdf_folder):
 @pytest.fixture(scope="module")
 def step(robot):
     """The driven pendulum with a rod hung on its tip."""
-    rod = flexible_object([Segment("R", 0.2, 0.02, 0.01, links=1)])
+    rod = flexible_object([FlexibleSegment("R", 0.2, 0.02, 0.01, links=1)])
     system = System.build(robot, objects=[(rod, "tip", None)], driven=robot.joint_names, damping=0.1)
     return compile_step(system, TIME_STEP, use_compiler=False)
 

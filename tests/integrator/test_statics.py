@@ -14,7 +14,7 @@ from yid_ocp.integrator.statics import (
     steady_effect_internal_coordinates,
 )
 from yid_ocp.integrator.step import compile_step, compile_step_like, simulate
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import floating_joint_mechanism
@@ -24,7 +24,7 @@ from yid_ocp.model.urdf import read_urdf
 def hung_cable(span: float):
     """A cable of 0.6 m that starts level along x, its end held at a fraction of its length; statics and clamp pose."""
     turn = rotation_from_rpy(0.0, np.pi / 2, 0.0)
-    segment = Segment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rest_rotation=turn)
+    segment = FlexibleSegment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rest_rotation=turn)
     clamp = floating_joint_mechanism("clamp")
     objects, grasps = [(flexible_object([segment], name="cable"), None, None)], [Grasp("end", "clamp", "w_C")]
     system = System.build(clamp, objects=objects, grasps=grasps, prescribed=clamp.joint_names)

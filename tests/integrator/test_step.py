@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import NewtonStatusCode
-from yid_ocp.model import Grasp, Parameters, Segment, StepTerms, System, flexible_object
+from yid_ocp.model import EffectStepTerms, FlexibleSegment, Grasp, Parameters, System, flexible_object
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
@@ -71,7 +71,7 @@ def hinge():
     """One rod on a three-axis joint at the ground."""
 
     def build(effects=(), **options):
-        rod = flexible_object([Segment("R", 0.4, 0.2, 0.05, links=1, bend=2.0, twist=1.0, damping=0.0)])
+        rod = flexible_object([FlexibleSegment("R", 0.4, 0.2, 0.05, links=1, bend=2.0, twist=1.0, damping=0.0)])
         return System.build(objects=[(rod, None, None)], effects=effects, **options)
 
     return build
@@ -100,7 +100,7 @@ def test_a_maxwell_branch_relaxes_with_its_time_constant(parts, hinge, roll):
 
 def test_an_internal_coordinate_needs_an_equation(parts, hinge):
     internal = {"orphan@R.z": ca.SX.sym("z")}
-    orphan = parts.Added("orphan", "R", Parameters(), internal, add=lambda effect, state: StepTerms())
+    orphan = parts.Added("orphan", "R", Parameters(), internal, add=lambda effect, state: EffectStepTerms())
     with pytest.raises(ModelError, match=r"orphan@R\.z"):
         compile_step(hinge([orphan]), 0.01)
 

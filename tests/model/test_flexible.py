@@ -18,7 +18,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model import FlexibleSegment, System, flexible_object, forward_kinematics
 from yid_ocp.model.flexible import edge_to_edge_transport_rotations
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import init_command_object_factories
@@ -41,7 +41,7 @@ def bodies(item) -> list:
 
 def test_unequal_links():
     lengths = [0.1, 0.3, 0.2]
-    item = flexible_object([Segment("C", 9.9, 0.6, 0.01, link_lengths=lengths)])
+    item = flexible_object([FlexibleSegment("C", 9.9, 0.6, 0.01, link_lengths=lengths)])
     tips = positions(item, ["C_0_tip", "C_1_tip", "C_2_tip", "w_C"])
     np.testing.assert_allclose(tips[:, 2], [0.1, 0.4, 0.6, 0.6])
     assert item.mechanism.parameters["C.length"].value == pytest.approx(0.6)
@@ -61,9 +61,9 @@ def test_unequal_links():
 def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
     lengths = [0.1, 0.3, 0.2]
     shared = {"bend": 2.0, "twist": 1.5, "damping": 0.1, "stiffness_given_as_rigidity": True, "link_lengths": lengths}
-    trunk = Segment("A", 0.0, 0.6, 0.01, clamped_at_base=True, **shared)
-    branch = Segment("B", 0.0, 0.6, 0.01, parent="A", parent_link_index=1, twist_damping=0.3, **shared)
-    held = Segment("D", 0.0, 0.6, 0.01, parent="A", clamped_at_base=True, **shared)
+    trunk = FlexibleSegment("A", 0.0, 0.6, 0.01, clamped_at_base=True, **shared)
+    branch = FlexibleSegment("B", 0.0, 0.6, 0.01, parent="A", parent_link_index=1, twist_damping=0.3, **shared)
+    held = FlexibleSegment("D", 0.0, 0.6, 0.01, parent="A", clamped_at_base=True, **shared)
     springs = stiffness(flexible_object([trunk, branch, held]))
     between = [2 / (0.1 + 0.3), 2 / (0.3 + 0.2)]
     first = {"A": 2 / 0.1, "B": 2 / (0.3 + 0.1), "D": 2 / 0.1}
@@ -73,14 +73,16 @@ def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
             assert springs[f"{name}_{i}_y"] == springs[f"{name}_{i}_x"]
             damping = 0.3 if name == "B" else 0.1
             assert springs[f"{name}_{i}_z"] == pytest.approx((1.5 * factor, damping * factor))
-    plain = stiffness(flexible_object([Segment("A", 0.6, 0.6, 0.01, links=3, bend=2.0, twist=1.5, damping=0.1)]))
+    plain = stiffness(
+        flexible_object([FlexibleSegment("A", 0.6, 0.6, 0.01, links=3, bend=2.0, twist=1.5, damping=0.1)])
+    )
     assert set(plain.values()) == {(2.0, 0.1), (1.5, 0.1)}
 
 
 def test_branches_at_inner_links():
     turn = rotation_from_rpy(math.pi / 2, 0.0, 0.0)
-    branch = Segment("a", 0.2, 0.1, 0.01, links=2, parent="P", parent_link_index=0, rest_rotation=turn)
-    item = flexible_object([Segment("P", 0.6, 0.3, 0.01, links=3), branch])
+    branch = FlexibleSegment("a", 0.2, 0.1, 0.01, links=2, parent="P", parent_link_index=0, rest_rotation=turn)
+    item = flexible_object([FlexibleSegment("P", 0.6, 0.3, 0.01, links=3), branch])
     joint = item.mechanism.joints[item.mechanism.joint_index("a_0_x")]
     assert item.mechanism.joint_names[joint.parent_index] == "P_0_z"
     np.testing.assert_allclose(positions(item, ["w_a", "w_P"]), [[0, -0.2, 0.2], [0, 0, 0.6]], atol=1e-15)
@@ -88,7 +90,9 @@ def test_branches_at_inner_links():
 
 def test_a_flat_beam_that_bends_one_way():
     clamped = {"stiffness_given_as_rigidity": True, "clamped_at_base": True}
-    beam = Segment("B", 0.6, 0.3, links=3, cross_section_size=(0.001, 0.08), joint_axes="y", bend=1.2, **clamped)
+    beam = FlexibleSegment(
+        "B", 0.6, 0.3, links=3, cross_section_size=(0.001, 0.08), joint_axes="y", bend=1.2, **clamped
+    )
     item = flexible_object([beam])
     assert item.mechanism.joint_names == ("B_0_y", "B_1_y", "B_2_y")
     assert {spring.axis for spring in item.elastic_joints} == {"y"}
@@ -108,7 +112,7 @@ def test_polyline_is_reproduced_by_forward_kinematics(seed, count):
     start *= np.sign(np.linalg.det(start))
     first, *later = edge_to_edge_transport_rotations(vertices, start)
     lengths = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
-    segment = Segment("C", 0.0, 1.0, 0.01, link_lengths=lengths, rest_rotation=first, link_rest_rotations=later)
+    segment = FlexibleSegment("C", 0.0, 1.0, 0.01, link_lengths=lengths, rest_rotation=first, link_rest_rotations=later)
     item = flexible_object([segment], root_placement=homogeneous_transform(start, vertices[0]))
     tips = positions(item, [f"C_{i}_tip" for i in range(len(lengths))])
     np.testing.assert_allclose(tips, vertices[1:], atol=1e-9)
@@ -134,7 +138,7 @@ def test_polyline_turns_the_shortest_way():
 )
 def test_inertia_is_physical_for_every_theta(length, mass, radius, links, unequal, seed):
     shares = np.random.default_rng(seed).uniform(0.2, 1.0, links) if unequal else None
-    item = flexible_object([Segment("C", 1.0, 1.0, 0.1, links=links, link_lengths=shares)])
+    item = flexible_object([FlexibleSegment("C", 1.0, 1.0, 0.1, links=links, link_lengths=shares)])
     numeric = item.mechanism.with_numeric_values({"C.length": length, "C.mass": mass, "C.radius": radius})
     found = bodies(replace(item, mechanism=numeric))
     assert sum(float(body.mass) for body in found) == pytest.approx(mass)
@@ -176,7 +180,7 @@ def test_errors_of_a_segment(name):
     changes, words = WRONG[name]
     options = {"name": "B", "length": 1.0, "mass": 1.0, "radius": 0.1, **changes}
     with pytest.raises(ModelError) as caught:
-        flexible_object([Segment("T1", 1.0, 1.0, 0.1), Segment(**options)])
+        flexible_object([FlexibleSegment("T1", 1.0, 1.0, 0.1), FlexibleSegment(**options)])
     for word in [*words, f"segment {options['name']}"]:
         assert word in str(caught.value)
 

@@ -14,7 +14,7 @@ from placed_frames import numbers
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Mechanism, Segment, flexible_object, forward_kinematics
+from yid_ocp.model import FlexibleSegment, Mechanism, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import (
     Inertia,
     homogeneous_transform,
@@ -35,8 +35,8 @@ from yid_ocp.model.urdf import read_urdf
 
 def branched(links=4):
     turn = rotation_from_rpy(-0.8, 0.0, 0.0)
-    branch = Segment("T2", 0.5, 0.04, 0.01, links, parent="T1", rest_rotation=turn)
-    trunk = Segment("T1", 0.8, 0.08, 0.03, links)
+    branch = FlexibleSegment("T2", 0.5, 0.04, 0.01, links, parent="T1", rest_rotation=turn)
+    trunk = FlexibleSegment("T1", 0.8, 0.08, 0.03, links)
     return flexible_object([trunk, branch], homogeneous_transform(np.eye(3), [0.1, 0.2, 0.3]))
 
 
@@ -67,14 +67,14 @@ def test_inside_a_link_it_lies_on_the_straight_line_and_turns_with_it(percent, b
 
 
 def test_unequal_links_are_counted_by_their_lengths():
-    tree = flexible_object([Segment("T1", 0.0, 0.1, 0.01, link_lengths=[0.1, 0.5, 0.2])]).mechanism
+    tree = flexible_object([FlexibleSegment("T1", 0.0, 0.1, 0.01, link_lengths=[0.1, 0.5, 0.2])]).mechanism
     heights = [pose[2, 3] for pose in places(tree, [f"T1:{p}%" for p in (5, 12.5, 50, 90)])]
     assert heights == pytest.approx([0.04, 0.1, 0.4, 0.72])
 
 
 def test_points_stay_when_the_tree_is_put_together():
     """On a robot, after another joint was inserted before it, and with numbers for its parameters."""
-    base = flexible_object([Segment("B", 0.3, 0.1, 0.01, 2)]).mechanism
+    base = flexible_object([FlexibleSegment("B", 0.3, 0.1, 0.01, 2)]).mechanism
     base = replace(base, frames={name: frame for name, frame in base.frames.items() if name != "object_root"})
     aside = homogeneous_transform(np.eye(3), [1.0, 0.0, 0.0])
     tree = base.with_attached_mechanism(branched().mechanism, "B:50%", aside)

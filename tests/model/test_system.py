@@ -11,10 +11,10 @@ from placed_frames import numbers
 from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.model import (
     Effect,
+    FlexibleSegment,
     Grasp,
     Parameter,
     Parameters,
-    Segment,
     System,
     flexible_object,
     forward_kinematics,
@@ -45,7 +45,7 @@ def test_configuration_order_of_the_paper(dual_arm):
 
 
 def test_forces_and_energy(robot):
-    cable = flexible_object([Segment("C", 0.5, 0.1, 0.01, links=1, bend=2.0, twist=3.0, damping=0.1)])
+    cable = flexible_object([FlexibleSegment("C", 0.5, 0.1, 0.01, links=1, bend=2.0, twist=3.0, damping=0.1)])
     objects = [(cable, "tool", None)]
     system = System.build(robot, objects=objects, driven=["swing", "spin"], damping={"slide": 0.7})
     theta, n = system.parameters.vector(), system.n_coordinates

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from yid_ocp.integrator.step import compile_step, step_with_time_step
-from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import mass_matrix
 from yid_ocp.model.system import floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
@@ -39,7 +39,7 @@ def cases(urdf_folder):
     def read(name, **options):
         return System.build(read_urdf(urdf_folder / f"{name}.urdf"), **options)
 
-    cable = flexible_object([Segment("C", 0.6, 0.3, 0.02, links=3, bend=2.0, twist=1.0)])
+    cable = flexible_object([FlexibleSegment("C", 0.6, 0.3, 0.02, links=3, bend=2.0, twist=1.0)])
     return {
         "mixed_joints": case(read("mixed_joints"), 2e-3),
         "turntable": case(read("turntable"), 5e-3),
@@ -118,7 +118,7 @@ def double_pendulum(urdf_folder):
 
 def grasped_cable(urdf_folder):
     """Thick and soft: the twist of a thin one is too fast for time steps in the range where the order shows."""
-    cable = flexible_object([Segment("C", 0.6, 0.3, 0.1, 3, bend=2.0, twist=2.0, damping=2e-3)])
+    cable = flexible_object([FlexibleSegment("C", 0.6, 0.3, 0.1, 3, bend=2.0, twist=2.0, damping=2e-3)])
     bent = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
     pose = forward_kinematics(cable.mechanism.with_numeric_values(), ca.SX(ca.DM(bent))).frame_position("w_C")
     clamp, grasp = floating_joint_mechanism("clamp"), Grasp("end", "clamp", "w_C")

@@ -17,7 +17,7 @@ from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import OutputError
-from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.report import animation, figures
@@ -63,7 +63,7 @@ def test_places_are_those_of_the_model_and_sticks_its_links(single_arm):
 
 
 def test_what_an_effect_puts_under_the_object_is_no_arm():
-    bare = System.build(objects=[(flexible_object([Segment("rod", 0.4, 0.1, 0.01, links=2)]), None, None)])
+    bare = System.build(objects=[(flexible_object([FlexibleSegment("rod", 0.4, 0.1, 0.01, links=2)]), None, None)])
     system = bare.with_effects([make_effect("mount_compliance", "base", bare, {"stiffness": 12.0})])
     assert any("@" in name for name in system.mechanism.joint_names)
     sticks = animated(system, np.zeros((1, system.n_coordinates))).sticks

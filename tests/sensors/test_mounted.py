@@ -17,7 +17,7 @@ from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -99,7 +99,7 @@ def holding(urdf: Path, kind: str = "point", effects: Mapping[str, dict[str, flo
     place[:3, 3] = np.array(ca.DM(ca.evalf(at.translation))).ravel() - [0.17, 0.1, 0.55]
     leaning = ca.SX(ca.DM(Rotation.from_rotvec([-0.23, 0.39, 0.0]).as_matrix()))  # as a bent rod's end does
     more = {} if kind == "point" else {"held_orientation": ca.SX(ca.DM(ca.evalf(at.rotation.T @ leaning)))}
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0, damping=0.02)])
+    rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0, damping=0.02)])
     grasp, points = Grasp("hand", "tool", "w_T1", kind, **more), ("lower", "tool", "w_T1")
     system = System.build(
         robot, objects=[(rod, None, place)], grasps=[grasp], damping=0.05, point_frames=points, **moved

@@ -15,7 +15,7 @@ from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError, SolverError
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Mechanism, Segment, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Mechanism, System, flexible_object
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Effect, NodeState
@@ -35,7 +35,10 @@ def system() -> System:
     lower = Joint("left_b", "revolute", 0, along, (1.0, 0.0, 0.0), (body,))
     robot = Mechanism("arm", (upper, lower), {"left_gripper": Frame(1, along)})
     turn = rotation_from_rpy(-0.8, 0.0, 0.0)
-    segments = (Segment("T1", 0.4, 0.08, 0.03, 2), Segment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rest_rotation=turn))
+    segments = (
+        FlexibleSegment("T1", 0.4, 0.08, 0.03, 2),
+        FlexibleSegment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rest_rotation=turn),
+    )
     return System.build(robot, objects=[(flexible_object(segments), None, None)], prescribed=robot.joint_names)
 
 

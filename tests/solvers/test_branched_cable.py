@@ -7,7 +7,7 @@ import pytest
 
 from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.system import System, floating_joint_mechanism
 from yid_ocp.model.urdf import read_urdf
@@ -29,9 +29,9 @@ def cable():
     """Makes the problem from a start, the same for all free stiffnesses [N m^2]; recorded by the model at the truth."""
     how = {"radius": 0.005, "stiffness_given_as_rigidity": True, "damping": 2e-4}
     segments = [
-        Segment("a", 0.3, 0.03, links=4, clamped_at_base=True, **how),
-        Segment("b", 0.2, 0.02, links=3, parent="a", rest_rotation=rotation_from_rpy(0.64, 0.0, 0.0), **how),
-        Segment("c", 0.15, 0.01, links=3, parent="a", rest_rotation=rotation_from_rpy(0.0, 0.64, 0.0), **how),
+        FlexibleSegment("a", 0.3, 0.03, links=4, clamped_at_base=True, **how),
+        FlexibleSegment("b", 0.2, 0.02, links=3, parent="a", rest_rotation=rotation_from_rpy(0.64, 0.0, 0.0), **how),
+        FlexibleSegment("c", 0.15, 0.01, links=3, parent="a", rest_rotation=rotation_from_rpy(0.0, 0.64, 0.0), **how),
     ]
     item = flexible_object(segments, name="cable")
     system = System.build(
@@ -94,7 +94,9 @@ def arm_with_cable(links: int, mode: str) -> System:
     """A UR5 that carries 1 m of cable, bending alone."""
     how = {"stiffness_given_as_rigidity": True, "clamped_at_base": True}
     how |= {name: CABLE_TRUTH[f"cable.{name}"] for name in ("bend", "damping")}
-    cable = flexible_object([Segment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable")
+    cable = flexible_object(
+        [FlexibleSegment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable"
+    )
     robot = read_urdf("package:ur5", joints=list(JOINTS))
     parts = {"objects": [(cable, "tool0", None)], "point_frames": ("w_cable",), "damping": dict.fromkeys(JOINTS, 1.0)}
     return System.build(robot, **parts, **{mode: list(JOINTS)})

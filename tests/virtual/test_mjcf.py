@@ -15,12 +15,12 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.export.models import format_support_by_effect
 from yid_ocp.model import (
     Effect,
+    EffectStepTerms,
+    FlexibleSegment,
     Grasp,
     MidpointState,
     Parameter,
     Parameters,
-    Segment,
-    StepTerms,
     System,
     flexible_object,
 )
@@ -82,7 +82,7 @@ OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", 
 
 
 def clamped_beam() -> System:
-    beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=3)], name="beam")
+    beam = flexible_object([FlexibleSegment("B", 0.5, 0.2, 0.01, links=3)], name="beam")
     clamp = floating_joint_mechanism("clamp")
     body = Inertia.from_values(0.3, [0.01, 0.02, 0.03], np.diag([1e-3, 2e-3, 2.5e-3]))
     clamp = replace(clamp, joints=(*clamp.joints[:-1], replace(clamp.joints[-1], bodies=(body,))))
@@ -129,8 +129,8 @@ def assert_same_mechanics(system: System, values: dict[str, float]) -> None:
 @pytest.fixture(scope="module")
 def system() -> System:
     """Two driven joints, a trunk with two branches, the tip of one of them held by the ceiling."""
-    branches = [Segment(name, 0.2, 0.1, 0.01, 1, parent="T", bend=6.0) for name in "BC"]
-    item = flexible_object([Segment("T", 0.4, 0.2, 0.01, 2, bend=8.0, twist=5.0), *branches])
+    branches = [FlexibleSegment(name, 0.2, 0.1, 0.01, 1, parent="T", bend=6.0) for name in "BC"]
+    item = flexible_object([FlexibleSegment("T", 0.4, 0.2, 0.01, 2, bend=8.0, twist=5.0), *branches])
     robot = read_urdf("default:double_pendulum.urdf")
     grasps = [Grasp("hold", "ceiling", "w_B")]
     driven = robot.joint_names
@@ -259,8 +259,8 @@ def test_mechanics_equals_the_symbolic_one(system: System, values: dict[str, flo
 
 
 class Pull(Effect):
-    def step_terms(self, state: MidpointState) -> StepTerms:
-        return StepTerms(generalized_force=self.parameters["pull@T1.force"].symbol * state.v)
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+        return EffectStepTerms(generalized_force=self.parameters["pull@T1.force"].symbol * state.v)
 
 
 def test_what_mujoco_cannot_express_is_refused() -> None:
@@ -276,7 +276,7 @@ def test_what_mujoco_cannot_express_is_refused() -> None:
         mujoco_xml(replace(system, joint_compliances={"B_0_x": ca.SX(0)}))
     with pytest.raises(ModelError, match="has a mass"):
         mujoco_xml(System.build(floating_joint_mechanism("clamp")))
-    beam = flexible_object([Segment("B", 0.5, 0.2, 0.01)])
+    beam = flexible_object([FlexibleSegment("B", 0.5, 0.2, 0.01)])
     tree = SYSTEMS[1].mechanism
     bare = Frame(tree.joint_index("T2_1_y"), Placement.identity())
     with pytest.raises(ModelError, match="more than six"):

@@ -10,7 +10,7 @@ from yid_ocp import vision
 from yid_ocp.cli import main
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.system import System
 from yid_ocp.vision import FrameSequence, SceneModel, TrackOptions, look_at_pose
 from yid_ocp.vision.frame_selection import is_shape_self_touching
@@ -74,7 +74,7 @@ def swing(k):
 
 @pytest.fixture(scope="module")
 def rope():
-    segment, names = Segment("rope", 1.0, 0.1, RADIUS, links=16), ("rope:0%", "rope:50%", "w_rope")
+    segment, names = FlexibleSegment("rope", 1.0, 0.1, RADIUS, links=16), ("rope:0%", "rope:50%", "w_rope")
     return System.build(objects=[(flexible_object([segment]), None, None)], point_frames=names)
 
 
@@ -127,8 +127,10 @@ def test_either_end_where_nothing_tells(rope):
 
 
 def test_branches_tell_where_the_root_is():
-    branches = (Segment(name, size, 0.1, RADIUS, links=4, parent="stem") for name, size in (("a", 0.3), ("b", 0.2)))
-    segments = [Segment("stem", 0.4, 0.1, RADIUS, links=5), *branches]
+    branches = (
+        FlexibleSegment(name, size, 0.1, RADIUS, links=4, parent="stem") for name, size in (("a", 0.3), ("b", 0.2))
+    )
+    segments = [FlexibleSegment("stem", 0.4, 0.1, RADIUS, links=5), *branches]
     names = ("stem:0%", "w_stem", "w_a", "w_b")
     system = System.build(objects=[(flexible_object(segments), None, None)], point_frames=names)
 

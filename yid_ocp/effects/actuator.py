@@ -16,7 +16,7 @@ import casadi as ca
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD, PositionServo
-from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
+from yid_ocp.model.system import EffectStepTerms, MidpointState, NodeState, System
 
 _PLAY_TORQUE = 0.2  # torque at which tanh reaches three quarters [N m]
 _DEFAULT_EFFORT_LIMIT = 10.0  # for a joint without an effort limit [N m or N]
@@ -131,19 +131,19 @@ class Backlash(_DistortedReading):
         """Name `play` (present backlash) for a joint with a servo. Other joints have no internal coordinate."""
         return ("play",) if location in system.servos else ()
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         if not self.internal_coordinate_symbols:
-            return StepTerms()
+            return EffectStepTerms()
         [name] = self.internal_coordinate_symbols
         row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
         # value after the step, because a mean over the step would oscillate
         play = state.z[row] + state.h / 2 * state.z_rate[row]
         if self.location not in state.system.servos:  # the joint is held for a while, and nothing takes the play up
-            return StepTerms(internal_equations={name: play})
+            return EffectStepTerms(internal_equations={name: play})
         servo, command = state.system.servos[self.location], state.u[state.system.driven.index(self.location)]
         free, geared = (servo.torque(command, state.q[index] + give, state.v[index]) for give in (0, play))
         taken = play - self["width"] / 2 * ca.tanh(geared / _PLAY_TORQUE)
-        return StepTerms(
+        return EffectStepTerms(
             generalized_force=base.generalized_force_at_joint(state.system, self.location, geared - free),
             internal_equations={name: taken},
         )

@@ -15,7 +15,7 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, Repor
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Inertia, merge_bodies, symbolic_rotation_from_rpy
 from yid_ocp.model.parameters import Parameter
-from yid_ocp.model.system import ForceWithDerivativeFactors, MidpointState, StepTerms, System
+from yid_ocp.model.system import EffectStepTerms, ForceWithDerivativeFactors, MidpointState, System
 
 _MAX_PAYLOAD_DISTANCE = 0.5  # distance of a payload's centre from its frame [m]
 _MAX_COM_SHIFT = 0.05  # shift of a link's centre of mass without added mass [m]
@@ -279,9 +279,9 @@ class _RotorInertia(EffectBase):
         ),
     )
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        return StepTerms(lagrangian=self["armature"] / 2 * v**2)
+        return EffectStepTerms(lagrangian=self["armature"] / 2 * v**2)
 
 
 @EFFECTS.register("aerodynamic_drag")
@@ -297,7 +297,7 @@ class _AerodynamicDrag(EffectBase):
     possible_locations = base.segment_names
     declared_parameters = (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         system, kinematics = state.system, state.kinematics
         tree, segment = system.mechanism, system.segment_layout(self.location)
         velocity = _velocities(kinematics, state.v)
@@ -315,7 +315,7 @@ class _AerodynamicDrag(EffectBase):
             wrenches[j] = ca.vertcat(ca.cross(centre, push), push)
             reach = ca.horzcat(-ca.skew(centre), ca.SX.eye(3))
             slopes[j] = reach.T @ slope @ reach
-        return StepTerms(force_with_derivatives=_on_bodies(kinematics, velocity, wrenches, slopes))
+        return EffectStepTerms(force_with_derivatives=_on_bodies(kinematics, velocity, wrenches, slopes))
 
 
 def _object(system: System) -> tuple[str, ...]:

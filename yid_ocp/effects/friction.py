@@ -11,7 +11,7 @@ import casadi as ca
 
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
-from yid_ocp.model.system import Effect, MidpointState, StepTerms, System
+from yid_ocp.model.system import Effect, EffectStepTerms, MidpointState, System
 
 SIGN_SMOOTHING_SPEED = 0.02
 """v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
@@ -48,9 +48,9 @@ class _JointFriction(EffectBase):
         """Torque opposite to the speed v."""
         raise NotImplementedError
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        return StepTerms(
+        return EffectStepTerms(
             dissipative_force=base.generalized_force_at_joint(state.system, self.location, -self._friction(v))
         )
 
@@ -127,13 +127,14 @@ class _JointLoadFriction(_JointFriction):
             return -2 * outside
         return system.input_force(state.u, state.q, state.v)[index] - outside
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         load = self._load(state)
         size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
         v = state.v[state.system.mechanism.joint_index(self.location)]
         friction = self["share"] * size * ca.tanh(v / _LOAD_SIGN_SMOOTHING_SPEED)
         # it dissipates energy, but is not a dissipative force of the speed alone: its size depends on weight and motor
-        return StepTerms(generalized_force=base.generalized_force_at_joint(state.system, self.location, -friction))
+        force = base.generalized_force_at_joint(state.system, self.location, -friction)
+        return EffectStepTerms(generalized_force=force)
 
 
 @EFFECTS.register("joint_presliding")
@@ -170,7 +171,7 @@ class _JointPresliding(EffectBase):
         """Bound 1 on the initial |s|. The initial `s` of every recording is estimated."""
         return dict.fromkeys(self.internal_coordinate_symbols, 1.0)
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         [name] = self.internal_coordinate_symbols
         row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
         s, rate, width = state.z[row], state.z_rate[row], self["yield_angle"]
@@ -182,7 +183,7 @@ class _JointPresliding(EffectBase):
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
         force = base.generalized_force_at_joint(state.system, self.location, -self["tau_c"] * mean)
-        return StepTerms(
+        return EffectStepTerms(
             generalized_force=force, internal_equations={name: state.h * rate - change}, static_equations={name: s}
         )
 
@@ -206,6 +207,6 @@ class _JointSpring(EffectBase):
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         stretch = state.q[state.system.mechanism.joint_index(self.location)] - self["rest_angle"]
-        return StepTerms(lagrangian=-self["stiffness"] / 2 * stretch**2)
+        return EffectStepTerms(lagrangian=-self["stiffness"] / 2 * stretch**2)

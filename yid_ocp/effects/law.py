@@ -25,7 +25,7 @@ from yid_ocp.files import read_input_text
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
-from yid_ocp.model.system import MidpointState, StepTerms, System
+from yid_ocp.model.system import EffectStepTerms, MidpointState, System
 
 TorqueLawQuantitiesName = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
 """Quantities on which a law's torque depends: one, or two with a sum of functions."""
@@ -91,7 +91,7 @@ class TorqueLaw(EffectBase):
         """Names of the parameters at the knots of one quantity."""
         return tuple(f"{self.label}.{quantity}{k}" for k in range(len((self.knots or {})[quantity])))
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         force = ca.SX(state.system.n_coordinates, 1)
         for index in _coordinate_indices(state.system, self.location):
             for quantity in self.quantities:
@@ -104,7 +104,7 @@ class TorqueLaw(EffectBase):
         for name in self.internal_coordinate_symbols:
             row = state.internal_rows[name]
             equations[name], at_rest[name] = state.h * (state.z_rate[row] - 1), state.z[row]
-        return StepTerms(generalized_force=force, internal_equations=equations, static_equations=at_rest)
+        return EffectStepTerms(generalized_force=force, internal_equations=equations, static_equations=at_rest)
 
     def _torque(self, quantity: str, x: ca.SX) -> ca.SX:
         """f(x) by cubic B-splines, of which four are nonzero at any x."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elastic_joints_within_segment, segment_names
 from yid_ocp.model.flexible import ElasticJoint
-from yid_ocp.model.system import MidpointState, StepTerms, System
+from yid_ocp.model.system import EffectStepTerms, MidpointState, System
 
 _ABS_SMOOTHING_SPEED = 1e-3  # smoothing range of |v| in Dahl's law [rad/s]
 _REFERENCE_ANGLE = 0.5  # largest angle assumed for the range of k3 without data [rad]
@@ -70,11 +70,11 @@ class _KelvinVoigt(_SegmentEffect):
     required_excitation = "how fast it moves"
     declared_parameters = (ParameterDefinition("tau", "s", 0.0, 0.0, 1.0, (0.005, 0.2), "damping over stiffness"),)
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         force = ca.SX(state.system.n_coordinates, 1)
         for spring, index in self._springs(state):
             force[index] = -self["tau"] * spring.stiffness * state.v[index]
-        return StepTerms(dissipative_force=force)
+        return EffectStepTerms(dissipative_force=force)
 
 
 @EFFECTS.register("standard_linear_solid")
@@ -92,7 +92,7 @@ class _StandardLinearSolid(_SegmentMemory):
         ParameterDefinition("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "of the branch", True),
     )
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         energy, equations = ca.SX(0), {}
         for spring, index in self._springs(state):
             name = f"{self.label}.{spring.joint_name}"
@@ -100,7 +100,7 @@ class _StandardLinearSolid(_SegmentMemory):
             stretch = state.q[index] - state.z[row]
             energy += self["ratio"] * spring.stiffness * stretch**2 / 2
             equations[name] = stretch - self["relaxation_time"] * state.z_rate[row]
-        return StepTerms(lagrangian=-energy, internal_equations=equations)
+        return EffectStepTerms(lagrangian=-energy, internal_equations=equations)
 
 
 @EFFECTS.register("hysteresis")
@@ -126,7 +126,7 @@ class _Hysteresis(_SegmentMemory):
         ParameterDefinition("yield_angle", "rad", 0.15, 5e-3, 5.0, (0.05, 0.5), "angle over which it yields", True),
     )
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         force, equations, start = ca.SX(state.system.n_coordinates, 1), {}, {}
         for spring, index in self._springs(state):
             name = f"{self.label}.{spring.joint_name}"
@@ -136,7 +136,7 @@ class _Hysteresis(_SegmentMemory):
             force[index] = -self["stiffness"] * z
             equations[name] = state.z_rate[row] - v + speed * z / self["yield_angle"]
             start[name] = z
-        return StepTerms(generalized_force=force, internal_equations=equations, static_equations=start)
+        return EffectStepTerms(generalized_force=force, internal_equations=equations, static_equations=start)
 
 
 @EFFECTS.register("cubic_stiffness")
@@ -165,8 +165,9 @@ class _CubicStiffness(_SegmentEffect):
         low, high = k3.prior_range
         return replace(self, definitions=(replace(k3, prior_range=(factor * low, factor * high)),))
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
-        return StepTerms(lagrangian=-self["k3"] / 4 * sum((state.q[i] ** 4 for _, i in self._springs(state)), ca.SX(0)))
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+        quartic = sum((state.q[i] ** 4 for _, i in self._springs(state)), ca.SX(0))
+        return EffectStepTerms(lagrangian=-self["k3"] / 4 * quartic)
 
 
 @EFFECTS.register("rest_curvature")

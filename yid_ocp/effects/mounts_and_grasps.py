@@ -11,7 +11,7 @@ from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS
 from yid_ocp.model.mechanism import Joint, Placement
-from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System
+from yid_ocp.model.system import EffectStepTerms, Grasp, MidpointState, System
 
 _SPRING_RELAXATION_TIME = 5e-3  # for mount and junction springs: too short to damp visible motion [s]
 
@@ -173,14 +173,14 @@ class _GraspSlip(_GraspChange):
     def _changes(self, grasp: Grasp) -> dict[str, Any]:
         return {"axial_slip": grasp.axial_slip - self.internal_coordinate_symbols[f"{self.label}.offset"]}
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         [name] = self.internal_coordinate_symbols
         row, grasps = state.internal_rows[name], state.system.grasps
         at = base.grasp_names(state.system).index(self.location)
         first = sum(grasp.n_constraint_equations for grasp in grasps[:at])
         axis = state.kinematics.frame_pose(grasps[at].held_frame).rotation[:, 2]
         load = ca.dot(axis, state.constraint_force[first : first + 3])
-        return StepTerms(
+        return EffectStepTerms(
             internal_equations={name: state.z_rate[row] - self["slip_per_load"] * load},
             static_equations={name: state.z[row]},
         )

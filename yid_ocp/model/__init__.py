@@ -1,7 +1,7 @@
 """Mechanical model of a robot and a flexible object. Additions to it are implemented in `effects`."""
 
 from yid_ocp.model.flexible import FlexibleObject as FlexibleObject
-from yid_ocp.model.flexible import Segment as Segment
+from yid_ocp.model.flexible import FlexibleSegment as FlexibleSegment
 from yid_ocp.model.flexible import flexible_object as flexible_object
 from yid_ocp.model.kinematics import Kinematics as Kinematics
 from yid_ocp.model.kinematics import forward_kinematics as forward_kinematics
@@ -9,8 +9,8 @@ from yid_ocp.model.mechanism import Mechanism as Mechanism
 from yid_ocp.model.parameters import Parameter as Parameter
 from yid_ocp.model.parameters import Parameters as Parameters
 from yid_ocp.model.system import Effect as Effect
+from yid_ocp.model.system import EffectStepTerms as EffectStepTerms
 from yid_ocp.model.system import Grasp as Grasp
 from yid_ocp.model.system import MidpointState as MidpointState
 from yid_ocp.model.system import NodeState as NodeState
-from yid_ocp.model.system import StepTerms as StepTerms
 from yid_ocp.model.system import System as System

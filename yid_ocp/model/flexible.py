@@ -30,7 +30,7 @@ AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0,
 
 
 @dataclass(frozen=True)
-class Segment:
+class FlexibleSegment:
     """One segment of a flexible object, such as a tube, a branch or a beam."""
 
     name: str
@@ -117,7 +117,7 @@ class FlexibleObject(ReprMixin):
 
 
 def flexible_object(
-    segments: Sequence[Segment],
+    segments: Sequence[FlexibleSegment],
     root_placement: ArrayLike | None = None,
     name: str = "object",
     gravity_fraction: float = 1.0,
@@ -131,7 +131,7 @@ def flexible_object(
 
     Parameters
     ----------
-    segments : sequence of Segment
+    segments : sequence of FlexibleSegment
         Parents first.
     root_placement : array_like, shape (4, 4), optional
         Pose of the root; default: identity.
@@ -158,7 +158,7 @@ class _Parts:
     chains: dict[str, ArcLengthChain] = field(default_factory=dict)
 
 
-def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fraction: ca.SX | None) -> None:
+def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravity_fraction: ca.SX | None) -> None:
     own = _segment_parameters(segment)
     parts.parameters.extend(own.values())
     mass, shares = own["mass"].symbol, _length_shares(segment)
@@ -210,7 +210,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
     """Compute the twist-free rotation (3, 3) of each edge of a polyline relative to the previous edge.
 
-    The rotations serve as `Segment.rest_rotation` and `Segment.link_rest_rotations`. `vertices` (k, 3) are the
+    The rotations serve as a segment's `rest_rotation` and `link_rest_rotations`. `vertices` (k, 3) are the
     undeformed centre line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line;
     default: the world frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong.
     """
@@ -237,7 +237,7 @@ def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLi
     return rotations
 
 
-def _length_shares(segment: Segment) -> tuple[float, ...]:
+def _length_shares(segment: FlexibleSegment) -> tuple[float, ...]:
     if segment.link_lengths is None:
         return (1.0 / segment.links,) * segment.links
     lengths = np.asarray(segment.link_lengths, float)
@@ -253,7 +253,7 @@ def _cross_section(own: Mapping[str, Parameter]) -> tuple[ca.SX, ca.SX, ca.SX]:
     return x**2 / 12, y**2 / 12, ca.sqrt(x**2 + y**2) / 2
 
 
-def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
+def _segment_parameters(segment: FlexibleSegment) -> dict[str, Parameter]:
     per, rate = ("N m^2", "N m^2 s") if segment.stiffness_given_as_rigidity else ("N m/rad", "N m s/rad")
     length = segment.length if segment.link_lengths is None else float(np.sum(segment.link_lengths))
     small, shares = 1e-9, enumerate(_length_shares(segment))
@@ -278,7 +278,7 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
     }
 
 
-def _check(segment: Segment, known: Mapping[str, SegmentLayout]) -> None:
+def _check(segment: FlexibleSegment, known: Mapping[str, SegmentLayout]) -> None:
     parent, at, axes = segment.parent, segment.parent_link_index, segment.joint_axes
     section, lengths, turns = segment.cross_section_size, segment.link_lengths, segment.link_rest_rotations
     count = segment.links if lengths is None else len(lengths)

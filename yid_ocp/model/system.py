@@ -148,7 +148,7 @@ class ForceWithDerivativeFactors:
 
 
 @dataclass(frozen=True)
-class StepTerms:
+class EffectStepTerms:
     """Energy, generalized forces and internal equations that an effect adds to one step. Forces: (n, 1) [N m or N]."""
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
@@ -181,9 +181,9 @@ class Effect:
         """Return the system with this effect, which may change masses, lengths, springs, grasps, gravity or joints."""
         return system
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         """Return the energy, forces and internal equations that this effect adds to a step at its midpoint."""
-        return StepTerms()
+        return EffectStepTerms()
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """Predict a reading from the error-free `output`. `channel` is `group.point` or `joints.quantity.JOINT`."""
@@ -221,7 +221,7 @@ class _ServoIntegral(Effect):
         servo, [z] = system.servos[self.location], self.internal_coordinate_symbols.values()
         return replace(system, servos={**system.servos, self.location: replace(servo, integral=servo.integral * z)})
 
-    def step_terms(self, state: MidpointState) -> StepTerms:
+    def step_terms(self, state: MidpointState) -> EffectStepTerms:
         [name], system = self.internal_coordinate_symbols, state.system
         row, rate = state.internal_rows[name], state.z_rate[state.internal_rows[name]]
         if self.location in system.servos:  # not while the joint is held
@@ -229,7 +229,7 @@ class _ServoIntegral(Effect):
             rate -= system.servos[self.location].position_error(
                 command, state.q[system.mechanism.joint_index(self.location)]
             )
-        return StepTerms(internal_equations={name: rate}, static_equations={name: state.z[row]})
+        return EffectStepTerms(internal_equations={name: rate}, static_equations={name: state.z[row]})
 
 
 class SystemBuildArguments(TypedDict, total=False):

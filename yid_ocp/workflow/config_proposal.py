@@ -16,7 +16,7 @@ from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.inference.null_test import chi2_p_value
-from yid_ocp.model import Mechanism, Segment
+from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
 from yid_ocp.problem.signal_filters import LowPassFilter
@@ -115,7 +115,7 @@ class ProposedConfigChoices:
 def propose_config_choices(
     robot: str,
     recordings: Sequence[Recording],
-    branches: Sequence[Segment],
+    branches: Sequence[FlexibleSegment],
     *,
     holder: str | None = None,
     grasps: Mapping[str, str] | None = None,
@@ -128,7 +128,7 @@ def propose_config_choices(
 
     Parameters
     ----------
-    branches : sequence of Segment
+    branches : sequence of FlexibleSegment
         Segments of the object, parents first. Empty for an arm without an object.
     holder : str, optional
         Frame that carries the object's root. Default: the tool of the arm that moves most.
@@ -324,7 +324,7 @@ def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | 
 
 
 def _places(
-    tree: Mechanism, recording: Recording, branches: Sequence[Segment], holder: str, standing: bool
+    tree: Mechanism, recording: Recording, branches: Sequence[FlexibleSegment], holder: str, standing: bool
 ) -> dict[str, tuple[_PointPlacement, ...]]:
     """Locations of all points: a frame or segment of the same name, else, on an arm, from measured positions."""
     names = [branch.name for branch in branches]
@@ -354,7 +354,7 @@ def _places(
 
 
 def _samples_to_place_by(
-    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[Segment], holder: str
+    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[FlexibleSegment], holder: str
 ) -> PointGroup:
     """Samples of a group, only those at standstill if points are too far away in motion (a late clock)."""
     at = _poses(tree, recording, holder, group.t)[:, :3, 3]
@@ -369,7 +369,7 @@ def _samples_to_place_by(
 
 
 def _parts_when_straight(
-    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[Segment], holder: str
+    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[FlexibleSegment], holder: str
 ) -> Array | None:
     """Positions (np,) of points as fractions of a single segment's length; None without a straight pose or an end."""
     apart = np.linalg.norm(group.position - _poses(tree, recording, holder, group.t)[:, None, :3, 3], axis=2)
@@ -388,7 +388,7 @@ def _near(
     t: Array,
     position: Array,
     part_when_straight: float,
-    branches: Sequence[Segment],
+    branches: Sequence[FlexibleSegment],
     holder: str,
 ) -> tuple[str, str]:
     """Most probable frame of a point, from its positions relative to the holder, and the reason."""
@@ -443,7 +443,7 @@ def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannel
                 yield f"{group.name}.{kind.quantity}", group, kind
 
 
-def _straight(branches: Sequence[Segment]) -> dict[str, Array]:
+def _straight(branches: Sequence[FlexibleSegment]) -> dict[str, Array]:
     """Positions along the straight object, by frame name."""
     spots: dict[str, Array] = {}
     ends: dict[str | None, tuple[Array, Array]] = {None: (np.eye(3), np.zeros(3))}

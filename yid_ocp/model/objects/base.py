@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
-from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
+from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
@@ -176,7 +176,7 @@ def parse_comma_separated_numbers(text: str, count: int, flag: str) -> list[floa
 
 
 def initial_parameters_with_comments(
-    segments: Sequence[Segment], rigidity_ratio: float
+    segments: Sequence[FlexibleSegment], rigidity_ratio: float
 ) -> dict[str, tuple[float, str]]:
     """Initial bending rigidity (`rigidity_ratio` x weight x length^2) and damping of `segments`, with comments."""
     found: dict[str, tuple[float, str]] = {}
@@ -202,7 +202,7 @@ class ObjectBuilder:
 
     kind: Annotated[str, OptionInfo("kind of object")]
 
-    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
         """Define the segments, parents first. `damping` is per joint; each link is split into `link_division` links."""
         return []
 

@@ -33,7 +33,7 @@ from yid_ocp.model.flexible import (
     AXIS_UNIT_VECTORS,
     ElasticJoint,
     FlexibleObject,
-    Segment,
+    FlexibleSegment,
     edge_to_edge_transport_rotations,
     flexible_object,
 )
@@ -233,7 +233,9 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
-def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
+def _segments(
+    cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions
+) -> list[FlexibleSegment]:
     parent = cable.parent_branch_vertex_names
     turns = edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
@@ -251,7 +253,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             before = None
             at = junction - 2
         edges = [lengths[edge] for edge in pairwise(chain)]
-        segment = Segment(
+        segment = FlexibleSegment(
             name,
             sum(edges),
             branch.linear_density * sum(edges),

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from annotated_types import Ge, Le
 
-from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
+from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectBuilder
 from yid_ocp.options import OptionInfo
@@ -18,13 +18,13 @@ from yid_ocp.options import OptionInfo
 _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]
 
 
-def foam_y_segments() -> tuple[Segment, ...]:
+def foam_y_segments() -> tuple[FlexibleSegment, ...]:
     """Segments of the foam Y. Branches T2 and T3 leave the trunk T1 at 45 degrees, towards +y and -y."""
     lean = math.radians(45.0)
     return (
-        Segment("T1", 0.813, 0.064, 0.032),
-        Segment("T2", 0.610, 0.015, 0.025, parent="T1", rest_rotation=rotation_from_rpy(-lean, 0.0, 0.0)),
-        Segment("T3", 0.737, 0.016, 0.019, parent="T1", rest_rotation=rotation_from_rpy(lean, 0.0, 0.0)),
+        FlexibleSegment("T1", 0.813, 0.064, 0.032),
+        FlexibleSegment("T2", 0.610, 0.015, 0.025, parent="T1", rest_rotation=rotation_from_rpy(-lean, 0.0, 0.0)),
+        FlexibleSegment("T3", 0.737, 0.016, 0.019, parent="T1", rest_rotation=rotation_from_rpy(lean, 0.0, 0.0)),
     )
 
 
@@ -65,7 +65,7 @@ model:
     kind: Annotated[Literal["foam_y"], OptionInfo("kind of object")] = "foam_y"
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of rigid links of every tube")] = 4
 
-    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
         """Build the three tubes of the foam Y. Nominal joint stiffnesses are those for four links with any `links`."""
         n = link_division
         links = self.links * n

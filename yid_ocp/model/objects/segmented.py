@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model.flexible import Segment
+from yid_ocp.model.flexible import FlexibleSegment
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.objects import base
 from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectBuilder
@@ -53,8 +53,8 @@ class FlexibleSegmentSettings:
         False
     )
 
-    def _build_segment(self, name: str, damping: float, link_division: int) -> Segment:
-        """Build the named `Segment`. Links are divided into `link_division` links at equal segment stiffness."""
+    def _build_segment(self, name: str, damping: float, link_division: int) -> FlexibleSegment:
+        """Build the segment `name`. Links are divided into `link_division` links at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
             what, hint = f"segment '{name}' has no length", "set one of the two"
             where = f"model.object.named_segments.{name}"
@@ -73,7 +73,7 @@ class FlexibleSegmentSettings:
             "cross_section_size",
         )
         options: dict[str, Any] = {key: getattr(self, key) for key in (*same, "has_length_parameter_per_link")}
-        return Segment(
+        return FlexibleSegment(
             name,
             self.length if self.length is not None else float(sum(lengths or ())),
             **options,
@@ -81,8 +81,8 @@ class FlexibleSegmentSettings:
             link_lengths=None if lengths is None else [length / n for length in lengths for _ in range(n)],
             parent_link_index=None if index is None else (index + 1) * n - 1,  # a child stays where it is on its parent
             rest_rotation=rotation_from_rpy(*self.rpy),
-            bend=Segment.bend * factor,
-            twist=Segment.twist * factor,
+            bend=FlexibleSegment.bend * factor,
+            twist=FlexibleSegment.twist * factor,
             damping=damping * factor,
             twist_damping=damping * factor if self.separate_twist_damping else None,
         )
@@ -214,5 +214,5 @@ stiffness_given_as_rigidity: true, clamped_at_base: true}
         field(default_factory=dict)
     )
 
-    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
         return [s._build_segment(name, damping, link_division) for name, s in self.named_segments.items()]

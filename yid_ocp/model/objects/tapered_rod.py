@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import casadi as ca
 from annotated_types import Ge, Gt, Le
 
-from yid_ocp.model.flexible import FlexibleObject, Segment
+from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
 from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectBuilder
@@ -59,10 +59,10 @@ parameters:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 8
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
 
-    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
         """Build the rod as one segment with the radius of its base. `build` then tapers the links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
-        rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_given_as_rigidity=True, clamped_at_base=True)
+        rod = FlexibleSegment(_SEGMENT, *sizes, damping=damping, stiffness_given_as_rigidity=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
