@@ -260,6 +260,14 @@ def test_smoothed_errors_that_depend_on_the_unknowns_do_not_keep_a_fit_from_its_
     assert solution.x[0] == pytest.approx(2.5, abs=1e-3)
 
 
+def test_steps_that_alternate_are_shortened():
+    """The derivative lacks what smoothed errors do, so that every whole step is twice the right one."""
+    problem = Disturbed(lambda x, duration: (10 * (x - 2.5), np.array([[5.0]])), [2.48])
+    solution = solve(problem, Carrying(), restarts=False)
+    assert (solution.status, len(problem.frozen)) == (Status.CONVERGED, 4)
+    assert solution.x[0] == pytest.approx(2.5, abs=1e-6)
+
+
 def test_weights_that_never_settle_are_renewed_a_limited_number_of_times():
     def moving(frozen):
         return linear(np.eye(1), [-frozen - 0.5])

@@ -276,7 +276,7 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
 
 
 def prediction_errors_and_units(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodePrediction | str]]
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
     """Prediction and baseline errors of all recordings (held-out first), units and fit errors by channel."""
     residuals: Mapping[str, Any] = {}
@@ -315,10 +315,10 @@ def _prediction_error_entry(
 
 def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
-) -> tuple[list[tuple[Episode, EpisodePrediction | str]], dict[str, dict[str, float]]]:
+) -> tuple[list[EpisodeAndPrediction], dict[str, dict[str, float]]]:
     """Predictions of held-out recordings, and the errors that sensor and torque noise cause, by channel."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
-    pairs: list[tuple[Episode, EpisodePrediction | str]] = []
+    pairs: list[EpisodeAndPrediction] = []
     expected: dict[str, dict[str, float]] = {}
     for episode, theta, offset in problem.held_out_prediction_inputs(x):
         outcome = predict(episode, theta, offset, False)

@@ -16,10 +16,8 @@ its reference is not a measurement. Residuals are r = H d + v. With the filter's
 where Sigma is the covariance of all residuals. The map is linear and frozen at the point of linearisation: it is the
 same for residual and Jacobian, which is generalised least squares.
 
-Recorded torques are regressors with errors: derivatives along a rollout under them contain the same noise as the
-residual, which biases estimates, above all of inertias. If a filter exists, the next one is therefore linearised about
-the smoothed motion with w and b subtracted from the torques. The derivatives are then those of the sum of squares
-minimised over w and b (Golub and Pereyra).
+If a filter exists, the next one is linearised about the smoothed motion with w and b subtracted from the torques: the
+derivatives are then those of the sum of squares minimised over w and b (Golub and Pereyra).
 
 References
 ----------

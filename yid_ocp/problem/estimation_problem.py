@@ -19,6 +19,7 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_at_equilibrium_with_denoised_gear_loads
 from yid_ocp.problem.episodes import (
     Episode,
+    EpisodeAndPrediction,
     EpisodePrediction,
     InitialStateWithSensitivity,
     mass_matrix_diagonal_at_zero,
@@ -325,9 +326,7 @@ class EstimationProblem(ReprMixin):
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
         return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameter_names, guess)
 
-    def predict_held_out(
-        self, x: ArrayLike, derivatives: bool = False
-    ) -> list[tuple[Episode, EpisodePrediction | str]]:
+    def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[EpisodeAndPrediction]:
         """Predict held-out recordings with the shared parameters in `x` and initial values of local parameters.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
