@@ -148,3 +148,9 @@ def test_every_reason_has_a_sentence_of_its_own():
     assert len({diagnosis_summary_text(finding("unknown", unknown_reason=reason)) for reason in reasons}) == len(
         reasons
     )
+
+
+def test_a_result_shows_itself_in_one_line_and_a_table():
+    made = finding()
+    assert repr(made) == "<DiagnosisResult: effect, friction@elbow, 90 % of the held-out gap closed>"
+    assert "<td>friction@elbow</td><td>a = 0.5 N m</td>" in made._repr_html_()

@@ -37,7 +37,7 @@ _GAP_ORIGIN_PHRASES = {
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class DiagnosisResult(NominalModelGapEvidence, Judgement, ReprMixin):
+class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     """Result of a diagnosis: verdict, gap, locations, effects and the statistics behind them.
 
     Values have the units of their parameters. `smoother_result` has means and standard deviations (J, nd) per recording
