@@ -208,7 +208,7 @@ diagnosis:
     "track": """\
 track:
   frames_path: clouds/                            # folder
-  length_unit: mm
+  point_cloud_unit: mm
   n_drawn_frames: 5
 """,
     "track.virtual_frames": """\

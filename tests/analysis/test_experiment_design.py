@@ -482,7 +482,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
     # what is there tells of errors of torques too: those that the real recording tells of
     errors = problem_with_whitening_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors
     effort = recording.joints.effort.copy()
-    effort[: len(errors.torque_noise)] -= errors.estimated_torque_error
+    effort[: len(errors.torque_noise)] -= errors.recorded_minus_true_torque
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
     values = noisy.named_values(noisy.initial_unknowns)
     problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, values)

@@ -18,7 +18,7 @@ from yid_ocp.analysis.estimate_history import (
     pool_estimates_and_chi2,
 )
 from yid_ocp.analysis.friction_law_comparison import (
-    FrictionLawFit,
+    CrossValidatedFrictionLawFit,
     cross_validate_friction_law,
     mean_and_std_error_over_motion_kinds,
     measured_and_predicted_friction_torques,
@@ -150,8 +150,10 @@ def test_a_steady_drift_and_two_runs_that_differ_make_no_outlier():
 KINDS = {"a": ("a_1", "a_2"), "b": ("b_1",), "c": ("c_1",)}
 
 
-def fit_of(law: str, *errors: float) -> FrictionLawFit:
-    return FrictionLawFit(law, {}, dict(zip(("a_1", "a_2", "b_1", "c_1"), errors, strict=True)), "rad", True)
+def fit_of(law: str, *errors: float) -> CrossValidatedFrictionLawFit:
+    return CrossValidatedFrictionLawFit(
+        law, {}, dict(zip(("a_1", "a_2", "b_1", "c_1"), errors, strict=True)), "rad", True
+    )
 
 
 def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():

@@ -279,7 +279,7 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     [theta, later] = [problem.theta_and_initial_state_deviation(x, 0)[0] for x in (at, near)]
     assert np.max(np.abs(errors.torque_noise)) > WHITE
     acting, more = (problem.predictor.corrected_inputs(episode, own, ()).torque for own in (theta, later))
-    np.testing.assert_allclose(acting, inverse * episode.torque - errors.estimated_torque_error, atol=1e-12)
+    np.testing.assert_allclose(acting, inverse * episode.torque - errors.recorded_minus_true_torque, atol=1e-12)
     noise = errors.torque_noise / inverse if inverse else 0.0
     np.testing.assert_allclose(more - acting, 0.01 * (episode.torque - noise), atol=1e-12)
 

@@ -379,10 +379,10 @@ def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
     seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in (PositionSensor(names), EffortSensor(names))]
     assert seen == pytest.approx([angle, torque])
     channels = zip(("joints.position.left_a", "joints.effort.left_a"), seen, strict=True)
-    back = [effect.corrected_reading(channel, ca.SX(reading), ca.SX(3.0)) for channel, reading in channels]
+    back = [effect.true_value_from_reading(channel, ca.SX(reading), ca.SX(3.0)) for channel, reading in channels]
     value = ca.Function("back", [effect.parameters.symbols], back)(ca.DM([p.value for p in effect.parameters]))
     assert [float(x) for x in value] == pytest.approx([0.5, 3.0])
-    assert effect.corrected_reading("joints.position.other", ca.SX(1), ca.SX(1)).is_one()
+    assert effect.true_value_from_reading("joints.position.other", ca.SX(1), ca.SX(1)).is_one()
 
 
 POSE = np.eye(4)

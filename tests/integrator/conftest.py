@@ -49,7 +49,7 @@ class Added:
     def step_terms(self, state):
         return self.add(self, state)
 
-    def distorted_reading(self, channel, output, state):
+    def reading_from_true_value(self, channel, output, state):
         return output
 
 

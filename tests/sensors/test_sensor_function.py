@@ -53,7 +53,7 @@ def read(system: System, sensor: Sensor, q=None, effort=None) -> np.ndarray:
 class Drift(Effect):
     """Adds gain (memory + effort of the first joint) to every reading: what depends on all that a sensor may see."""
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         memory = self.internal_coordinate_symbols[f"{LABEL}.memory"]
         return output + self.parameters[f"{LABEL}.gain"].symbol * (memory**2 + ca.sin(state.load[0]))
 

@@ -88,7 +88,7 @@ def tracked(system, run, recording, shape):
         camera = vision.VirtualCameraSetup(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = vision.render_virtual_frames(scene, run.t, run.q, camera)
         options = vision.TrackOptions(
-            calibration=vision.CameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames
+            calibration=vision.ArmBasedCameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames
         )
         made.sequence.stamps[list(late)] += 0.15
         found = track_object(scene, recording, made.sequence, options)

@@ -8,7 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import DataError
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, calibration, look_at_pose
+from yid_ocp.vision import (
+    ArmBasedCameraCalibrationOptions,
+    CameraClockOptions,
+    CameraIntrinsics,
+    calibration,
+    look_at_pose,
+)
 from yid_ocp.vision.camera_registration import (
     CAMERA_STATE_SIZE,
     CLOCK_DRIFT_INDEX,
@@ -95,7 +101,7 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
     clock = options.pop("clock", CameraClockOptions())
     pose = told_pose(turn, shift, rng)
     found = calibration.calibrate_camera(
-        arm_of(robot, motion), seen, pose, rng, CameraCalibrationOptions(**options), clock
+        arm_of(robot, motion), seen, pose, rng, ArmBasedCameraCalibrationOptions(**options), clock
     )
     about = found.camera_state.clock_reference_stamp
     return found, CalibrationState(POSE, 1 / scale, 0.0, latency + drift * (about - latency), drift, about)
@@ -284,9 +290,11 @@ def test_refused_where_the_arm_does_not_tell(robot):
     away = look_at_pose([1.9, 0.6, 0.8], [4.0, 0.6, 0.8])
     rng = np.random.default_rng(0)
     nothing = list(map(CalibrationFrame, (1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng)))
-    options = CameraCalibrationOptions(fix_pose=True)
+    options = ArmBasedCameraCalibrationOptions(fix_pose=True)
     with pytest.raises(DataError, match="in view in 0 frames"):
-        calibration.calibrate_camera(arm_of(robot), nothing, away, rng, CameraCalibrationOptions(), known, "there")
+        calibration.calibrate_camera(
+            arm_of(robot), nothing, away, rng, ArmBasedCameraCalibrationOptions(), known, "there"
+        )
     kept = calibration.calibrate_camera(arm_of(robot), nothing, away, rng, options, known)
     assert kept.n_frames == 0
     assert "as given: it is in view in 0 frames" in kept.message
@@ -298,4 +306,6 @@ def test_refused_where_the_camera_sees_through_the_arm(robot):
     times = np.linspace(1.0, 4.0, 4)
     other = list(map(CalibrationFrame, times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9))))
     with pytest.raises(DataError, match="cannot be calibrated"):
-        calibration.calibrate_camera(arm_of(robot), other, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())
+        calibration.calibrate_camera(
+            arm_of(robot), other, POSE, rng, ArmBasedCameraCalibrationOptions(), CameraClockOptions()
+        )

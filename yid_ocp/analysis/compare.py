@@ -48,7 +48,7 @@ class _MethodResult:
 
 
 @dataclass(frozen=True)
-class MethodComparison:
+class MethodsComparisonResult:
     """Results of all estimation methods on one problem, with disagreements on identifiable parameters."""
 
     method_results: tuple[_MethodResult, ...]
@@ -73,7 +73,7 @@ def compare_methods(
     callback: Callable[[str, Iterate], None] | None = None,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     time_budget: float = math.inf,
-) -> MethodComparison:
+) -> MethodsComparisonResult:
     """Run several estimation methods (`solvers`) from the same initial values and compare their estimates.
 
     Steepest descent minimises the published cost (points in metres, no noise levels, no weak prior). The other methods
@@ -122,7 +122,7 @@ def compare_methods(
         judged = estimation.add_intervals_and_checks(problem, best.solution)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
     explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.has_process_noise))
-    return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)
+    return MethodsComparisonResult(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)
 
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:

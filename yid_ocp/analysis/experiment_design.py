@@ -367,7 +367,7 @@ class ExperimentVariantSensitivityBuilder:
         if errors is not None and joints is not None and joints.effort is not None:
             effort, driven = joints.effort.copy(), self.setting.problem.system.driven
             at = errors.sample_of_step[:, None], [joints.names.index(name) for name in driven]
-            effort[at] = effort[at] - errors.estimated_torque_error
+            effort[at] = effort[at] - errors.recorded_minus_true_torque
             recording = replace(recording, joints=replace(joints, effort=effort))
         if self.setting.problem.options.duration is None:
             return recording

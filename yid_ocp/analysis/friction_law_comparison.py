@@ -23,7 +23,7 @@ _MAX_CLOUD_POINTS = 1500
 
 
 @dataclass(frozen=True)
-class FrictionLawFit:
+class CrossValidatedFrictionLawFit:
     """One friction law fitted to all recordings, with its prediction errors on recordings left out of the fit.
 
     `left_out_errors` holds the root mean square prediction error of each recording by a fit without the recordings of
@@ -53,7 +53,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 
 def cross_validate_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
-) -> FrictionLawFit:
+) -> CrossValidatedFrictionLawFit:
     """Fit a friction law to all recordings, and refit it without each of the `kinds` of motion to get errors."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
@@ -74,7 +74,7 @@ def cross_validate_friction_law(
             errors[episode.name] = float(np.sqrt(np.nanmean(np.concatenate(squares))))
     unit = units.pop() if len(units) == 1 else "std"
     free = {name: entry for name, entry in solution.parameters.items() if name in problem.free}
-    return FrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
+    return CrossValidatedFrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
 
 
 def mean_and_std_error_over_motion_kinds(
@@ -86,14 +86,16 @@ def mean_and_std_error_over_motion_kinds(
 
 
 def prediction_error_difference_and_std_error(
-    fit: FrictionLawFit, other: FrictionLawFit, kinds: Mapping[str, Sequence[str]]
+    fit: CrossValidatedFrictionLawFit, other: CrossValidatedFrictionLawFit, kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
     """Mean over kinds of motion by which one fit's errors exceed another's, and its standard error."""
     beyond = {name: own - other.left_out_errors[name] for name, own in fit.left_out_errors.items()}
     return mean_and_std_error_over_motion_kinds(beyond, kinds)
 
 
-def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
+def simplest_fit_within_std_error(
+    fits: Sequence[CrossValidatedFrictionLawFit], kinds: Mapping[str, Sequence[str]]
+) -> CrossValidatedFrictionLawFit:
     """Choose the simplest friction law by the one-standard-error rule of cross-validation.
 
     Returns the first of `fits` whose mean error over the `kinds` of motion is within one standard error of the smallest
@@ -105,7 +107,7 @@ def simplest_fit_within_std_error(fits: Sequence[FrictionLawFit], kinds: Mapping
     best = fits[int(np.argmin(np.where(np.isfinite(means), means, np.inf)))]
     _, error = mean_and_std_error_over_motion_kinds(best.left_out_errors, kinds)
 
-    def is_near(fit: FrictionLawFit) -> bool:
+    def is_near(fit: CrossValidatedFrictionLawFit) -> bool:
         difference, paired = prediction_error_difference_and_std_error(fit, best, kinds)
         return difference <= max(error, paired)
 

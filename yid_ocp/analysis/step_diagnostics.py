@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.step import Step
-from yid_ocp.integrator.step_model import StepEquationLinearizations
+from yid_ocp.integrator.step_model import StepResidualsAndJacobians
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import sensor_reading_function
 
@@ -32,7 +32,7 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
 
 def linearise_step_equations(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
-) -> StepEquationLinearizations:
+) -> StepResidualsAndJacobians:
     """Linearise the step equations, also by all parameters, at a state (nx,), torque (nu,) [N m] and path (nc,)."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
@@ -70,7 +70,7 @@ def parameter_influences(
     episode: Episode | None,
     state: Array,
     theta: Array,
-    stages: StepEquationLinearizations,
+    stages: StepResidualsAndJacobians,
 ) -> tuple[ParameterInfluence, ...]:
     """Find for each parameter the step equations that contain it, and which sensors respond to it.
 
@@ -132,7 +132,7 @@ def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_
 
 def _answers(
     step: Step,
-    stages: StepEquationLinearizations,
+    stages: StepResidualsAndJacobians,
     gain: Array,
     push: Array,
     sensors: Sequence[_WhitenedSensor],

@@ -387,7 +387,9 @@ class _TrackSettings:
         tuple[_Vector4, _Vector4, _Vector4, _Vector4] | None,
         OptionInfo("pose of the camera (x right, y down, z ahead) in the world, by rows; default: the folder's", "m"),
     ] = None
-    length_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("unit of the clouds; default: the folder's")] = None
+    point_cloud_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("unit of the clouds; default: the folder's")] = (
+        None
+    )
     background_frames_path: Annotated[
         _FilePath | None,
         OptionInfo("frames of the scene without robot and object from the same camera pose, whose points are removed"),

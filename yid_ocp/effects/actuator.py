@@ -1,8 +1,8 @@
 """Effects between a motor and its recorded signals, such as backlash, encoder offsets and delays.
 
 For inputs of the model (torques and angles of driven joints, angles of prescribed joints) an effect acts through
-`corrected_reading`. For the effort of a prescribed joint, which is compared with the record, it acts through
-`distorted_reading`.
+`true_value_from_reading`. For the effort of a prescribed joint, which is compared with the record, it acts through
+`reading_from_true_value`.
 """
 
 from __future__ import annotations
@@ -73,12 +73,12 @@ class _DistortedReading(EffectBase):
     def _is_own(self, channel: str) -> bool:
         return channel == f"{self.quantity}.{self.location}"
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         if not self._is_own(channel):
             return output
         return output + self._error(state.load[state.system.mechanism.joint_index(self.location)])
 
-    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+    def true_value_from_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         return reading - self._error(effort) if self._is_own(channel) else reading
 
 
@@ -151,14 +151,16 @@ class Backlash(_DistortedReading):
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["width"] / 2 * ca.tanh(effort / _PLAY_TORQUE)
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         for name in self.internal_coordinate_symbols if self._is_own(channel) else ():
             return output + state.z[state.internal_rows[name]]
-        return super().distorted_reading(channel, output, state)
+        return super().reading_from_true_value(channel, output, state)
 
-    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+    def true_value_from_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         # a servo's joint angle is not an input, and its command refers to the motor side
-        return reading if self.internal_coordinate_symbols else super().corrected_reading(channel, reading, effort)
+        return (
+            reading if self.internal_coordinate_symbols else super().true_value_from_reading(channel, reading, effort)
+        )
 
 
 class _DistortedEffort(_DistortedReading):
@@ -193,10 +195,10 @@ class _EffortGain(_DistortedEffort):
             return None
         return {name: 1.0 if value < 0 else -1.0}
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         return output / self["inverse"] if self._is_own(channel) else output
 
-    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+    def true_value_from_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         return reading * self["inverse"] if self._is_own(channel) else reading
 
 

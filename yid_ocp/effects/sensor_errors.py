@@ -37,7 +37,7 @@ class _CameraEffect(EffectBase):
     def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
         return point
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         return output if state.camera_pose is None else self._seen(output, state.camera_pose, state)
 
 
@@ -159,7 +159,7 @@ class _MountedSensorEffect(EffectBase):
     def _read(self, quantity: str, output: ca.SX) -> ca.SX:
         return output
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         group, _, frame = self.location.partition(":")
         if state.marked_frame != frame or not channel.startswith((f"{group}.", f"{group}_")):
             return output

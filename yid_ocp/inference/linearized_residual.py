@@ -229,7 +229,7 @@ def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Arra
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))
 
 
-def move_in_stds(evaluation: Evaluation | None, moved: Array) -> float:
+def step_norm_in_stds(evaluation: Evaluation | None, moved: Array) -> float:
     """Norm |J d| of a move d of the unknowns (nx,), which bounds all |d_i| / std_i; infinite without a Jacobian."""
     slopes = evaluation.jacobian if evaluation is not None and evaluation.ok else None
     return math.inf if slopes is None else float(np.linalg.norm(slopes @ moved))

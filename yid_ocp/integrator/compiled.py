@@ -24,8 +24,8 @@ from yid_ocp.integrator.step_model import (
     Rollout,
     RolloutCostGradient,
     RolloutInputs,
-    StepEquationLinearizations,
     StepModel,
+    StepResidualsAndJacobians,
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
@@ -215,7 +215,7 @@ class CompiledKernel:
 
     def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
-    ) -> StepEquationLinearizations:
+    ) -> StepResidualsAndJacobians:
         """Evaluate step residuals along a trajectory in C, with their Jacobians if `derivatives` is set."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         # in the order of the struct

@@ -23,8 +23,8 @@ from yid_ocp.integrator.step_model import (
     RolloutCostGradient,
     RolloutInputs,
     SensitivityDirections,
-    StepEquationLinearizations,
     StepModel,
+    StepResidualsAndJacobians,
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
@@ -266,7 +266,7 @@ class InterpretedKernel:
 
     def linearize_step_equations(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
-    ) -> StepEquationLinearizations:
+    ) -> StepResidualsAndJacobians:
         """Evaluate step residuals along a trajectory one by one, with their Jacobians if `derivatives` is set."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)

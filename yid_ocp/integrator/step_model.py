@@ -222,7 +222,7 @@ class RolloutCostGradient:
 
 
 @dataclass(frozen=True)
-class StepEquationLinearizations:
+class StepResidualsAndJacobians:
     """Residuals and Jacobians of the step equations along any trajectory, even one that does not satisfy them.
 
     Each step has nt = n + nz + m equations: momentum balance (n), internal (nz) and constraint (m). `p1` is the
@@ -257,14 +257,14 @@ def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -
 
 def allocate_linearization(
     sizes: dict[str, int], count: int, width: int, derivatives: bool
-) -> StepEquationLinearizations:
+) -> StepResidualsAndJacobians:
     """Allocate zero linearizations of `count` steps and `width` parameters, without Jacobians if not `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
     shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
     for name, columns in {"new": nt, "old": n + nz, "input": nu, "theta": width}.items():
         shapes |= {f"residual_by_{name}": (steps, nt, columns), f"p1_by_{name}": (steps, n, columns)}
-    return StepEquationLinearizations(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
+    return StepResidualsAndJacobians(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
 
 
 def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> dict[str, Array]:

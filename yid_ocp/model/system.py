@@ -166,9 +166,9 @@ class EffectStepTerms:
 class Effect:
     """Base class of additions to the nominal model, such as friction. The base class itself changes nothing.
 
-    With neutral parameters a subclass leaves the nominal model unchanged. `distorted_reading` computes a reading from
-    the true value. Its inverse `corrected_reading` computes the true value of recorded inputs (torques that drive the
-    model, angles that are prescribed or followed).
+    With neutral parameters a subclass leaves the nominal model unchanged. `reading_from_true_value` computes a reading.
+    Its inverse `true_value_from_reading` computes the true value of recorded inputs (torques that drive the model,
+    angles that are prescribed or followed).
     """
 
     kind: str  # name under which its class is registered
@@ -185,16 +185,16 @@ class Effect:
         """Return the energy, forces and internal equations that this effect adds to a step at its midpoint."""
         return EffectStepTerms()
 
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """Predict a reading from the error-free `output`. `channel` is `group.point` or `joints.quantity.JOINT`."""
         return output
 
-    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+    def true_value_from_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """Return the true value of a recorded `joints.position.JOINT` or `joints.effort.JOINT`, given `effort`."""
         return reading
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """Added delay [s] of a channel: recorded minus true time of a sample. `channel` is as in `distorted_reading`.
+        """Added delay [s] of a channel, named as in `reading_from_true_value`: recorded minus true time of a sample.
 
         `camera` marks points of a camera. For a driving torque, `torque.JOINT`, the delay is from recording to action.
         """

@@ -107,14 +107,14 @@ class InputErrorModel:
     smoothed_reference: Array | None = None  # reference of the tracking filter in place of the measured motion, (N, nb)
 
     @property
-    def estimated_torque_error(self) -> Array:
+    def recorded_minus_true_torque(self) -> Array:
         """Estimated torque error, recorded minus true, in every step, (N, nu) [N m]. It includes offset and noise."""
         return self.torque_bias + self.torque_noise
 
     @property
     def estimated_torque_error_to_subtract(self) -> Array:
         """Torque error that remains to be subtracted after effects on torques were applied, (N, nu) [N m]."""
-        return self.estimated_torque_error - self.transmitted_torque_noise
+        return self.recorded_minus_true_torque - self.transmitted_torque_noise
 
     @property
     def torque_bias_part(self) -> InputErrorModel:

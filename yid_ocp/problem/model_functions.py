@@ -155,9 +155,9 @@ class InputCorrectionFunctions:
             # a servo's command is a target of its encoder reading
             channel = "joints.position" if joint in self.system.servos else "joints.effort"
             for effect in reversed(self._effects):
-                true_effort = effect.corrected_reading(f"{channel}.{joint}", true_effort, true_effort)
+                true_effort = effect.true_value_from_reading(f"{channel}.{joint}", true_effort, true_effort)
             for effect in reversed(self._effects):
-                true_angle = effect.corrected_reading(f"joints.position.{joint}", true_angle, true_effort)
+                true_angle = effect.true_value_from_reading(f"joints.position.{joint}", true_angle, true_effort)
             efforts.append(true_effort)
             angles.append(true_angle)
         return ca.vertcat(ca.SX(0, 1), *angles), ca.vertcat(ca.SX(0, 1), *efforts)

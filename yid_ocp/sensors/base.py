@@ -291,7 +291,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     marked = sensor.frame_names or (None,) * len(sensor.channel_names)
     for channel, part, frame in zip(sensor.channel_names, parts, marked, strict=True):
         for effect in system.effects:
-            part = effect.distorted_reading(channel, part, replace(state, marked_frame=frame))
+            part = effect.reading_from_true_value(channel, part, replace(state, marked_frame=frame))
         read.append(part)
     output = ca.vertcat(*read)
     symbols = ca.vertcat(*system.effect_internal_coordinate_symbols.values()) if rows else ca.SX(0, 1)

@@ -20,9 +20,9 @@ from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import ConfigError, YidError, missing_package_error
 from yid_ocp.inference.linearized_residual import (
     is_stationary_point,
-    move_in_stds,
     projected_gradient_norm,
     size_limited_damped_step,
+    step_norm_in_stds,
 )
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
@@ -413,7 +413,8 @@ class _MultiStartSearch:
 
         def watched(entry: Iterate) -> None:
             noted(entry)
-            distance, gain = move_in_stds(best.evaluation, entry.x - best.result.x), best.evaluation.cost - entry.cost
+            distance = step_norm_in_stds(best.evaluation, entry.x - best.result.x)
+            gain = best.evaluation.cost - entry.cost
             if distance < _SAME_MINIMUM_STDS and -(distance**2) - least < gain < least:
                 reached.append(True)
                 raise StopSearch
@@ -548,7 +549,7 @@ class _RelinearizingSearch:
             slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
             recorder.record_iterate(now.cost, x, slope, f"weights {number + 2} of at most {_MAX_LINEARIZATIONS + 1}")
             step = size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
-            length = move_in_stds(now, step)
+            length = step_norm_in_stds(now, step)
             if length < _LAST_STEP_STDS:
                 return ended(Status.CONVERGED, "a step is less than a hundredth of a standard deviation")
             least = np.where(problem.positive_unknowns_mask, np.maximum(lower, _LEAST_FACTOR * x), lower)
@@ -566,7 +567,7 @@ class _RelinearizingSearch:
             found = self.solver.minimize_cost(problem, x, callback)
             recorder.n_evaluations += found.n_evaluations
             recorder.history += found.history
-            length, moved = move_in_stds(now, found.x - x), np.zeros(len(x))
+            length, moved = step_norm_in_stds(now, found.x - x), np.zeros(len(x))
             x, self.evaluation = found.x, found.evaluation or now
         self.evaluation = self.weighted.evaluate(x, equilibrium_guesses=guesses)
         status = Status.CONVERGED if length < 10 * _LAST_STEP_STDS else Status.ITERATION_LIMIT

@@ -177,7 +177,7 @@ def _actuation(
     true = reading = ca.SX.sym("reading")
     channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
     for effect in reversed(effects):
-        true = effect.corrected_reading(channel, true, true)
+        true = effect.true_value_from_reading(channel, true, true)
     late = sum((effect.added_channel_delay(f"torque.{joint}", False) for effect in effects), ca.SX(0))
     lag = sum((effect.channel_lag_time_constant(f"torque.{joint}") for effect in effects), ca.SX(0))
     numbers = [ca.substitute(part, reading, 0) for part in (ca.jacobian(true, reading), -true)]

@@ -3,8 +3,8 @@
 Letters in shapes: N points of a cloud, K links or skeleton nodes, np points of the model, M frames, s tubes.
 """
 
+from yid_ocp.vision.calibration import ArmBasedCameraCalibrationOptions as ArmBasedCameraCalibrationOptions
 from yid_ocp.vision.calibration import CameraCalibration as CameraCalibration
-from yid_ocp.vision.calibration import CameraCalibrationOptions as CameraCalibrationOptions
 from yid_ocp.vision.calibration import CameraClockOptions as CameraClockOptions
 from yid_ocp.vision.fit import ShapeFitOptions as ShapeFitOptions
 from yid_ocp.vision.fit import ShapeFitter as ShapeFitter

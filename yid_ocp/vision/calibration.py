@@ -162,7 +162,7 @@ _CONTRADICTION_STDS = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
-class CameraCalibrationOptions:
+class ArmBasedCameraCalibrationOptions:
     """Priors of the camera calibration, and settings for the use of the visible arm."""
 
     fix_pose: Annotated[
@@ -236,7 +236,7 @@ def calibrate_camera(
     frames: Sequence[CalibrationFrame],
     pose: Array,
     rng: np.random.Generator,
-    options: CameraCalibrationOptions,
+    options: ArmBasedCameraCalibrationOptions,
     clock: CameraClockOptions,
     source: str = "sequence",
 ) -> CameraCalibration:
@@ -274,7 +274,7 @@ class _Calibrator:
     arm: ArmSurface
     told: CalibrationState
     rng: np.random.Generator
-    options: CameraCalibrationOptions
+    options: ArmBasedCameraCalibrationOptions
     clock: CameraClockOptions
 
     @cached_property

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import shortest_path
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
-from yid_ocp.vision.calibration import CameraCalibrationOptions, CameraClockOptions
+from yid_ocp.vision.calibration import ArmBasedCameraCalibrationOptions, CameraClockOptions
 from yid_ocp.vision.fit import ShapeFitOptions, ShapeFitter
 from yid_ocp.vision.point_cloud import CloudFilterOptions, SkeletonOptions, XyzTuple
 from yid_ocp.vision.sequence_calibration import (
@@ -44,9 +44,9 @@ class TrackOptions:
         CameraClockOptions, OptionInfo("estimation of the camera clock's offset from the joints' clock")
     ] = field(default_factory=CameraClockOptions)
     calibration: Annotated[
-        CameraCalibrationOptions,
+        ArmBasedCameraCalibrationOptions,
         OptionInfo("estimation of pose, depth and clock of the camera from the visible arm"),
-    ] = field(default_factory=CameraCalibrationOptions)
+    ] = field(default_factory=ArmBasedCameraCalibrationOptions)
     background_estimation: Annotated[
         Literal["none", "frames"],
         OptionInfo(

@@ -304,7 +304,7 @@ def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, 
 _DEFAULT_OPTIONS = SkeletonOptions()
 
 
-def extract_skeleton(
+def extract_skeleton_graph(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULT_OPTIONS
 ) -> CloudSkeleton:
     """Extract the skeleton of a cloud, starting at its lowest point. Connected parts with few points are omitted."""

@@ -426,7 +426,7 @@ class FrameTracker:
 
     def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
         """View of an object whose root position follows from the model."""
-        found = point_cloud.extract_skeleton(cloud, rng, self.options.skeleton)
+        found = point_cloud.extract_skeleton_graph(cloud, rng, self.options.skeleton)
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods
+from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodsComparisonResult, compare_methods
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import Progress
 from yid_ocp.inference.uncertainty import EstimateChecks
@@ -60,7 +60,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
     return CommandOutcome(folder.path, written, None, done)
 
 
-def _compare_result(problem: EstimationProblem, comparison: MethodComparison) -> dict[str, Any]:
+def _compare_result(problem: EstimationProblem, comparison: MethodsComparisonResult) -> dict[str, Any]:
     methods = {}
     for run in comparison.method_results:
         own = {key: getattr(run, key) for key in ("whitened_cost", "wall_seconds", "cpu_seconds", "peak_memory_mib")}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis import friction_law_comparison
-from yid_ocp.analysis.friction_law_comparison import FrictionLawFit, mean_and_std_error_over_motion_kinds
+from yid_ocp.analysis.friction_law_comparison import CrossValidatedFrictionLawFit, mean_and_std_error_over_motion_kinds
 from yid_ocp.config.settings import FrictionLawSettings, RunSettings
 from yid_ocp.display import Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
@@ -28,7 +28,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
     joints = None if run.model.friction is None else run.model.friction.joints
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")
-        fits: list[FrictionLawFit] = []
+        fits: list[CrossValidatedFrictionLawFit] = []
         solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
         for law in EFFECT_KINDS_BY_FRICTION_LAW:
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
@@ -69,7 +69,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
     return CommandOutcome(folder.path, written, None, best.is_converged)
 
 
-def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+def _law_result(
+    fit: CrossValidatedFrictionLawFit, best: CrossValidatedFrictionLawFit, kinds: dict[str, tuple[str, ...]]
+) -> dict[str, Any]:
     mean, error = mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)
     difference, paired = friction_law_comparison.prediction_error_difference_and_std_error(fit, best, kinds)
     return {

@@ -22,7 +22,7 @@ from yid_ocp.export.equations import export_step_functions
 from yid_ocp.files import attributes_by_name
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
-from yid_ocp.integrator.step_model import StepEquationLinearizations
+from yid_ocp.integrator.step_model import StepResidualsAndJacobians
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.workflow.build import build_step, free_parameter_names
@@ -142,7 +142,7 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
     return _LinearisationPoint(words, False, np.zeros(sizes["nx"]), np.zeros(sizes["nu"]), theta, np.zeros(sizes["nc"]))
 
 
-def _linearised(step: Step, point: _LinearisationPoint) -> tuple[dict[str, Array], StepEquationLinearizations]:
+def _linearised(step: Step, point: _LinearisationPoint) -> tuple[dict[str, Array], StepResidualsAndJacobians]:
     """Jacobians A, B_u and B_theta of the step at a point, and the linearised equations of the step."""
     n, path = step.sizes["n"], point.prescribed_positions
     q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
@@ -166,7 +166,7 @@ def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
 def _patterns(
     symbols: NamedStepEquations,
     matrices: Mapping[str, Array],
-    rows: StepEquationLinearizations,
+    rows: StepResidualsAndJacobians,
     point: _LinearisationPoint,
 ) -> dict[str, step_diagnostics.SparsityPattern]:
     prescribed = list(symbols.equations.system.prescribed_coordinate_indices)
@@ -186,7 +186,7 @@ def _dependence(
     symbols: NamedStepEquations,
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
-    rows: StepEquationLinearizations,
+    rows: StepResidualsAndJacobians,
 ) -> tuple[step_diagnostics.ParameterInfluence, ...]:
     """Equations and sensors that depend on each parameter; along the recordings if the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None

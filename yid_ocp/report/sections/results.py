@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from yid_ocp.analysis.compare import MethodComparison
+from yid_ocp.analysis.compare import MethodsComparisonResult
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
@@ -129,7 +129,7 @@ def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
 
 @register_report_section("methods", 10, "Methods")
 def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    comparison: MethodComparison | None = findings.section_data.get("comparison")
+    comparison: MethodsComparisonResult | None = findings.section_data.get("comparison")
     if comparison is None:
         return
     rows = []
