@@ -37,9 +37,9 @@ def loads(folder):
 
 
 def test_the_bare_run_gives_the_modulus_that_others_found(bare):
-    entry = bare.solution.parameters["beam.bend"]
+    entry = bare.output.parameters["beam.bend"]
     assert entry.value / SECOND_MOMENT == pytest.approx(264e3, rel=0.08)
-    assert bare.solution.goodness_of_fit.explains
+    assert bare.output.goodness_of_fit.explains
     assert max(channel["rmse"] for channel in bare.result["residuals"].values()) < 3e-4
 
 
