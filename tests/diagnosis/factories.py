@@ -130,7 +130,7 @@ def costing(cost: float, rows: int) -> Evaluation:
 
 
 def problem_of(*names: str) -> SimpleNamespace:
-    """What is asked of a problem whose free parameters [N m/rad] have these names."""
+    """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
     system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad") for name in names})
     return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system)
 

@@ -207,6 +207,9 @@ def test_probabilities_are_compared_with_how_often_sets_hold_the_cause():
     assert (wide.right, wide.is_cause_in_sets, wide.probability) == (False, True, 0.9)
     assert not score_blind_case(PAIR, said("effect", [RIGHT])).is_cause_in_sets
     assert not score_blind_case(OUTSIDE, said("effect", [RIGHT])).is_cause_in_sets
+    # answers of older versions have no probability
+    older = score_blind_case(SINGLE, {key: own for key, own in said("effect", [RIGHT]).items() if key != "probability"})
+    assert blind_scores._calibration_rates([older])["expected_calibration_error"] is None
 
 
 @pytest.mark.parametrize(

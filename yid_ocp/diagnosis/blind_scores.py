@@ -72,7 +72,7 @@ class BlindCaseScore:
     experiment: str = ""
     z: Mapping[str, float] = field(default_factory=dict)  # (estimate - truth)/std of the same parameters
     p_value: float = math.nan  # p-value of the null test on the held-out recordings
-    probability: float = 0.0  # that the named sets hold the cause
+    probability: float = math.nan  # that the named sets hold the cause; NaN in answers of older versions
     is_cause_in_sets: bool = False  # whether they do, with one set for each true effect
 
     @property
@@ -144,7 +144,7 @@ def score_blind_case(
         experiment=label.experiment,
         z=z,
         p_value=_or_nan(before.get("p_value")),
-        probability=float(result["probability"]),
+        probability=_or_nan(result.get("probability")),
         is_cause_in_sets=bool(true) and _found(true, named, groups, math.inf),
     )
 
@@ -264,7 +264,7 @@ def _calibration_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     z = [abs(value) for m in marks if m.category == "single" for value in m.z.values()]
     p = [m.p_value for m in marks if m.category == "null" and math.isfinite(m.p_value)]
     quantiles = {a: float(scipy.stats.norm.ppf(0.5 * (1 + a))) for a in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)}
-    named = sorted((m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-")
+    named = sorted((m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-" and m.probability >= 0)
     bins = [own for own in np.array_split(np.array(named, float).reshape(-1, 2), 5) if len(own)]
     errors = [abs(float(np.sum(own[:, 0] - own[:, 1]))) for own in bins]
     return {

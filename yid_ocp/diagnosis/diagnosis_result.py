@@ -189,6 +189,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     added, alone, before = judged.accepted_selections, judged.single_effect_models, seen.nominal_model.held_out_loss
     closures = {fit.effects[0].label: held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
+    probabilities = judged.candidate_probabilities
     found = [
         *((e.effect, added[-1].refitted_model.effect_parameters_as_reported(e.effect)) for e in added),
         *((fit.effects[0], fit.effect_parameters_as_reported(fit.effects[0])) for fit in alone),
@@ -201,7 +202,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
             **attributes_by_name(effect, _EFFECT),
             "parameters": {name: attributes_by_name(own, "value std unit") for name, own in reported.items()},
             **attributes_by_name(score, "score=lm_statistic p_value"),
-            "probability": judged.candidate_probabilities.get(effect.label, 0.0),
+            "probability": probabilities.get(effect.label, 0.0),
             **_closure(closures.get(effect.label, UNDEFINED_GAP_CLOSURE)),
         }
         listed.setdefault(effect.label, to_json_types(entry))

@@ -54,7 +54,7 @@ class SelectedEffect:
 
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
     """Fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
-    if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
+    if math.isnan(fraction := _closed_fraction(before, after)):
         return UNDEFINED_GAP_CLOSURE
     count = len(before.block_sample_counts)
     draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
@@ -63,7 +63,14 @@ def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
         np.maximum((loss.block_chi2[draws].sum(axis=1) + loss.baseline_chi2) / n - 1.0, 0.0) for loss in (before, after)
     )
     low, high = np.quantile(1 - g1[g0 > 0] / g0[g0 > 0], [0.025, 0.975]) if g0.any() else (math.nan, math.nan)
-    return GapClosure(1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample, float(low), float(high))
+    return GapClosure(fraction, float(low), float(high))
+
+
+def _closed_fraction(before: HeldOutLoss, after: HeldOutLoss) -> float:
+    """Fraction of the held-out gap closed from `before` to `after`; NaN if there is no gap or no prediction."""
+    if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
+        return math.nan
+    return 1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample
 
 
 def leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
@@ -269,7 +276,7 @@ def select_effects(
         before = current
         rivals = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == base]
         chosen = chosen.replaced(better, [*rivals, *untried])
-        closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss).fraction
+        closed = _closed_fraction(nominal.held_out_loss, better.held_out_loss)
         said = "" if math.isnan(closed) else f": {100 * closed:.3g} % of the held-out gap closed"
         search.progress.begin_stage(f"explained by {join_effect_labels(better.effects)}{said}")
     chosen = _reconsidered(search, nominal, chosen, before)
@@ -291,7 +298,7 @@ def _is_futile(
     promised = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=0.0)
     if leaves_noise(current, limits):
         return promised < max(2 * limits.min_log_bayes_factor, limits.min_gap_closed * gap)
-    if held_out_gap_closure(nominal.held_out_loss, current.held_out_loss).fraction >= _MIN_FIRST_CLOSURE:
+    if _closed_fraction(nominal.held_out_loss, current.held_out_loss) >= _MIN_FIRST_CLOSURE:
         return False
     *_, pair = next(iter(search.ranked_candidate_pairs(alone)), (0.0,))
     return max(pair, 2 * (nominal.cost - current.cost) + promised) < limits.min_explained_fraction * gap
