@@ -20,6 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
@@ -156,14 +157,10 @@ def _pinv(matrix: Array) -> Array:
 
 def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannel]) -> Array:
     """X' Omega X under the noise's known autocorrelation."""
-    import scipy.signal  # slow to import
-
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
-        seen = x = columns[s.residual_indices]
-        if (lags := len(s.noise_autocorrelation) - 1) > 0:
-            both = np.concatenate([s.noise_autocorrelation[:0:-1], s.noise_autocorrelation])[:, None]
-            seen = scipy.signal.oaconvolve(x, both, mode="full", axes=0)[lags:][: len(x)]
+        x, lags = columns[s.residual_indices], s.noise_autocorrelation[: len(s.residual_indices)]
+        seen = scipy.linalg.matmul_toeplitz(np.pad(lags, (0, len(x) - len(lags))), x) if len(lags) > 1 else x
         total += x.T @ seen
     return (total + total.T) / 2
 
